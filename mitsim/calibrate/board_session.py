@@ -28,7 +28,7 @@ from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.memory import frame_seconds, frames_at_once, light_bytes
+from mitsim.light.memory import first_shadow, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
@@ -261,7 +261,7 @@ class Session:
         seconds = session_seconds(self.board, count, self.shots, first)
         exposures = len(self.recipe.exposure_ladder)
         session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
-        with job.planning("calibration"):
+        with job.planning("calibration", first_shadow(self.board, {})):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
         seconds = session_seconds(self.board, count, self.shots, plan.settings, self._terms_of(plan.settings))
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.

@@ -210,8 +210,10 @@ def plan(
         bench = devices.open(scene, variant, job)
         if place is not None:
             check_apart(place, bench.loaded.files)
-        starting = running_seconds()
-        with job.planning(sampling.patterns):
+        from mitsim.light.memory import first_shadow
+
+        starting, effects = running_seconds(), mitsim.Request.of(**request).effects
+        with job.planning(sampling.patterns, first_shadow(bench, effects)):
             found = _plan_of(bench, devices.colour, request).taking(start=starting)
         if place is not None:
             found.save(place)
@@ -329,7 +331,9 @@ def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any
     assert output is not None, "the command line writes a folder"
     if colour == AUTO:
         assert isinstance(what, str), "a plan has chosen"
-        with job.planning(what):
+        from mitsim.light.memory import first_shadow
+
+        with job.planning(what, first_shadow(bench, mitsim.Request.of(**request).effects)):
             chosen = bench.choose_colour(patterns=what, **request)
         bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
     if by_line(colour):

@@ -33,6 +33,8 @@ RASTER_LEFT_OUT = 1e-4
 _SKETCHES = 96, 192, 384, 640
 """Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
 features has 59 terms, a zone plate of 512 has 535. Where the last are too few, sums take longer than correlations."""
+MOST_TERMS = _SKETCHES[-1]
+"""Of a raster."""
 _TURNS = 2
 """Times that a sketch is turned toward the largest terms: a third changes their number by one in a hundred."""
 FEW = 2
