@@ -209,7 +209,7 @@ def plan(
     with nullcontext() if output is None else output_file(output, overwrite) as place, common.job() as job:
         bench = devices.open(scene, variant, job)
         if place is not None:
-            check_apart(place, bench.loaded.files)
+            check_apart(place, (*bench.loaded.files, *devices.models))
         from mitsim.light.memory import first_shadow
 
         starting, effects = running_seconds(), mitsim.Request.of(**request).effects

@@ -239,7 +239,6 @@ def transport(
     limited: Limited,
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
-    from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
 
     request, known = planned.read(context, vars(sampling))
@@ -247,8 +246,7 @@ def transport(
     devices.check(scene, patterns)
     with limited.job() as job, output_file(output, overwrite) as output:
         bench = devices.open(scene, limited.variant, job)
-        models = (locate(each, "calibration", ".toml") for each in (devices.camera, devices.projector) if each)
-        check_apart(output, (*bench.loaded.files, *models))
+        check_apart(output, (*bench.loaded.files, *devices.models, *filter(None, [planned.plan])))
         light = bench.light(known or patterns, job, **request)
         with job.clock.stage("write"):
             light.save(output)

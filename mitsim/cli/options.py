@@ -260,6 +260,16 @@ class Devices(LitScene):
         with nullcontext() if job is None else job.clock.stage("open scene"):
             return mitsim.open_bench(scene, variant, self.camera, self.projector, self.outside, **self.parameters)
 
+    @property
+    def models(self) -> list[Path]:
+        """Files of the camera and its mask, and of the projector, that are named."""
+        from mitsim.core.configuration import locate
+        from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
+
+        files = [locate(each, "calibration", ".toml") for each in (self.camera, self.projector) if each]
+        mask = load_mask(files[0]) if self.camera else None
+        return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
+
     def check_exposure(self, exposure: Exposure) -> None:
         """MitsimError, before the renderer is imported, for an ``exposure`` that the camera cannot have."""
         from mitsim.bench.apparatus import check_devices

@@ -309,8 +309,9 @@ class Plan:
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
                 place, planned, found = differs
-                values = f"{place}{_value_text(planned)} there, {_value_text(found)} here"
-                differs_by = f"the content of {place.strip()} differs" if what == "scene" else values
+                one, other = _value_text(planned), _value_text(found)
+                alike = what == "scene" or one == other  # checksums, or what is cut before it differs
+                differs_by = f"the content of {place.strip()} differs" if alike else f"{place}{one} there, {other} here"
                 raise ArgumentError(
                     argument,
                     f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "

@@ -106,6 +106,30 @@ def test_light_is_written_and_captured(
     mentions(lit, "--light was made of another projector: ")
 
 
+def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
+    call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
+) -> None:
+    """Neither the plan by light that is traced by it, nor files of camera, its drawn mask and projector, with
+    --overwrite. (Planted: each left out; once, `transport --plan p.json -o p.json --overwrite` took the plan away.)"""
+    np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 0]))
+    drawn, projector, file = tmp_path / "drawn.toml", tmp_path / "projector.toml", tmp_path / "plan.json"
+    drawn.write_text(lab.camera.read_text() + '\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "bars.npy"\n')
+    projector.write_text(lab.projector.read_text())
+    own = lab.scene, "--camera", drawn, "--projector", projector
+    assert call("plan", *own, "--patterns", "dots:2", "--accuracy", 0.1, "-o", file).code in (0, 1)
+    for path in (drawn, projector, tmp_path / "bars.npy"):
+        mentions(refused("plan", *own, "-o", path, "--overwrite"), f"output {path}: would replace", "which is read")
+    for path in (file, drawn):
+        line = refused("transport", *own, "--plan", file, "-o", path, "--overwrite")
+        mentions(line, f"output {path}: would replace", "which is read")
+    light = tmp_path / "light.h5"
+    assert call("transport", *own, "--plan", file, "-o", light).code in (0, 1)
+    np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 1]))  # of the same name
+    for known in (("--plan", file), ("--light", light, "--patterns", "dots:2")):
+        line = refused("capture", *own, *known, "-o", tmp_path / "run")
+        mentions(line, f"{known[0]} was made of another camera: the content of mask_plate differs")
+
+
 def test_what_python_warns_of_is_a_line_of_the_command_line(
     call: Callable[..., Any], lab: Any, devices: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
