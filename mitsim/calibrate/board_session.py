@@ -39,7 +39,7 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms, stripe_misfits
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.reconstruct.session_side import too_many, unexplained
+from mitsim.reconstruct.session_side import odd_responses, too_many
 
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
@@ -166,7 +166,7 @@ class Session:
         noise, scale = self._noise_behind(seen)
         numbers = math.prod(geometry.frame_shape)
         patterns = sum(
-            len(unexplained(scale * misfits + noise, scale * energies + noise, numbers))
+            len(odd_responses(scale * misfits + noise, scale * energies + noise, numbers))
             for misfits, energies in stripe_misfits(terms, self.signs)
         )
         return _Inseparable(words, remedy, patterns)

@@ -260,8 +260,8 @@ class Capturing(Sampling):
 
 
 @dataclass(frozen=True)
-class Traced:
-    """What is there already beside a plan."""
+class Made(KnownPlan):
+    """What is there already."""
 
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
@@ -276,8 +276,7 @@ def capture(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     capturing: Capturing,
-    planned: KnownPlan,
-    made: Traced,
+    made: Made,
     devices: Coloured,
     limited: Limited,
 ) -> int:
@@ -290,7 +289,7 @@ def capture(
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
-    request, known = _request_beside(context, capturing, planned, made.light)
+    request, known = _request_beside(context, capturing, made)
     if made.light is not None:
         refuse_unused(context, ["resume", "colour"], "on --light, which is of all lines and soon exposed")
     asked = mitsim.Request.of(**request) if known is None else known.request_with(request)
@@ -359,17 +358,15 @@ def _expose(path: Path, bench: Bench, request: dict[str, Any], output: Path, job
     return light.expose(request.pop("patterns"), output, job, **request).summary()
 
 
-def _request_beside(
-    context: typer.Context, capturing: Capturing, planned: KnownPlan, light: Path | None
-) -> tuple[dict[str, Any], Plan | None]:
+def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> tuple[dict[str, Any], Plan | None]:
     """Checked fields of the request, and the plan that is there: of all fields, or of those that are given beside it
-    or ``light`` in a file."""
+    or light in a file."""
     fields = vars(replace(capturing, exposure=number_of("exposure", capturing.exposure)))
-    if planned.plan is not None and light is not None:
-        raise MitsimError(f"--plan {planned.plan}: light in a file has a plan of its own; leave out --plan or --light")
-    if planned.plan is None and capturing.patterns is None:
+    if made.plan is not None and made.light is not None:
+        raise MitsimError(f"--plan {made.plan}: light in a file has a plan of its own; leave out --plan or --light")
+    if made.plan is None and capturing.patterns is None:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
-    return planned.read(context, fields if light is None else given_of(context, fields))
+    return made.read(context, fields if made.light is None else given_of(context, fields))
 
 
 def _chosen_colour(known: Plan) -> str:

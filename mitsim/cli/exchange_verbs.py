@@ -226,6 +226,13 @@ def patterns(
     return finish(common.as_json, payload, lines, ())
 
 
+@dataclass(frozen=True)
+class Traced(KnownPlan):
+    """What is planned already, and whether a file of light is replaced."""
+
+    overwrite: Overwrite = False
+
+
 @verb
 def transport(
     *,
@@ -233,20 +240,19 @@ def transport(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
     sampling: OfPatterns,
-    planned: KnownPlan,
+    traced: Traced,
     devices: Devices,
-    overwrite: Overwrite = False,
     limited: Limited,
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
     from mitsim.core.files import check_apart, output_file
 
-    request, known = planned.read(context, vars(sampling))
+    request, known = traced.read(context, vars(sampling))
     patterns = pop_patterns(request, known)
     devices.check(scene, patterns)
-    with limited.job() as job, output_file(output, overwrite) as output:
+    with limited.job() as job, output_file(output, traced.overwrite) as output:
         bench = devices.open(scene, limited.variant, job)
-        check_apart(output, (*bench.loaded.files, *devices.models, *filter(None, [planned.plan])))
+        check_apart(output, (*bench.loaded.files, *devices.models, *filter(None, [traced.plan])))
         light = bench.light(known or patterns, job, **request)
         with job.clock.stage("write"):
             light.save(output)

@@ -202,10 +202,9 @@ def _say(text: str) -> None:
         sys.stderr.flush()
 
 
-def say_note(message: Warning | str, *_: object) -> None:
-    """Tell a reader on stderr, in a line, what a Python warning says: as ``warnings.showwarning`` it gets the category,
-    file and line too, which are nothing to a reader."""
-    _say(f"note: {' '.join(str(message).split())}")
+def say_note(text: str) -> None:
+    """Tell a reader on stderr, in a line, the ``text`` of a Python warning, without the file and line of a program."""
+    _say(f"note: {' '.join(text.split())}")
 
 
 def _check_descriptors() -> None:

@@ -319,7 +319,7 @@ _TURNS = 8
 place; where another pattern of the same period is known, each step takes off half of the error."""
 
 
-def unexplained(misfits: FloatArray, energies: FloatArray, numbers: int) -> npt.NDArray[np.intp]:
+def odd_responses(misfits: FloatArray, energies: FloatArray, numbers: int) -> npt.NDArray[np.intp]:
     """Responses that hold much that no separable camera explains, where the others do not.
 
     Parameters
@@ -482,7 +482,7 @@ class SideCheck:
     def _check_misfits(self) -> None:
         """Responses that hold much that no separable camera explains, where the others do not."""
         misfits, energies = self.sums.misfits, self.sums.energies
-        for index in unexplained(misfits, energies, self.length * len(self.sums.common)):
+        for index in odd_responses(misfits, energies, self.length * len(self.sums.common)):
             if index in self.uncounted or index in self.unknown:
                 continue
             part = misfits[index] / energies[index]

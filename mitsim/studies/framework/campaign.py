@@ -483,7 +483,7 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
     """Measure every batch that comes, point by point, until the parent is gone; ``folders`` are for temporary files and
     for calibrations that are shared."""
     tempfile.tempdir, shared = folders
-    warnings.showwarning = say_note
+    warnings.showwarning = lambda message, *_: say_note(str(message))
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             for point in pipe.recv():
