@@ -42,7 +42,7 @@ from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, trace_light, trace_lines
 from mitsim.light.light_file import read_light, write_light
-from mitsim.light.memory import frame_seconds, frames_cost
+from mitsim.light.memory import first_shadow, frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
@@ -286,7 +286,8 @@ def capture(
             places.enter_context(claim_run(place, head, task.resume)) if place else Recorder()
             for place, head in zip(folders, heads, strict=True)
         ]
-        with job.planning(request.patterns):
+        least = first_shadow(bench.whole, request.effects)
+        with job.planning(request.patterns, least):
             made = lights[0].plan if lights else plan or bench.plan(request)
         known = {"plan": spent.get("plan", 0.0)} if plan is not None else {}  # what this run took to have it
         plan = made.taking(start=starting, **known)
@@ -471,7 +472,7 @@ def _sparser(light: SampledLight, lighting: Lighting) -> str:
     the plan left out shows; empty where they do not."""
     planned = light.plan.known_request.patterns
     both = light.bench.family(planned, light.seed).lighting, lighting
-    made, other = (float(each.weights.mean(axis=0)[each.labels].mean()) for each in both)
+    made, other = (each.lit for each in both)
     if other >= _AS_DENSE * made:
         return ""
     return (

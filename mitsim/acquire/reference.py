@@ -23,7 +23,7 @@ from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
-from mitsim.light.memory import frames_cost
+from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.planner.explain import unseen_lamps
 from mitsim.planner.planner import make_plan
 
@@ -247,7 +247,7 @@ def render(
         warnings += tuple(unseen_lamps(bench.loaded, spp * mean.shape[0] * mean.shape[1], "the reference"))
     else:
         uniform = Lighting.uniform(bench.n)
-        with job.planning(str(bench.loaded.path)):
+        with job.planning(str(bench.loaded.path), first_shadow(bench, effects or {})):
             plan = make_plan(bench, uniform, accuracy, seed, effects)
         frames_cost(bench, plan.settings, uniform, plan.predicted_seconds).check(str(bench.loaded.path), job.limits)
         job.clock.predict({"transport": plan.predicted["transport"]})

@@ -159,8 +159,7 @@ class SpectralBench:
             return plan_request(self.whole, request)
         self.check(request)
         lighting = self.whole.family(request.patterns, request.seed).lighting
-        lit = float(np.mean(lighting.weights.mean(axis=0)[lighting.labels]))
-        roughest = self.lit_by_lamps(request.effects, request.seed).roughest(request.seed, lit)
+        roughest = self.lit_by_lamps(request.effects, request.seed).roughest(request.seed, lighting.lit)
         plan = plan_request(roughest, request, len(self.benches))
         if roughest.counted_lamps is not None and "ambient" not in plan.settings.effects:
             # Beside a weaker line lamps may count.

@@ -119,10 +119,11 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
+        from mitsim.light.memory import first_shadow
 
         job, asked = job or Job(), request_of(patterns, request)
         if isinstance(patterns, str):
-            with job.planning(patterns):
+            with job.planning(patterns, first_shadow(self, asked.effects)):
                 patterns = plan_request(self, asked)
         else:
             check_plan(patterns, SpectralBench(self), asked)

@@ -19,6 +19,7 @@ from mitsim.acquire.exposure import camera_warnings
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
@@ -27,23 +28,38 @@ from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.memory import frame_seconds, frames_at_once, light_bytes
+from mitsim.light.memory import first_shadow, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import raster
 from mitsim.optics.frames import Frame, at_once, mixes
-from mitsim.optics.image_formation import number_of_terms
+from mitsim.optics.image_formation import largest_terms, number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centre_terms, shadow_terms
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms, stripe_misfits
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
+from mitsim.reconstruct.session_side import odd_responses, too_many
 
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
 be of diffraction."""
+_TERMS_BYTES = 2**30
+"""Memory of a drawn shadow's largest terms that are looked at in place of all: there are at most as many."""
+_DARK = 1e-12
+"""Transmission below which nothing is seen: rounding of sums."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
+
+
+@dataclass(frozen=True)
+class _Inseparable:
+    """What the best separable mask leaves of a mask's shadow in ``words``, its ``remedy``, and how many ``patterns`` of
+    a session are of another shape than the others."""
+
+    words: str
+    remedy: str
+    patterns: int
 
 
 @dataclass(frozen=True)
@@ -116,29 +132,79 @@ class Session:
     def mask_warnings(self) -> tuple[str, ...]:
         """A warning where no separable camera comes near this one's shadow between projector pixels and sensor, with
         the residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
-        geometry, spectrum = self.bench.geometry, self.bench.spectrum
-        rays = residual = best_term(self.shadow(geometry)).residual
-        if geometry.few_wave_terms and spectrum is not None:
-            residual = best_term(self.shadow(geometry, spectrum)).residual
+        found = self._inseparable
+        return () if found is None else (f"{found.words}, and images of these factors lack it; {found.remedy}",)
+
+    def check_mask(self) -> None:
+        """MitsimError for a mask behind which more patterns of the session are of another shape than may be left out of
+        it, which its frames would show after all the work."""
+        found, count = self._inseparable, self.signs.shape[1]
+        if found is not None and too_many(found.patterns, count):
+            raise MitsimError(
+                f"{found.words}, and {found.patterns} of {2 * count} patterns of a session would show no shape that "
+                f"the others do, too many for factors; {found.remedy}: without factors it can be planned and captured, "
+                "and no image is solved"
+            )
+
+    @cached_property
+    def _inseparable(self) -> _Inseparable | None:
+        """Of the mask's shadow in closed form; None where a separable mask has next to all of it."""
+        geometry, told, remedy = self.bench.geometry, self._told, "straighten the mask, or take a separable one"
+        seen = self._transmissions(geometry, told)
+        terms = centre_terms(seen) if self.centre else seen
+        residual = best_term(terms).residual
         if residual <= SEPARABLE_RESIDUAL:
-            return ()
-        cause, remedy = "", "straighten the mask, or take a separable one"
+            return None
+        rays, cause = residual if told is None else best_term(self.shadow(geometry)).residual, ""
         if rays < _IN_RAYS * residual:
             cause = f" by diffraction ({rays:.1%} without)"
             remedy = "take a separable mask, or one nearer to the sensor or of larger features"
-        return (
+        words = (
             f"the mask ({geometry.mask_words}) is not separable{cause}: the best separable one leaves {residual:.1%} "
-            f"of its shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; {remedy}",
+            f"of its shadow, {-decibels(residual):.1f} dB below it"
         )
+        noise, scale = self._noise_behind(seen)
+        numbers = math.prod(geometry.frame_shape)
+        patterns = sum(
+            len(odd_responses(scale * misfits + noise, scale * energies + noise, numbers))
+            for misfits, energies in stripe_misfits(terms, self.signs)
+        )
+        return _Inseparable(words, remedy, patterns)
+
+    @property
+    def _told(self) -> Spectrum | None:
+        """Lines of the light, in waves of which the shadow is a sum of few terms; None: it is told in rays."""
+        return self.bench.spectrum if self.bench.geometry.few_wave_terms else None
+
+    def _noise_behind(self, terms: SeparableTerms) -> tuple[float, float]:
+        """Squared noise of a +-1 response all in all [electrons^2], and squared electrons of a shot for a transmission
+        of one of the shadow's ``terms``: the brightest pixel of the uniform frame has the recipe's part of the full
+        well. Without falloff, dark current, speckle and steps of numbers."""
+        sensor, recipe = self.bench.sensor, self.recipe
+        rows, columns = (np.stack([each.sum(axis=1) for each in side]) for side in zip(*terms, strict=True))
+        white = self.through_filters(np.maximum(rows.T @ columns, 0.0))
+        scale = recipe.exposure_fraction * sensor.superpixel_full_well_e / max(float(white.max()), _DARK)
+        # A pair's two shots share the uniform light; 2 Y - U has twice that light of its own, and the readings of four.
+        light, readings = (1.0, 2.0) if self.pairs else (2.0, 4.0)
+        variance = light * scale * white + readings * sensor.superpixel_reading_noise_e**2
+        passed = 1.0 if self.filters is None else np.square(self.filters)
+        return float(np.sum(variance / passed)) / recipe.repeats, scale**2
 
     def shadow(self, geometry: CameraGeometry, spectrum: Spectrum | None = None) -> SeparableTerms:
         """The operator of a camera's ``geometry`` from projector pixels at the board's distance to the sensor, of
         transmissions: in rays, or in waves of a ``spectrum``; centred where frames are."""
+        terms = self._transmissions(geometry, spectrum)
+        return centre_terms(terms) if self.centre else terms
+
+    def _transmissions(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> SeparableTerms:
+        """The same of frames as they are."""
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )
-        terms = shadow_terms(geometry, rows, columns, self.distance, spectrum)
-        return centre_terms(terms) if self.centre else terms
+        largest = None
+        if geometry.is_drawn(waves=False):
+            largest = largest_terms(geometry, rows, columns, self.distance, most_bytes=_TERMS_BYTES)
+        return largest or shadow_terms(geometry, rows, columns, self.distance, spectrum)
 
     @cached_property
     def signs(self) -> FloatArray:
@@ -195,9 +261,9 @@ class Session:
         seconds = session_seconds(self.board, count, self.shots, first)
         exposures = len(self.recipe.exposure_ladder)
         session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
-        with job.planning("calibration"):
+        with job.planning("calibration", first_shadow(self.board, {})):
             plan = make_plan(self.board, _lines(n), accuracy, self.seed)
-        seconds = session_seconds(self.board, count, self.shots, plan.settings, self._largest_terms(plan.settings))
+        seconds = session_seconds(self.board, count, self.shots, plan.settings, self._terms_of(plan.settings))
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.
         plan = plan.taking(start=starting, truth=0.0, **seconds)
         cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
@@ -205,7 +271,7 @@ class Session:
         job.clock.predict(plan.predicted)
         return replace(plan, cost=cost)
 
-    def _largest_terms(self, settings: Settings) -> float:
+    def _terms_of(self, settings: Settings) -> float:
         """Terms of the shadow that ``settings`` have drawn on a raster, which their plan has looked at; 1 of others."""
         geometry, waves = self.board.geometry, in_waves(settings.effects)
         if not geometry.is_drawn(waves):

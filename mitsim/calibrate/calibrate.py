@@ -202,6 +202,8 @@ def _run_sessions(
     frames
         folder that the frames of a single one are written to.
     """
+    for session in lines:
+        session.check_mask()
     found, job, whole = list[Factors](), task.job, lines[0].whole or lines[0]
     plan: Plan | None = None
     lights: list[SampledLight] = []
@@ -325,7 +327,8 @@ def estimates(
     )
     with job.clock.stage("estimate"):
         judged = [
-            _check(session, sums, taken) if kind == NOISY else CheckedSession(sums) for kind, sums in found.sums.items()
+            _check_session(session, sums, taken) if kind == NOISY else CheckedSession(sums)
+            for kind, sums in found.sums.items()
         ]
         factors = [
             each.estimate(session.signs, lit.response_noise if kind == NOISY else None)
@@ -334,8 +337,9 @@ def estimates(
     return factors, found.saturated, judged[0]
 
 
-def _check(session: Session, sums: tuple[StripeSums, StripeSums], taken: SessionConditions) -> CheckedSession:
-    """:func:`check_session`, which takes stripes for wrong behind a mask that is not separable: that is said first."""
+def _check_session(session: Session, sums: tuple[StripeSums, StripeSums], taken: SessionConditions) -> CheckedSession:
+    """:func:`check_session`, which takes stripes for wrong behind a mask that is not separable: that is said first,
+    where the mask alone did not tell."""
     try:
         return check_session(sums, session.signs, taken)
     except MitsimError as error:

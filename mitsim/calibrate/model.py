@@ -98,6 +98,7 @@ def calibrate_model(
 def _fit_factors(
     bench: Apparatus, modelling: Modelling, frames: Path | str | SessionFrames | None, request: SessionRequest, job: Job
 ) -> Factors:
+    camera = model_of(bench, modelling.model)
     if frames is not None:
         listed = frames if isinstance(frames, SessionFrames) else load_frames(frames)
         shown, digital, used = _of_frames(bench, listed, modelling)
@@ -116,7 +117,6 @@ def _fit_factors(
         configuration = {"seed": request.seed, "recipe": recipe.model_dump(exclude_defaults=True)}
     job.progress("fit", 0.5)
     with job.clock.stage("fit"):
-        camera = model_of(bench, modelling.model)
         fitted = fit_placement(camera, shown, modelling.free)
     manifest = CalibrationManifest(
         configuration={**bench.provenance(), **bench.identity(), **configuration},

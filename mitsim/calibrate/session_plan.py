@@ -220,11 +220,12 @@ def plan_calibration(
             "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
         )
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
+    session = Session(bench, recipe, seed)
+    session.check_mask()
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
         request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)
         shots = capture(SpectralBench(bench), request).runs[0]
-    session = Session(bench, recipe, seed)
     job.progress("session", 0.0)
     with job.clock.stage("session"):
         own = job.apart("session ")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import signal
 import sys
+import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -31,6 +32,7 @@ from mitsim.cli.options import (
     Devices,
     Effects,
     ExposureFraction,
+    KnownPlan,
     Limited,
     LitScene,
     OfPatterns,
@@ -42,21 +44,23 @@ from mitsim.cli.options import (
     Seed,
     by_line,
     check_work,
+    given_of,
     in_colour,
     is_given,
     message_of,
     number_of,
     option,
+    pop_patterns,
     refuse_unused,
     request_of,
     verb,
 )
 from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
-from mitsim.core.errors import ArgumentError, MitsimError, printable
+from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
-from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped
+from mitsim.core.worker import INTERRUPTED, RESUME, advise, end_stopped, end_uncaught, is_stopped, say_note
 from mitsim.devices.patterns import pattern_names
 
 if TYPE_CHECKING:
@@ -87,7 +91,10 @@ def run() -> None:
     except FileNotFoundError:
         _fail("the working folder does not exist any more; change to another one")
     try:
-        code = app(standalone_mode=False)
+        with warnings.catch_warnings(record=True) as found:
+            code = app(standalone_mode=False)
+        for note in dict.fromkeys(str(each.message) for each in found):  # not before: progress is shown meanwhile
+            say_note(note)
     except SystemExit as ended:
         if ended.code == 1:  # click's for a reader that went away
             sys.exit(128 + signal.SIGPIPE)
@@ -202,9 +209,11 @@ def plan(
     with nullcontext() if output is None else output_file(output, overwrite) as place, common.job() as job:
         bench = devices.open(scene, variant, job)
         if place is not None:
-            check_apart(place, bench.loaded.files)
-        starting = running_seconds()
-        with job.planning(sampling.patterns):
+            check_apart(place, (*bench.loaded.files, *devices.models))
+        from mitsim.light.memory import first_shadow
+
+        starting, effects = running_seconds(), mitsim.Request.of(**request).effects
+        with job.planning(sampling.patterns, first_shadow(bench, effects)):
             found = _plan_of(bench, devices.colour, request).taking(start=starting)
         if place is not None:
             found.save(place)
@@ -251,24 +260,13 @@ class Capturing(Sampling):
 
 
 @dataclass(frozen=True)
-class Made:
+class Made(KnownPlan):
     """What is there already."""
 
-    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
     )
     resume: Resume = False
-
-    def known_plan(self, request: Mapping[str, Any]) -> Plan | None:
-        """The plan in its file; None without one. MitsimError for a ``request`` beside it that needs another."""
-        if self.plan is None:
-            return None
-        if self.light is not None:
-            raise MitsimError(f"--plan {self.plan}: light in a file has a plan of its own; leave out --plan or --light")
-        found = mitsim.Plan.load(self.plan)
-        found.request_with(request)
-        return found
 
 
 @verb
@@ -291,16 +289,15 @@ def capture(
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
     if capturing.ambient_frame == "no":
         refuse_unused(context, ["ambient_shots"], "with --ambient-frame no")
-    request = _request_beside(context, capturing, made)
-    known = made.known_plan(request)
+    request, known = _request_beside(context, capturing, made)
     if made.light is not None:
         refuse_unused(context, ["resume", "colour"], "on --light, which is of all lines and soon exposed")
     asked = mitsim.Request.of(**request) if known is None else known.request_with(request)
     if known is not None and devices.colour == AUTO:
         devices = replace(devices, colour=_chosen_colour(known))
     colour, variant = devices.colour, devices.traced_in(limited.variant)
-    if known is not None and colour != NO and request.pop("patterns", asked.patterns) != known.known_request.patterns:
-        raise ArgumentError("patterns", f"{asked.patterns}: {known.made_for('patterns')}")
+    if known is not None and colour != NO:
+        pop_patterns(request, known)
     begun_in_one = (output / MANIFEST).is_file()  # which auto may decide for
     check_work(output, made.resume, "capture", several=by_line(colour) or (colour == AUTO and not begun_in_one))
     devices.check_colour(limited.variant, asked.seconds)
@@ -333,7 +330,9 @@ def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any
     assert output is not None, "the command line writes a folder"
     if colour == AUTO:
         assert isinstance(what, str), "a plan has chosen"
-        with job.planning(what):
+        from mitsim.light.memory import first_shadow
+
+        with job.planning(what, first_shadow(bench, mitsim.Request.of(**request).effects)):
             chosen = bench.choose_colour(patterns=what, **request)
         bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
     if by_line(colour):
@@ -359,16 +358,15 @@ def _expose(path: Path, bench: Bench, request: dict[str, Any], output: Path, job
     return light.expose(request.pop("patterns"), output, job, **request).summary()
 
 
-def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> dict[str, Any]:
-    """Checked fields of the request: all of them, or those that are given beside a plan or light that is ``made``."""
+def _request_beside(context: typer.Context, capturing: Capturing, made: Made) -> tuple[dict[str, Any], Plan | None]:
+    """Checked fields of the request, and the plan that is there: of all fields, or of those that are given beside it
+    or light in a file."""
     fields = vars(replace(capturing, exposure=number_of("exposure", capturing.exposure)))
-    if made.plan is not None or made.light is not None:
-        fields = {name: value for name, value in fields.items() if is_given(context, name)}
-    if made.plan is not None:
-        return request_of(**fields)
-    if capturing.patterns is None:
+    if made.plan is not None and made.light is not None:
+        raise MitsimError(f"--plan {made.plan}: light in a file has a plan of its own; leave out --plan or --light")
+    if made.plan is None and capturing.patterns is None:
         raise MitsimError("Missing option '--patterns': give it, or a plan with --plan")
-    return request_of(**fields)
+    return made.read(context, fields if made.light is None else given_of(context, fields))
 
 
 def _chosen_colour(known: Plan) -> str:

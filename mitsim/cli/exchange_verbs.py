@@ -12,6 +12,7 @@ import typer
 from mitsim.cli.options import (
     Common,
     Devices,
+    KnownPlan,
     Limited,
     OfPatterns,
     Overwrite,
@@ -19,8 +20,8 @@ from mitsim.cli.options import (
     Scene,
     Seed,
     option,
+    pop_patterns,
     refuse_unused,
-    request_of,
     verb,
 )
 from mitsim.cli.screen import finish
@@ -225,27 +226,34 @@ def patterns(
     return finish(common.as_json, payload, lines, ())
 
 
+@dataclass(frozen=True)
+class Traced(KnownPlan):
+    """What is planned already, and whether a file of light is replaced."""
+
+    overwrite: Overwrite = False
+
+
 @verb
 def transport(
     *,
+    context: typer.Context,
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
     sampling: OfPatterns,
+    traced: Traced,
     devices: Devices,
-    overwrite: Overwrite = False,
     limited: Limited,
 ) -> int:
     """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
-    from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
 
-    request = request_of(sampling)
-    devices.check(scene, sampling.patterns)
-    with limited.job() as job, output_file(output, overwrite) as output:
+    request, known = traced.read(context, vars(sampling))
+    patterns = pop_patterns(request, known)
+    devices.check(scene, patterns)
+    with limited.job() as job, output_file(output, traced.overwrite) as output:
         bench = devices.open(scene, limited.variant, job)
-        models = (locate(each, "calibration", ".toml") for each in (devices.camera, devices.projector) if each)
-        check_apart(output, (*bench.loaded.files, *models))
-        light = bench.light(request.pop("patterns"), job, **request)
+        check_apart(output, (*bench.loaded.files, *devices.models, *filter(None, [traced.plan])))
+        light = bench.light(known or patterns, job, **request)
         with job.clock.stage("write"):
             light.save(output)
     size = output.stat().st_size
@@ -255,7 +263,7 @@ def transport(
     lines = [
         f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "
         f"{taken['total']:.1f} s, {payload['entries']} numbers, {size / 2**20:.3g} MiB: {output}",
-        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {sampling.patterns}, total error up to "
+        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {patterns}, total error up to "
         f"{payload['total_error_bound']:.1e}",
     ]
     return finish(limited.as_json, payload, lines, payload["warnings"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, is_dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.bench.request import Exposure
     from mitsim.core.job import Job
+    from mitsim.light.plan import Plan
 
 _SPELLED = {
     "scene": "SCENE",
@@ -180,6 +181,32 @@ class OfPatterns(Sampling):
 
 
 @dataclass(frozen=True)
+class KnownPlan:
+    """What is planned already."""
+
+    plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
+
+    def read(self, context: typer.Context, fields: Mapping[str, Any]) -> tuple[dict[str, Any], Plan | None]:
+        """Checked fields of a request, and the plan in the file; None without one.
+
+        Parameters
+        ----------
+        context, fields
+            of the command line, and what it asks for; beside a plan that alone which is given.
+
+        Raises
+        ------
+        MitsimError
+            for a value that a field cannot have or that needs another plan, and a file that cannot be read.
+        """
+        if self.plan is None:
+            return request_of(**fields), None
+        request, found = request_of(**given_of(context, fields)), mitsim.Plan.load(self.plan)
+        found.request_with(request)
+        return request, found
+
+
+@dataclass(frozen=True)
 class LitScene:
     """What opens a scene, under its own light."""
 
@@ -232,6 +259,16 @@ class Devices(LitScene):
         """
         with nullcontext() if job is None else job.clock.stage("open scene"):
             return mitsim.open_bench(scene, variant, self.camera, self.projector, self.outside, **self.parameters)
+
+    @property
+    def models(self) -> list[Path]:
+        """Files of the camera and its mask, and of the projector, that are named."""
+        from mitsim.core.configuration import locate
+        from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
+
+        files = [locate(each, "calibration", ".toml") for each in (self.camera, self.projector) if each]
+        mask = load_mask(files[0]) if self.camera else None
+        return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
 
     def check_exposure(self, exposure: Exposure) -> None:
         """MitsimError, before the renderer is imported, for an ``exposure`` that the camera cannot have."""
@@ -404,6 +441,21 @@ def is_given(context: typer.Context, name: str) -> bool:
     """Whether the command line of a ``context`` names the parameter ``name``."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def pop_patterns(request: dict[str, Any], known: Plan | None) -> str:
+    """The patterns of a ``request``, which are taken out of its fields, or of a ``known`` plan; ArgumentError where
+    both have some and they differ."""
+    planned = () if known is None else (known.known_request.patterns,)
+    patterns: str = request.pop("patterns", *planned)
+    if known is not None and patterns != known.known_request.patterns:
+        raise ArgumentError("patterns", f"{patterns!r}: {known.made_for('patterns')}")
+    return patterns
+
+
+def given_of(context: typer.Context, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Those ``fields`` that the command line of a ``context`` names."""
+    return {name: value for name, value in fields.items() if is_given(context, name)}
 
 
 def refuse_unused(context: typer.Context, names: Sequence[str], where: str) -> None:

@@ -232,19 +232,23 @@ class Job:
         )
 
     @contextmanager
-    def planning(self, what: str) -> Iterator[None]:
+    def planning(self, what: str, least: Cost | None = None) -> Iterator[None]:
         """The stage "plan" of the clock, refused once the whole work has taken all the seconds that its limits allow.
 
         Parameters
         ----------
         what
             the work, for the message.
+        least
+            what is known before a plan; None: nothing.
 
         Raises
         ------
         MitsimError
-            when they are over before the plan is made.
+            where that is more than the limits allow, and when the seconds are over before the plan is made.
         """
+        if least is not None:
+            least.check(what, self.limits)
         try:
             with self.clock.stage("plan"), within(self.limits.seconds - self.clock.seconds()["total"]):
                 yield

@@ -219,6 +219,11 @@ def _say(text: str) -> None:
         sys.stderr.flush()
 
 
+def say_note(text: str) -> None:
+    """Tell a reader on stderr, in a line, the ``text`` of a Python warning, without the file and line of a program."""
+    _say(f"note: {' '.join(text.split())}")
+
+
 def _check_descriptors() -> None:
     """Exit when standard output is closed: a file that is opened later would get its number, and what is printed.
     Closed standard input and error lead to nothing instead."""

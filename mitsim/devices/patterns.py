@@ -73,6 +73,11 @@ class Lighting:
 
         return cls(np.zeros(n * n, dtype=np.int64), np.ones((1, 1)))
 
+    @property
+    def lit(self) -> float:
+        """Part of all pixels that a shot lights, in the mean, by their power."""
+        return float(self.weights.mean(axis=0)[self.labels].mean())
+
     def shots(self, chosen: list[int] | npt.NDArray[np.int64]) -> Lighting:
         """The same classes in the ``chosen`` shots only."""
         return replace(self, weights=self.weights[chosen])

@@ -33,6 +33,8 @@ RASTER_LEFT_OUT = 1e-4
 _SKETCHES = 96, 192
 """Directions in which the largest terms are looked for, until they hold all but that: at 512 pixels a disc of 64
 features has 59 terms, a zone plate of 512 has 535. Of more than the last, sums take longer than correlations."""
+MOST_TERMS = _SKETCHES[-1]
+"""Of a raster."""
 _SMALL = 512
 """Values a side up to which means from every value on are held: of a disc of 5 pixels, points' light a third of a pixel
 apart alone leaves 6e-3 of a frame, and every one 2e-5 (tests/physics/test_raster.py)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import names
@@ -10,7 +11,7 @@ from mitsim.core.job import Cost
 from mitsim.core.worker import workers
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.plate import FEW, Plate
+from mitsim.devices.plate import FEW, MOST_TERMS, Plate
 from mitsim.devices.projector import Spectrum
 from mitsim.light.cost_model import Numbers, entries
 from mitsim.light.settings import GROUPS, Settings
@@ -18,6 +19,7 @@ from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import cells_a_side, cells_per_pixel, points_per_cell
 from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import frames_in_memory
+from mitsim.optics.image_formation import SUMMED_BYTES
 
 _LAUNCH_BYTES = 380e6
 """Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
@@ -127,7 +129,7 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
         factors = max(
             0.0 if settings.raster else factors,
             raster_bytes(geometry.model_copy(update={"mask_cells": settings.raster_cells}), bench.waves),
-        )
+        ) + largest_terms_bytes(geometry, cells)
     held = lines * GROUPS * held * _ENTRY_BYTES + min(lines, workers()) * paths * path_sample_bytes(settings)
     return factors + _LAUNCH_BYTES + _FOLLOWED_BYTES * followed + held
 
@@ -197,6 +199,31 @@ def drawing_seconds(geometry: CameraGeometry, spectrum: Spectrum | None) -> floa
     each = _POINT_S + _TERM_S * seen.amplitude.most_terms
     part = _AROUND if turned else seen.amplitude.uneven_part
     return cells * part * each * sum(count**2 for count in points)
+
+
+def largest_terms_bytes(geometry: CameraGeometry, cells: int) -> float:
+    """Memory of a drawn shadow's largest terms at most [bytes]: those of all cells, and of those that a shot lights.
+    Those of further layers take the place of spectra (:data:`_HELD` is of eight shadows).
+
+    Parameters
+    ----------
+    geometry
+        the camera.
+    cells
+        along an axis, of all anchors.
+    """
+    return 2 * min(SUMMED_BYTES, 8.0 * MOST_TERMS * cells * sum(geometry.frame_shape))
+
+
+def first_shadow(bench: Apparatus, switches: Mapping[str, bool]) -> Cost:
+    """Time and memory of the first shadow that a plan of a ``bench`` draws, whose effects ``switches`` decide; none
+    where it need not draw any."""
+    geometry = bench.geometry
+    waves = geometry.diffracts and switches.get("diffraction") is not False
+    if not geometry.is_drawn(waves):
+        return Cost()
+    spectrum = bench.waves if waves else None
+    return Cost(drawing_seconds(geometry, spectrum), raster_bytes(geometry, spectrum))
 
 
 def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:

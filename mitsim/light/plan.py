@@ -274,10 +274,10 @@ class Plan:
             for a value that a field cannot have, or that needs another plan.
         """
         planned = self.known_request
-        left = self.colour.taken.error or 0.0 if self.colour else 0.0
-        if left and math.isclose(changes.get("accuracy") or 0.0, math.hypot(planned.accuracy, left)):
-            changes = {**changes, "accuracy": planned.accuracy}  # what colours leave of the accuracy asked for
         request = planned.with_values(**changes)
+        left = self.colour.taken.error or 0.0 if self.colour else 0.0
+        if left and math.isclose(request.accuracy, math.hypot(planned.accuracy, left)):
+            request = request.with_values(accuracy=planned.accuracy)  # what colours leave of the accuracy asked for
         for name in ("accuracy", "seconds", "effects"):
             if getattr(request, name) != getattr(planned, name):
                 raise ArgumentError(name, f"{_words(getattr(request, name))}: {self.made_for(name)}")
@@ -309,8 +309,9 @@ class Plan:
             differs = _difference(self.made_of.get(what), here)
             if differs is not None:
                 place, planned, found = differs
-                values = f"{place}{_value_text(planned)} there, {_value_text(found)} here"
-                differs_by = f"the content of {place.strip()} differs" if what == "scene" else values
+                one, other = _value_text(planned), _value_text(found)
+                alike = what == "scene" or one == other  # checksums, or what is cut before it differs
+                differs_by = f"the content of {place.strip()} differs" if alike else f"{place}{one} there, {other} here"
                 raise ArgumentError(
                     argument,
                     f"was made of another {what}: {differs_by}; give what it was made of, or make it anew "

@@ -232,7 +232,7 @@ class FrameOptics:
         def layer(depth: float) -> _Raster | _Terms:
             if geometry.is_correlated(spectrum is not None):
                 shadow = geometry, rows, columns, depth, spectrum
-                summed = _largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
+                summed = largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
                 return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
             return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
 
@@ -385,20 +385,29 @@ def number_of_terms(drawn: Plate) -> float:
     return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
 
 
-def _largest_terms(
+def largest_terms(
     geometry: CameraGeometry,
     rows: Directions,
     columns: Directions,
     depth: float,
-    spectrum: Spectrum | None,
-    places: Places | None,
+    spectrum: Spectrum | None = None,
+    places: Places | None = None,
+    most_bytes: float = SUMMED_BYTES,
 ) -> SeparableTerms | None:
     """The shadow of a mask that is drawn on a raster, but for 1e-4 of it, as separable terms; None where these would
-    take too much memory."""
+    take too much memory.
+
+    Parameters
+    ----------
+    geometry, rows, columns, depth, spectrum, places
+        as for :func:`mitsim.optics.terms.shadow_terms`.
+    most_bytes
+        that they may take.
+    """
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
     sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
-    if 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
+    if 8 * number_of_terms(drawn) * sides > most_bytes:
         return None
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
     return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places)

@@ -30,6 +30,7 @@ from mitsim.reconstruct.session_side import (
     frame_words,
     name_by_light,
     robust_scatter,
+    too_many,
 )
 
 # ---- Pairs of frames, which add up to one frame for all patterns -----------------------------------------------------
@@ -593,7 +594,7 @@ def check_session(
     ]
     count = signs.shape[1]
     patterns = {(fault.side, fault.index) for fault in faults}
-    if len(patterns) > max(2, MOST_FAULTS * 2 * count):
+    if too_many(len(patterns), count):
         first = faults[0]
         raise MitsimError(
             f"{len(patterns)} of {2 * count} patterns of the session are not what they should be, first {first.side} "

@@ -319,6 +319,29 @@ _TURNS = 8
 place; where another pattern of the same period is known, each step takes off half of the error."""
 
 
+def odd_responses(misfits: FloatArray, energies: FloatArray, numbers: int) -> npt.NDArray[np.intp]:
+    """Responses that hold much that no separable camera explains, where the others do not.
+
+    Parameters
+    ----------
+    misfits, energies
+        (N,) of all responses of a side, with their noise: squares that no common shape explains, and all.
+    numbers
+        of a response.
+    """
+    middle = float(np.median(misfits))
+    scatter = robust_scatter(misfits, middle)
+    excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
+    # Where no separable camera explains any, one that is no worse than others says nothing.
+    least = 4 * middle if scatter > _NOISY * middle * float(np.sqrt(2 / numbers)) else 0.0
+    return np.flatnonzero((excess > _UNEXPLAINED * energies) & (misfits >= least))
+
+
+def too_many(patterns: int, count: int) -> bool:
+    """Whether so many wrong ``patterns`` leave a session of ``count`` a side in doubt."""
+    return patterns > max(2, MOST_FAULTS * 2 * count)
+
+
 class SideCheck:
     """One side of a session while it is checked: ``vectors`` (m, N) as they are repaired so far.
 
@@ -459,13 +482,7 @@ class SideCheck:
     def _check_misfits(self) -> None:
         """Responses that hold much that no separable camera explains, where the others do not."""
         misfits, energies = self.sums.misfits, self.sums.energies
-        middle = float(np.median(misfits))
-        scatter = robust_scatter(misfits, middle)
-        excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
-        # Where no separable camera explains any, one that is no worse than others says nothing.
-        noise = middle * float(np.sqrt(2 / self.length / len(self.sums.common)))
-        least = 4 * middle if scatter > _NOISY * noise else 0.0
-        for index in np.flatnonzero((excess > _UNEXPLAINED * energies) & (misfits >= least)):
+        for index in odd_responses(misfits, energies, self.length * len(self.sums.common)):
             if index in self.uncounted or index in self.unknown:
                 continue
             part = misfits[index] / energies[index]

@@ -20,6 +20,7 @@ import numpy as np
 from mitsim.acquire.capture import expose, trace_request
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure, Request
+from mitsim.calibrate.board_session import Session
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
@@ -94,6 +95,7 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
     request, job = request or Request.of(), job or Job()
     Exposure().check(bench.sensor, bench.devices.camera_file)
     names = _fitting(bench, request)
+    Session(bench, load_recipe(), request.seed).check_mask()
     # Only now, with nothing left to refuse, is an earlier demo taken away.
     with study_folder(output, "demo") as folder:
         for part in DEMO_FOLDERS:
@@ -119,7 +121,8 @@ def _fitting(bench: Bench, request: Request) -> tuple[str, ...]:
 
 def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], job: Job) -> DemoResult:
     with job.clock.stage("plan"):
-        plan = bench.plan(**request.model_dump())
+        sparsest = min(names, key=lambda name: bench.family(name, request.seed).lighting.lit)
+        plan = bench.plan(**{**request.model_dump(), "patterns": sparsest})
     light = trace_request(bench, plan, job)
     shots = expose(light, request.patterns, folder / "run", job)
     session = job.apart("calibration ")

@@ -1,11 +1,15 @@
 """The memory that a capture is estimated to take, against what it took in a process of its own."""
 
+import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.physics.test_masks import camera_file
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Faults")
@@ -45,3 +49,47 @@ def test_the_estimate_is_an_upper_one_within_a_factor_of_three(
     taken, estimated, written, on_disk = map(float, done.stdout.split())
     measured(estimated / taken, at_least=1, at_most=3, what="estimated for what was taken")
     assert on_disk / 1.1 < written <= on_disk
+
+
+LIMITED = """
+import resource, sys
+import numpy as np
+import psutil
+from pathlib import Path
+from mitsim.api.bench import open_bench
+from mitsim.core.errors import MitsimError
+
+scene, camera, by, output = Path(sys.argv[1]), sys.argv[2] or None, float(sys.argv[3]), Path(sys.argv[4])
+bench = open_bench(scene, camera=camera)
+plan = bench.plan("dots:2", accuracy=0.03)
+limit = psutil.Process().memory_info().vms + int(by * plan.cost.memory_bytes / 0.9)
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+try:
+    print(len(bench.capture(plan, output).dn))
+except MitsimError as error:
+    sys.exit(str(error))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("mask", ["", "disc"])
+def test_what_is_predicted_to_fit_a_limit_on_memory_ends_well_and_what_is_not_is_refused(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path, mask: str
+) -> None:
+    """A limit on address space, which turns a prediction that is too low into MemoryError or worse; behind a mask that
+    is drawn, too. (Planted: a twentieth of what is predicted; the limit not looked at.)"""
+    camera = ""
+    if mask:
+        along = np.arange(32) - 15.5
+        disc = (np.hypot(along[:, None], along) < 14).astype(float)
+        camera = str(camera_file(tmp_path, mask, disc))
+    for by, out in ((1.05, "4\n"), (0.8, "")):
+        run = tmp_path / f"run{by}"
+        arguments = [sys.executable, "-c", LIMITED, str(small_scene()), camera, str(by), str(run)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+        done = subprocess.run(arguments, capture_output=True, text=True, env=environment)
+        assert done.stdout == out, done.stderr
+        if not out:
+            assert done.stderr.startswith("dots:2: would take about ") and "of memory; allowed are" in done.stderr
+            assert len(done.stderr.splitlines()) == 1 and not run.exists()

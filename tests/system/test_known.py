@@ -1,4 +1,4 @@
-"""What is planned or traced already: `capture --plan` and `capture --light` on the command line."""
+"""What is planned or traced already: `--plan` and `--light` on the command line."""
 
 from __future__ import annotations
 
@@ -7,14 +7,34 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
 from mitsim.core.exr import read_frame
 from tests.system.refusals import Refused, mentions
+from tests.system.test_colour import LINES, projector
+from tests.system.test_mosaic import camera_behind_filters
+from tests.system.test_mosaic import sheet as coloured_sheet
 
 
 def frames_of(run: Path) -> dict[str, bytes]:
     return {path.name: read_frame(path)[0]["DN"].tobytes() for path in sorted(run.glob("frame_*.exr"))}
+
+
+def numbers_of(light: Path) -> dict[str, bytes]:
+    """All that a file of light holds but its plan, which states seconds."""
+    found: dict[str, bytes] = {}
+    with h5py.File(light) as file:
+        file.visititems(
+            lambda name, each: (
+                found.update({name: each[()].tobytes()} if each.dtype.kind in "iuf" else {})
+                if isinstance(each, h5py.Dataset)
+                else None
+            )
+        )
+    assert len(found) > 8
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +68,20 @@ def test_a_plan_is_written_and_captured(
         (("--light", "light.h5"), ("--plan", "leave out --plan or --light")),
     ):
         mentions(refused("capture", *devices, "--plan", file, *options, "-o", tmp_path / "new"), *fragments)
+    traced = [
+        call("transport", *(lab.arguments if "--patterns" in more else devices), *more, "-o", tmp_path / name)
+        for name, more in (("one.h5", ("--patterns", "dots:4")), ("two.h5", ("--plan", file)))
+    ]
+    assert [each.code for each in traced] == [0, 0] and "frames of dots:4" in traced[1].out
+    assert numbers_of(tmp_path / "one.h5") == numbers_of(tmp_path / "two.h5")
+    for options, fragments in (
+        (("--patterns", "dots:2"), ("--patterns 'dots:2': the plan was made for 'dots:4'; plan anew",)),
+        (("--accuracy", "1e-3"), ("--accuracy 0.001: the plan was made for 0.005",)),
+    ):
+        mentions(refused("transport", *devices, "--plan", file, *options, "-o", tmp_path / "new.h5"), *fragments)
     other = lab.write_scene("laboratory_moved", sheet_z=390)
+    line = refused("transport", other, *devices[1:], "--plan", file, "-o", tmp_path / "new.h5")
+    mentions(line, "--plan was made of another scene: the content of its XML differs")
     line = refused("capture", other, *devices[1:], "--plan", file, "-o", tmp_path / "new")
     mentions(line, "--plan was made of another scene: the content of its XML differs")
 
@@ -71,3 +104,137 @@ def test_light_is_written_and_captured(
         mentions(refused("capture", *devices, "--light", file, *options, "-o", tmp_path / "new"), *fragments)
     lit = refused("capture", lab.scene, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "new")
     mentions(lit, "--light was made of another projector: ")
+
+
+def test_what_is_read_is_not_replaced_and_another_mask_of_its_name_is_seen(
+    call: Callable[..., Any], refused: Refused, lab: Any, devices: tuple[object, ...], tmp_path: Path
+) -> None:
+    """Neither the plan by light that is traced by it, nor files of camera, its drawn mask and projector, with
+    --overwrite. (Planted: each left out; once, `transport --plan p.json -o p.json --overwrite` took the plan away.)"""
+    np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 0]))
+    drawn, projector, file = tmp_path / "drawn.toml", tmp_path / "projector.toml", tmp_path / "plan.json"
+    drawn.write_text(lab.camera.read_text() + '\n[mask]\nkind = "drawing"\nfeature_mm = 0.06\nfile = "bars.npy"\n')
+    projector.write_text(lab.projector.read_text())
+    own = lab.scene, "--camera", drawn, "--projector", projector
+    assert call("plan", *own, "--patterns", "dots:2", "--accuracy", 0.1, "-o", file).code in (0, 1)
+    for path in (drawn, projector, tmp_path / "bars.npy"):
+        mentions(refused("plan", *own, "-o", path, "--overwrite"), f"output {path}: would replace", "which is read")
+    for path in (file, drawn):
+        line = refused("transport", *own, "--plan", file, "-o", path, "--overwrite")
+        mentions(line, f"output {path}: would replace", "which is read")
+    light = tmp_path / "light.h5"
+    assert call("transport", *own, "--plan", file, "-o", light).code in (0, 1)
+    np.save(tmp_path / "bars.npy", np.outer([1.0, 0, 1, 1], [0, 1.0, 1, 1]))  # of the same name
+    for known in (("--plan", file), ("--light", light, "--patterns", "dots:2")):
+        line = refused("capture", *own, *known, "-o", tmp_path / "run")
+        mentions(line, f"{known[0]} was made of another camera: the content of mask_plate differs")
+
+
+def test_what_python_warns_of_is_a_line_of_the_command_line(
+    call: Callable[..., Any], lab: Any, devices: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A note on stderr when all is done, without file and line of a program, and not among the JSON. (Planted: Python's
+    own words, as until 0.6.0 `mitsim demo --patterns dots:2` had them.)"""
+    file = tmp_path / "light.h5"
+    assert call("transport", *lab.arguments, "--patterns", "dots:4", "-o", file).code == 0
+    monkeypatch.setattr("mitsim.acquire.capture._foreign", lambda *_: "these frames are\nnoisier")
+    known = "capture", *devices, "--light", file, "--patterns", "dots:2", "--json", "-o"
+    done = call(*known, tmp_path / "run")
+    assert done.code == 0 and done.payload["frames"] == 4 and done.err == "mitsim: note: these frames are noisier\n"
+    assert len(call(*known, tmp_path / "run").refusal.splitlines()) == 1
+
+
+# ---- in colour
+
+
+OF_COLOUR = "--patterns", "dots:2", "--accuracy", 0.05, "--json"
+
+
+@pytest.fixture(scope="module")
+def sheet(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
+    """A scene with a coloured sheet, which two bands tell to the accuracy, and options of a projector of three
+    lines."""
+    lines = projector(tmp_path_factory.mktemp("devices") / "lines.toml", LINES)
+    return coloured_sheet(shared_scene("sheet of a plan")), "--projector", lines
+
+
+@pytest.fixture(scope="module")
+def filters(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
+    """Options of a camera behind colour filters."""
+    return "--camera", camera_behind_filters(tmp_path_factory.mktemp("camera") / "filters.toml")
+
+
+def same_run(one: Path, other: Path) -> bool:
+    """Whether frames, truths and configurations are equal, of all lines."""
+    files = [sorted(path.relative_to(run) for path in run.rglob("*.exr")) for run in (one, other)]
+    assert files[0] and files[0] == files[1]
+    stated = [
+        [json.loads(path.read_text())["configuration"] for path in sorted(run.rglob("manifest.json"))]
+        for run in (one, other)
+    ]
+    equal = [read_frame(one / name)[0] for name in files[0]], [read_frame(other / name)[0] for name in files[0]]
+    return stated[0] == stated[1] and all(
+        np.array_equal(first[channel], second[channel])
+        for first, second in zip(*equal, strict=True)
+        for channel in first
+    )
+
+
+def test_what_auto_chose_is_captured_by_its_plan(
+    shell: Callable[..., Any], sheet: tuple[object, ...], tmp_path: Path
+) -> None:
+    """Two bands, and not chosen again; said again or not, they are captured as --colour auto itself does. (Planted:
+    the accuracy that colours left taken for the one asked for; bands captured as lines.)"""
+    file, options = tmp_path / "plan.json", OF_COLOUR
+    assert shell("plan", *sheet, *options, "--colour", "auto", "-o", file).payload["colour"]["chosen"] == "bands:2"
+    known = "capture", *sheet, "--plan", file
+    done = shell(*known, "--colour", "auto", *options, "-o", tmp_path / "run").payload
+    assert [line["wavelength_nm"] for line in done["channels"]] == [490.0, 638.0]
+    assert shell("capture", *sheet, *options, "--colour", "auto", "-o", tmp_path / "own").code == 0
+    assert same_run(tmp_path / "run", tmp_path / "own")
+    refusal = shell(*known, "-o", tmp_path / "none").refusal
+    mentions(refusal, '--plan was made of another colour: {"filters": false', "none here")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("colour", ["bands:2", "lines", "mosaic"])
+def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
+    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path, colour: str
+) -> None:
+    """Frames of each line, and of all lines behind filters, are those of the capture that plans itself. Another word
+    of --colour, and light by pixel, of which none is told apart, are refused in a line before anything is written.
+    (Planted: lines of a plan not compared; light traced in another variant.)"""
+    file, options = tmp_path / "plan.json", (*OF_COLOUR, *(filters if colour == "mosaic" else ()))
+    assert shell("plan", *sheet, *options, "--colour", colour, "-o", file).code == 0
+    for name, more in (("run", ("--plan", file)), ("own", ())):
+        assert shell("capture", *sheet, *options, *more, "--colour", colour, "-o", tmp_path / name).code == 0
+    assert same_run(tmp_path / "run", tmp_path / "own")
+    for other in {"no", "auto", "bands:1", "lines", "mosaic"} - {colour}:
+        devices = filters if other == "mosaic" else ()
+        line = shell("capture", *sheet, "--plan", file, "--colour", other, *devices, "-o", tmp_path / "none").refusal
+        asked_auto = "--colour auto: the plan was made with another word of --colour; give that"
+        mentions(line, asked_auto if other == "auto" else "--plan was made of another colour: ")
+    for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
+        line = shell("transport", *sheet, "--plan", file, "--variant", variant, "-o", tmp_path / "none").refusal
+        mentions(line, "--plan was made of another colour: ")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_light_is_of_no_colour(
+    shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path
+) -> None:
+    """What told no line apart is exposed as no line, by no word of --colour and no camera behind filters."""
+    file = tmp_path / "light.h5"
+    assert shell("transport", *sheet, *OF_COLOUR, "-o", file).code == 0
+    known = "capture", *sheet, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "none"
+    for options, sentence in (
+        (("--colour", "lines"), "--colour: has no effect on --light"),
+        (("--colour", "auto"), "--colour: has no effect on --light"),
+        (("--colour", "mosaic", *filters), "--colour: has no effect on --light"),
+        (filters, "has a mosaic GBRG"),
+        (("--variant", "llvm_ad_spectral"), "--light was made of another variant: llvm_ad_mono there"),
+    ):
+        mentions(shell(*known, *options).refusal, sentence)
+    assert not (tmp_path / "none").exists()

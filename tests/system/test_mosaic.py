@@ -48,16 +48,22 @@ def lit(shared_scene: Callable[..., Path]) -> Path:
 
 @pytest.fixture(scope="module")
 def devices(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
-    """Options of a camera behind filters, of superpixels as the scene has them, and of a projector of three lines."""
+    """Options of a camera behind filters, and of a projector of three lines."""
     folder = tmp_path_factory.mktemp("devices")
+    camera = camera_behind_filters(folder / "filters.toml")
+    return "--camera", str(camera), "--projector", str(projector(folder / "lines.toml", LINES))
+
+
+def camera_behind_filters(path: Path) -> Path:
+    """A file of a camera behind filters, of superpixels as the scene has them."""
     single = CAMERA.replace("5.86", "11.72").replace("binning = 2\n", "").replace("quantum_efficiency = 0.75\n", "")
     tables = "".join(
         f"[mosaic_curves.{name}]\nwavelengths_nm = {sorted(map(float, parts))}\n"
         f"efficiency = {[parts[nm] for nm in sorted(parts)]}\n"
         for name, parts in CURVES.items()
     )
-    (folder / "filters.toml").write_text(f'{single}mosaic = "GBRG"\n{tables}')
-    return "--camera", str(folder / "filters.toml"), "--projector", str(projector(folder / "lines.toml", LINES))
+    path.write_text(f'{single}mosaic = "GBRG"\n{tables}')
+    return path
 
 
 def test_a_pixel_sees_each_line_through_its_own_filter(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import tempfile
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -26,7 +27,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
-from mitsim.core.worker import workers
+from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
 from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, find_experiment
 from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures
@@ -482,6 +483,7 @@ def _serve(name: str, folders: tuple[str, str], pipe: Connection) -> None:
     """Measure every batch that comes, point by point, until the parent is gone; ``folders`` are for temporary files and
     for calibrations that are shared."""
     tempfile.tempdir, shared = folders
+    warnings.showwarning = lambda message, *_: say_note(str(message))
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             for point in pipe.recv():

@@ -173,13 +173,10 @@ class Studio:
         patterns
             the family, or its name.
         """
+        factors = self.factors(setup, seed) if model == RENDERED else None  # first: a mask may have none
         lit = self.lit_scene(setup)
         family = lit.bench.family(patterns, seed) if isinstance(patterns, str) else patterns
-        return (
-            lit.rendered_frames(self.factors(setup, seed), family, seed)
-            if model == RENDERED
-            else lit.idealised_frames(family, seed)
-        )
+        return lit.idealised_frames(family, seed) if factors is None else lit.rendered_frames(factors, family, seed)
 
     def image(
         self,

@@ -16,6 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.runs import load_run
 from mitsim.light import light
+from mitsim.light.plan import Plan
 from mitsim.metrics import psnr
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruct import reconstruct
@@ -46,6 +47,22 @@ def test_first_sentence_of_the_opening_comment(tmp_path: Path, text: str, line: 
 def test_every_shipped_scene_says_what_it_is(path: Path) -> None:
     line = scene_line(path)
     assert line.startswith(f"{path.parent.name}: ") and len(line) > 40
+
+
+@pytest.mark.parametrize(("patterns", "planned"), [("dots:2", "dots:5"), ("uniform", "dots:5"), ("dots:7", "dots:7")])
+def test_light_is_planned_for_the_sparsest_family_that_is_shown(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    patterns: str, planned: str,
+) -> None:  # fmt: skip
+    """Of others the plan does not tell what it leaves. (Planted: the main family's plan.)"""
+
+    def trace(bench: Bench, plan: Plan, job: Job) -> None:
+        raise MitsimError(f"traced for {plan.known_request.patterns} at {plan.accuracy:g}")
+
+    monkeypatch.setattr("mitsim.studies.demo.trace_request", trace)
+    bench = open_bench(small_scene(), variant)
+    with pytest.raises(MitsimError, match=f"^traced for {planned} at 0.2$"):
+        demo(bench, tmp_path / "demo", Request.of(patterns=patterns, accuracy=0.2))
 
 
 @pytest.mark.slow
