@@ -140,7 +140,7 @@ class EffectRuns:
         if more <= samples:
             return replicates, samples
         # Seeds of their own: that the first replicates are vague says nothing of these.
-        return [tracer.trace(integer(seed, "closer"), 0, more) for seed in self.seeds], more
+        return tracer.replicates([integer(seed, "closer") for seed in self.seeds], more)[0], more
 
     def _indirect_samples(self, replicates: Sequence[PathSamples], samples: int) -> float:
         """Samples of all groups that the projector's side's light takes, as noisy as in ``replicates`` of so many
@@ -216,7 +216,7 @@ class EffectRuns:
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
         samples = max(1, self._closer[1] // SHARED_COST)
-        seen = [tracer.trace(integer(seed, "shared"), 0, samples) for seed in self.seeds[:_SHARING]]
+        seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
         seen += [PathSamples.none()] * (REPLICATES - _SHARING)
         frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
         shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
@@ -276,7 +276,7 @@ class EffectRuns:
         tracer = None if none else PASSES[name].tracer(simulation)
         if tracer is None:
             return [PathSamples.none()] * REPLICATES
-        return [tracer.trace(integer(seed, name), 0, self.sample.followed) for seed in self.seeds]
+        return tracer.replicates([integer(seed, name) for seed in self.seeds], self.sample.followed)[0]
 
     @staticmethod
     def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
@@ -584,7 +584,7 @@ class FollowedRuns(AnchorRuns):
     def _few_by_tracer(self) -> list[list[PathSamples]]:
         """The same by tracer."""
         tracers = _tracers(self._simulation(self.few))
-        return [[tracer.trace(seed, 0, self._samples) for seed in self._seeds] for tracer in tracers]
+        return [tracer.replicates(self._seeds, self._samples)[0] for tracer in tracers]
 
     def _at_anchors(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(anchors), self._samples
@@ -595,7 +595,7 @@ class FollowedRuns(AnchorRuns):
         found = []
         for first in range(0, samples, each):
             some = min(each, samples - first)
-            traced = [[tracer.trace(seed, first, some) for seed in self._seeds] for tracer in tracers]
+            traced = [tracer.replicates(self._seeds, some, first=first)[0] for tracer in tracers]
             found.append(self._form(grids, _join(traced)))
         return np.asarray(sum(found))
 

@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
-from mitsim.core.job import compiled_kernels
 from mitsim.devices.projector import Lines
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
@@ -61,37 +60,6 @@ class DirectTracer(Tracer):
     def paths_per_sample(self) -> int:
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
-
-    @keep_scenes()
-    def replicates(self, seeds: Sequence[int], *samples: int) -> list[list[PathSamples]]:
-        """Light of the first so many ``samples`` of each of the ``seeds``, by number; one kernel traces it all.
-
-        Parameters
-        ----------
-        seeds
-            of the random numbers.
-        *samples
-            numbers, the largest last.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`trace`.
-        """
-        first = self.paths_per_sample * samples[-1] * np.arange(len(seeds))
-        ranges = [(start, start + self.paths_per_sample * count) for count in samples for start in first]
-        found: list[list[PathSamples]] = [[] for _ in ranges]
-        for tracer in self.per_wavelength:
-            before = 0
-            for flight in tracer._flights(seeds, 0, samples[-1]):
-                seen, anchor = tracer._sightings(flight)
-                parts = PathSamples.fetch_parts(seen, DIRECT, np.array(ranges) - before, anchor)
-                for own, part in zip(found, parts, strict=True):
-                    own.append(part)
-                before += dr.width(flight.index)
-        compiled_kernels()
-        joined = list(map(PathSamples.join, found))
-        return [joined[start : start + len(seeds)] for start in range(0, len(joined), len(seeds))]
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         seen, anchor = self._sightings(flight)

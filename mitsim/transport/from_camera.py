@@ -491,7 +491,7 @@ class LampTracer(FromCameraTracer):
 
     def _by_band(self, found: PathSamples) -> PathSamples:
         """An entry for each band of those that were ``found``, path by path."""
-        assert found.lines is not None, "told apart by band"
+        assert found.lines is not None and found.lane is not None, "told apart by band"
         light = found.lines.T.ravel().astype(np.float64)
         several = PathSamples(
             **{
@@ -500,6 +500,7 @@ class LampTracer(FromCameraTracer):
             },
             pixel=(found.pixel[:, None] + self.counted.first + np.arange(MOST_LINES)).ravel(),
             value=light * self.counted.units[0],
+            lane=np.repeat(found.lane, MOST_LINES),
         )
         if not self.projector.by_line:
             return several
@@ -529,3 +530,14 @@ class CombinedTracer:
             as there.
         """
         return PathSamples.join([tracer.trace(seed, first, samples) for tracer in self.tracers])
+
+    def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
+        """The same of each of the ``seeds``; see :meth:`mitsim.transport.integrator.Tracer.replicates`.
+
+        Parameters
+        ----------
+        seeds, *samples, first
+            as there.
+        """
+        traced = [tracer.replicates(seeds, *samples, first=first) for tracer in self.tracers]
+        return [list(map(PathSamples.join, zip(*by_number, strict=True))) for by_number in zip(*traced, strict=True)]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsim.core.environment import keep_scenes
 from mitsim.core.job import compiled_kernels
@@ -141,6 +142,39 @@ class Tracer(ABC):
             place = number // each
             sample = number - place * each + dr.opaque(mi.UInt32, first)
             yield InFlight(dr.gather(mi.UInt32, known, place), sample, index)
+
+    @keep_scenes()
+    def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
+        """Light of so many ``samples`` of each of the ``seeds``, by number; one kernel traces it all.
+
+        Parameters
+        ----------
+        seeds
+            of the random numbers.
+        *samples
+            numbers, the largest last.
+        first
+            of the samples.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`trace`.
+        """
+        each, most = self.paths_per_sample, samples[-1]
+        starts = [each * most * place for place in range(len(seeds))]
+        ranges = np.array([(start, start + each * count) for count in samples for start in starts])
+        found: list[list[PathSamples]] = [[] for _ in ranges]
+        for tracer in self.per_wavelength:
+            before = 0
+            for flight in tracer._flights(seeds, first, most):
+                for launched in tracer._launch(flight):
+                    for own, part in zip(found, launched.by_lane(ranges - before), strict=True):
+                        own.append(part)
+                before += dr.width(flight.index) * self.connections_per_path
+        compiled_kernels()
+        joined = list(map(PathSamples.join, found))
+        return [joined[start : start + len(seeds)] for start in range(0, len(joined), len(seeds))]
 
     @keep_scenes()
     def trace(

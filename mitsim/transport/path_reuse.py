@@ -379,6 +379,7 @@ class ReusedPaths(ProjectorPaths):
             value=light[pairs].astype(np.float64),
             kind=np.full(len(pairs), INDIRECT, dtype=np.int16),
             lines=lines if self.by_line else None,
+            lane=index,
         )
 
 

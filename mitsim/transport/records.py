@@ -118,6 +118,8 @@ class PathSamples:
         (m,) :data:`DIRECT` or :data:`INDIRECT` light of the projector, or :data:`AMBIENT` light.
     lines
         (4, m) ``value`` by line, then zeros, in single precision as it was traced; None where it is not told apart.
+    lane
+        (m,) number of the connection among those of its launch, increasing; None but as it was fetched.
     """
 
     pixel: IntArray
@@ -129,6 +131,7 @@ class PathSamples:
     value: FloatArray
     kind: npt.NDArray[np.int16]
     lines: npt.NDArray[np.float32] | None = None
+    lane: IntArray | None = None
 
     @classmethod
     def join(cls, parts: Sequence[PathSamples]) -> PathSamples:
@@ -166,21 +169,6 @@ class PathSamples:
         MitsimError
             when the light is NaN or infinite.
         """
-        return cls.fetch_parts(seen, kind, np.array([[0, dr.width(seen.value)]]), anchors)[0]
-
-    @classmethod
-    def fetch_parts(
-        cls, seen: Sightings, kind: int, ranges: IntArray, anchors: tuple[mi.UInt32, mi.UInt32] | None = None
-    ) -> list[PathSamples]:
-        """The same of some ranges of lanes.
-
-        Parameters
-        ----------
-        seen, kind, anchors
-            as for :meth:`fetch`.
-        ranges
-            (parts, 2) lane with which each begins, and before which it ends.
-        """
         # Together: one by one, each would trace all paths again.
         dr.eval(seen, anchors)
         light = np.array(seen.value)
@@ -193,7 +181,7 @@ class PathSamples:
             return (found if whole else found[..., lit]).astype(dtype)
 
         none = np.zeros(lit.size, np.int64)
-        every = cls(
+        return cls(
             pixel=lit_ones(seen.pixel, np.int64),
             anchor_row=none if anchors is None else lit_ones(anchors[0], np.int64),
             anchor_column=none if anchors is None else lit_ones(anchors[1], np.int64),
@@ -203,8 +191,8 @@ class PathSamples:
             value=lit_ones(light, np.float64),
             kind=np.full(lit.size, kind, dtype=np.int16),
             lines=None if seen.lines is None else lit_ones(seen.lines, np.float32),
+            lane=lit,
         )
-        return [every.where(slice(*part)) for part in np.searchsorted(lit, ranges).tolist()]
 
     @classmethod
     def none(cls) -> PathSamples:
@@ -218,13 +206,18 @@ class PathSamples:
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
+    def by_lane(self, ranges: IntArray) -> list[PathSamples]:
+        """Those of some ``ranges`` (parts, 2): the lane with which each begins, and before which it ends."""
+        assert self.lane is not None, "as it was fetched"
+        return [self.where(slice(*part)) for part in np.searchsorted(self.lane, ranges).tolist()]
+
     def where(self, chosen: npt.NDArray[np.bool_] | slice) -> PathSamples:
         """The entries that are ``chosen`` (m,); consecutive ones are not copied."""
         lines = None if self.lines is None else self.lines[:, chosen]
         return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)
 
 
-_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name != "lines")
+_ARRAYS = tuple(name for name in PathSamples.__dataclass_fields__ if name not in ("lines", "lane"))
 """What is told of each entry."""
 
 

@@ -16,6 +16,7 @@ from mitsim.transport.records import PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 SEEDS = (7, 2**32 - 1, 11)
+_TRACER = {"shared": "indirect"}
 GLOSSY = """<emitter type="constant"><spectrum name="radiance" value="0.02"/></emitter>
     <shape type="sphere"><point name="center" x="-25" y="10" z="330"/> <float name="radius" value="30"/>
         <bsdf type="roughconductor"><float name="alpha" value="0.3"/></bsdf></shape>"""
@@ -55,18 +56,19 @@ def test_light_does_not_hang_on_how_paths_are_launched(
         assert alike(found, tracer.trace(seed, 0, 3))
 
 
-@pytest.mark.parametrize("name", ["direct", "anchored"])
+@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "shared", "at anchors", "from_camera"])
 def test_replicates_in_one_kernel_are_what_each_seed_traces(
     bench: Bench, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of each seed the first sample and the first three, to the bit, in launches that end within a seed's samples.
-    (Planted: every part begins with the first seed's; samples that go on from seed to seed.)"""
-    monkeypatch.setattr(Tracer, "paths_per_launch", 5 * 64)
-    settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)), anchors=2)
-    tracer = getattr(Simulation(bench, settings), name)
-    for samples, replicates in zip((1, 3), tracer.replicates(SEEDS, 1, 3), strict=True):
-        for seed, found in zip(SEEDS, replicates, strict=True):
-            expected = tracer.trace(seed, 0, samples)
-            assert len(expected.value) and all(
-                np.array_equal(getattr(found, name), getattr(expected, name)) for name in ("value", "pixel", "row")
-            )
+    """Of each seed the first sample and the first three, in launches that end within a seed's samples. (Planted: every
+    part begins with the first seed's; samples that go on from seed to seed; connections counted as paths.)"""
+    settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)))
+    simulation = Simulation(bench, replace(settings, anchors=2, followed_anchors=2, shared=name == "shared"))
+    tracer = simulation.at_anchors[0] if name == "at anchors" else getattr(simulation, _TRACER.get(name, name))
+    monkeypatch.setattr(type(tracer), "paths_per_launch", 5 * 64)
+    for first in (0, 2):
+        of_one, of_all = tracer.replicates(SEEDS, 1, 3, first=first)
+        assert all(replicate.value.size for replicate in of_all)
+        for samples, replicates in ((1, of_one), (3, of_all)):
+            for seed, found in zip(SEEDS, replicates, strict=True):
+                assert alike(found, tracer.trace(seed, first, samples))
