@@ -7,7 +7,6 @@ it meets one is handed out, drawn in proportion to its light."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
