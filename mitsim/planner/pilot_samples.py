@@ -187,9 +187,11 @@ class Sample:
         least, most = emitted.min(axis=1), emitted.max(axis=1)
         span = np.where(most > least, most - least, 1.0)
         pattern = (emitted - least[:, None]) / span[:, None]
-        frames = span[:, None, None] * self._class_frames(grid, replicates, pattern, known)
-        if least.any():
-            frames += least[:, None, None] * self._class_frames(grid, replicates, np.ones((1, emitted.shape[1])), known)
+        of_all = np.ones((int(least.any()), emitted.shape[1]))
+        seen = self._class_frames(grid, replicates, np.concatenate([pattern, of_all]), known)
+        frames = span[:, None, None] * seen[:, : len(pattern)]
+        if len(of_all):
+            frames += least[:, None, None] * seen[:, len(pattern) :]
         return frames / samples
 
     def lamps(
@@ -219,7 +221,7 @@ class Sample:
         missing = [place for place, key in enumerate(keys) if key not in known]
         classes_of = np.append(self.lighting.labels, [classes] * grid.bundle.lamps)
         size = grid.bundle.size
-        entries = [grid.bundle.entries(replicate) for replicate in replicates] if missing else []
+        entries = in_threads(grid.bundle.entries, replicates) if missing else []
         optics = grid.optics if any(len(place) for place, *_ in entries) else None
 
         def form(row: int) -> None:
