@@ -13,7 +13,7 @@ from pydantic import Field
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import NonNegative, Positive
-from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.parallel import in_threads
 
 Number = float | FloatArray
 Count = Annotated[int, Field(ge=1, le=4096)]
@@ -145,6 +145,8 @@ of the sensor a side for light that is followed over several surfaces or from th
 occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
+_AT_ONCE = 2**13
+"""Entries of frames that are multiplied at a time: some megabytes, where all of them are a hundred."""
 REPLICATES = 4
 """Independent replicates of the pilot, the fewest whose spread tells a standard error worth its name."""
 SURE = 2.35
@@ -262,11 +264,15 @@ class ErrorCovariance:
     @classmethod
     def between(cls, seen: Mapping[Approximation, FloatArray], energy: float) -> ErrorCovariance:
         """Of changes (replicates, ...) that were ``seen`` of frames whose squared norm is ``energy``."""
-        flat = np.array([change.reshape(REPLICATES, -1) for change in seen.values()]).reshape(
-            len(seen) * REPLICATES, -1
-        )
-        with single_threaded_blas():  # sums of several threads depend on their number in the last bits
-            pairs = (flat @ flat.T).reshape(len(seen), REPLICATES, len(seen), REPLICATES)
+        flat = [change.reshape(REPLICATES, -1) for change in seen.values()]
+
+        def multiply(first: int) -> FloatArray:
+            some = np.concatenate([change[:, first : first + _AT_ONCE] for change in flat])
+            return some @ some.T
+
+        count = len(flat) * REPLICATES
+        parts = in_threads(multiply, range(0, flat[0].shape[1] if flat else 0, _AT_ONCE))
+        pairs = sum(parts, np.zeros((count, count))).reshape(len(flat), REPLICATES, len(flat), REPLICATES)
         products = np.ascontiguousarray(pairs.transpose(1, 3, 0, 2))
         return cls(tuple(seen), products / energy if energy > 0 else products)
 
@@ -275,12 +281,11 @@ class ErrorCovariance:
 
         The mean product of two different replicates, and its jackknife over replicates.
         """
-        replicates = len(self.products)
-        pairs = np.zeros((replicates, replicates, len(chosen)))
-        for i, j in zip(*np.triu_indices(replicates, 1), strict=True):
-            pairs[i, j] = np.einsum("mp,mp->m", chosen @ self.products[i, j], chosen)
-        total, kept = pairs.sum(axis=(0, 1)), replicates * (replicates - 1) / 2
-        of_look = pairs.sum(axis=0) + pairs.sum(axis=1)
+        replicates, places = len(self.products), np.arange(len(self.products))
+        others = [self.products[place, places != place].sum(axis=0) for place in places]
+        of_look = np.array([np.einsum("mp,mp->m", chosen @ products, chosen) for products in others])
+        # Each pair is one of either replicate's.
+        total, kept = of_look.sum(axis=0) / 2, replicates * (replicates - 1) / 2
         without = (total - of_look) / (kept - replicates + 1)
         spread = np.sqrt((replicates - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
         return total / kept, spread
