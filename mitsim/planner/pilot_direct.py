@@ -346,15 +346,12 @@ def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) 
     seed
         of the rays.
     """
-    tracer = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels)
-    seen = tracer.trace(seed, 0, samples)
-    place = (np.searchsorted(pixels, seen.pixel) * _ANCHORS + seen.anchor_row) * _ANCHORS + seen.anchor_column
-    light = np.bincount(place, seen.value / samples, len(pixels) * _ANCHORS**2).reshape(-1, _ANCHORS, _ANCHORS)
+    light = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels).sums(seed, samples) / samples
     # Orthonormal polynomials at Chebyshev's nodes, by degree: the discrete cosine transform.
     angle = (np.arange(_ANCHORS) + 0.5) * np.pi / _ANCHORS
     basis = np.cos(np.outer(np.arange(_ANCHORS), angle)) * np.sqrt(2 / _ANCHORS)
     basis[0] /= np.sqrt(2)
-    squares = np.square(np.einsum("ka,pab,lb->pkl", basis, light, basis))
+    squares = np.square(basis @ light @ basis.T)
     smooth = squares[:, :SMOOTH, :SMOOTH].sum(axis=(1, 2))
     whole = squares.sum(axis=(1, 2))
     return np.asarray(whole - smooth), float(whole.sum())

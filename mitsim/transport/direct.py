@@ -60,6 +60,35 @@ class DirectTracer(Tracer):
         """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
+    @keep_scenes()
+    def sums(self, seed: int, samples: int) -> FloatArray:
+        """(m, anchors, anchors) light of each pixel at each anchor, summed over samples [W m^-2].
+
+        Parameters
+        ----------
+        seed
+            of the random numbers.
+        samples
+            the first so many of its sequence.
+
+        Raises
+        ------
+        MitsimError
+            as :meth:`trace`.
+        """
+        total = np.zeros(self.paths_per_sample)
+        for tracer in self.per_wavelength:
+            parts = list[npt.NDArray[np.float32]]()
+            for flight in tracer._flights([seed], 0, samples):
+                # All that other traces fetch, in the same kernel.
+                found = tracer._sightings(flight)
+                dr.eval(found)
+                parts.append(np.array(found[0].value))
+            light = np.concatenate(parts)
+            check_finite(light)
+            total += light.reshape(samples, -1).sum(axis=0, dtype=np.float64)
+        return total.reshape(self.points.anchors, self.points.anchors, len(self._pixels)).transpose(2, 0, 1)
+
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         seen, anchor = self._sightings(flight)
         if accumulator is None:

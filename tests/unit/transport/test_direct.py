@@ -215,3 +215,15 @@ def test_chosen_pixels_are_traced_as_among_all(white: Bench) -> None:
     assert np.array_equal(np.sort(mine.pixel), np.sort(expected.pixel)) and len(mine.value) == 12
     for name in ("value", "row", "column"):
         assert np.sort(getattr(mine, name)) == pytest.approx(np.sort(getattr(expected, name)), rel=1e-6)
+
+
+def test_sums_are_those_of_what_is_traced(large: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By pixel and anchor, in launches that end within a sample. (Planted: rows and columns of anchors exchanged.)"""
+    chosen = np.array([3, 17, 250])
+    some = DirectTracer(large.setup, 2, pixels=chosen)
+    seen = some.trace(5, 0, 3)
+    place = (np.searchsorted(chosen, seen.pixel) * 2 + seen.anchor_row) * 2 + seen.anchor_column
+    monkeypatch.setattr(integrator.Tracer, "paths_per_launch", 7)
+    found = some.sums(5, 3)
+    assert np.allclose(found, np.bincount(place, seen.value, 12).reshape(3, 2, 2), rtol=1e-6)
+    assert (found > 0).all() and not np.allclose(found, found.transpose(0, 2, 1), rtol=1e-3)
