@@ -326,8 +326,9 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
         again = samples <= _TIMED * every
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
-    _seconds(simulation, name, seed, labels, 1)  # compiles the kernel
-    launch, samples = once(1), max(1, _REHEARSED // paths_per_sample)
+    # Twice, as the first may compile the kernel.
+    launch = min(_seconds(simulation, name, seed, labels, 1) for _ in range(2))
+    samples = max(1, _REHEARSED // paths_per_sample)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples
     while _MORE * samples * paths_per_sample <= at_once and _MORE * samples <= _TIMED * every:
