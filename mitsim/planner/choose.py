@@ -139,7 +139,8 @@ class Candidates:
     """
 
     def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
-        self.pilot_result = pilot_result
+        self.pilot_result, self.switches = pilot_result, switches
+        self._chosen: dict[tuple[float, float], Candidate] = {}
         counts = [_choices(pilot_result, name, switches) for name in COUNTED]
         rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
         rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
@@ -166,8 +167,10 @@ class Candidates:
         accuracy, sure
             as for :func:`cheapest`.
         """
-        table, index = self.best(accuracy, sure)
-        return table.alone(index).candidate
+        if (accuracy, sure) not in self._chosen:
+            table, index = self.best(accuracy, sure)
+            self._chosen[accuracy, sure] = table.alone(index).candidate
+        return self._chosen[accuracy, sure]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
@@ -201,19 +204,18 @@ def _table_of(
     return _Table(accuracy, pilot_result, (settings.effects, cells), row, _omissions(switches), sure)
 
 
-def value_of_refining(
-    accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool]
-) -> tuple[float, Approximation]:
+def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
     """Work that knowing the pilot result for certain could save, and the part that is known worst.
 
     Parameters
     ----------
-    accuracy, pilot_result, switches
+    accuracy
         as for :func:`cheapest`.
+    candidates
+        of the pilot result.
     """
-    candidates = Candidates(pilot_result, switches)
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
-    unsure = _table_of(accuracy, pilot_result, hopeful.settings, switches, 0.0).unsure
+    unsure = _table_of(accuracy, candidates.pilot_result, hopeful.settings, candidates.switches, 0.0).unsure
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst

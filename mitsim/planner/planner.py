@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import drjit as dr
@@ -28,7 +28,6 @@ from mitsim.planner.choose import (
     Candidate,
     Candidates,
     accuracy_for_time,
-    cheapest,
     predicted_candidate,
     time_warnings,
     value_of_refining,
@@ -104,29 +103,30 @@ def make_plan(
     _refuse_unfit(bench, switches or {})
     started = time.perf_counter()
     runs = pilot.PilotRuns(bench, lighting, accuracy, seed, lines)
-    notes = tuple(_refine(runs, accuracy, switches or {}))
-    plan = _decide(runs, accuracy, switches or {}).taking(plan=time.perf_counter() - started)
+    candidates, notes = _refine(runs, accuracy, switches or {})
+    plan = _decide(runs, accuracy, candidates).taking(plan=time.perf_counter() - started)
     return replace(plan, notes=notes)
 
 
-def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Iterator[str]:
-    """Let ``runs`` look closer as long as that is worth it; what is to be said where they may not, as that would be a
-    large part of the run."""
+def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> tuple[Candidates, tuple[str, ...]]:
+    """Let ``runs`` look closer as long as that is worth it: what may be chosen then, and what is to be said where they
+    may not, as that would be a large part of the run."""
     spent = 0.0
     while True:
-        worth, part = value_of_refining(accuracy, runs.pilot_result, switches)
+        candidates = Candidates(runs.pilot_result, switches)
+        worth, part = value_of_refining(accuracy, candidates)
         run = pilot.run_of(part)
         work = runs.work(run)
         if _SELDOM * work > worth:
-            return
+            return candidates, ()
         spent += work
-        whole = cheapest(accuracy, runs.pilot_result, switches).work
+        whole = candidates.choice(accuracy).work
         if spent > _OF_RUN * whole:
-            yield (
+            note = (
                 f"{part.name.replace('_', ' ')} and all that hangs on them are chosen safely: to look closer would "
                 f"take {spent:.1f} s, more than a fifth of the {whole:.1f} s of light and frames"
             )
-            return
+            return candidates, (note,)
         runs.refine(run)
 
 
@@ -156,17 +156,19 @@ def plan_within(
     runs = pilot.PilotRuns(bench, lighting, FIRST_ACCURACY, seed)
     around += runs.seconds
     again = _LONGER * runs.seconds
-    found = accuracy_for_time(Candidates(runs.pilot_result, switches), seconds - around, FIRST_ACCURACY)
+    candidates = Candidates(runs.pilot_result, switches)
+    found = accuracy_for_time(candidates, seconds - around, FIRST_ACCURACY)
     # What a look tells of finer accuracies than its own is their price, not whether they are kept.
-    aim = accuracy_for_time(Candidates(runs.pilot_result, switches), seconds - around - again, 0.0, kept=False)
+    aim = accuracy_for_time(candidates, seconds - around - again, 0.0, kept=False)
     if found.fits and aim.fits and aim.accuracy < FIRST_ACCURACY:
         around += again
         closer = pilot.PilotRuns(bench, lighting, aim.accuracy, seed)
-        finer = accuracy_for_time(Candidates(closer.pilot_result, switches), seconds - around, aim.accuracy)
+        others = Candidates(closer.pilot_result, switches)
+        finer = accuracy_for_time(others, seconds - around, aim.accuracy)
         # It may say that no accuracy is kept at all, and then has the loosest.
         if finer.fits and finer.accuracy <= found.accuracy:
-            runs, found = closer, finer
-    plan = _decide(runs, found.accuracy, switches).taking(plan=time.perf_counter() - started)
+            runs, candidates, found = closer, others, finer
+    plan = _decide(runs, found.accuracy, candidates).taking(plan=time.perf_counter() - started)
     return replace(plan, asked_seconds=seconds, warnings=(*time_warnings(found, seconds, around), *plan.warnings))
 
 
@@ -179,10 +181,11 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
         check_waves(bench.geometry, bench.spectrum)
 
 
-def _decide(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-    """The plan at an ``accuracy`` of what ``runs`` found, with the unit costs of its choice measured."""
-    pilot_result, bench = runs.pilot_result, runs.bench
-    chosen = cheapest(accuracy, pilot_result, switches)
+def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> Plan:
+    """The plan at an ``accuracy`` of the ``candidates`` that ``runs`` left, with the unit costs of its choice
+    measured."""
+    pilot_result, switches, bench = candidates.pilot_result, candidates.switches, runs.bench
+    chosen = candidates.choice(accuracy)
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
         pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)

@@ -28,7 +28,6 @@ from mitsim.light.settings import GROUPS, PilotResult, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, planner
-from mitsim.planner.choose import Candidate
 from mitsim.planner.explain import SceneFacts
 from mitsim.planner.planner import make_plan
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT
@@ -281,11 +280,12 @@ def test_a_plan_of_several_lines_is_priced_for_all(
     """
     seen: list[int] = []
 
-    def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool]) -> Candidate:
-        seen.append(pilot_result.forming.lines)
-        return choose.cheapest(accuracy, pilot_result, switches)
+    class Candidates(choose.Candidates):
+        def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
+            seen.append(pilot_result.forming.lines)
+            super().__init__(pilot_result, switches)
 
-    monkeypatch.setattr(planner, "cheapest", cheapest)
+    monkeypatch.setattr(planner, "Candidates", Candidates)
     plan = planner.make_plan(bench, family, 1e-2, 0, dict.fromkeys(EFFECTS, False), lines=3)
     assert seen == [3]
     monkeypatch.setattr(memory, "workers", lambda: 1)  # files one line at a time

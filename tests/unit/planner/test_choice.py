@@ -22,7 +22,7 @@ from mitsim.light.settings import (
     SharpPixels,
 )
 from mitsim.optics.forming import bound_over_error
-from mitsim.planner.choose import cheapest, counts_of, predicted_candidate, value_of_refining
+from mitsim.planner.choose import Candidates, cheapest, counts_of, predicted_candidate, value_of_refining
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -162,15 +162,16 @@ def test_what_the_pilot_cannot_tell_is_on() -> None:
     assert "interreflection" not in cheapest(1e-3, sure, {}).settings.effects
     careful, hopeful = (cheapest(1e-3, unsure, {}, sigmas).settings.effects for sigmas in (2.35, 0.0))
     assert "interreflection" in careful
-    worth, part = value_of_refining(1e-3, unsure, {})
+    worth, part = value_of_refining(1e-3, Candidates(unsure, {}))
     assert worth > 0 and part == Approximation("interreflection") and "interreflection" not in hopeful
-    assert value_of_refining(1e-3, sure, {})[0] == 0
+    assert value_of_refining(1e-3, Candidates(sure, {}))[0] == 0
 
 
 def test_nothing_is_worth_knowing_where_no_luck_would_keep_the_accuracy() -> None:
     """Every number of cells is known to leave all of the light. (Planted: a second's worth.)"""
     sizes = {part: 1.0 if part.name == "cells" else size for part, size in SIZES.items()}
-    assert value_of_refining(1e-3, replace(PILOT_RESULT, changes=changes(sizes), apart={}), {})[0] == 0.0
+    certain = replace(PILOT_RESULT, changes=changes(sizes), apart={})
+    assert value_of_refining(1e-3, Candidates(certain, {}))[0] == 0.0
 
 
 @pytest.mark.parametrize("accuracy", [1e-3, 1e-4, 1e-6])
@@ -342,7 +343,7 @@ def test_the_value_of_refining_coarse_cells_names_them() -> None:
     products = PILOT_RESULT.changes.products.copy()
     products[:, :, place, place] = changes({Approximation("indirect cells", 1): 1e-4}, 8e-3).products[:, :, 0, 0]
     unsure = replace(ONE_CLASS, changes=ErrorCovariance(PILOT_RESULT.changes.parts, products))
-    worth, part = value_of_refining(1e-3, unsure, {})
+    worth, part = value_of_refining(1e-3, Candidates(unsure, {}))
     assert worth > 0 and part == Approximation("indirect cells", 1) and run_of(part) == "effects"
 
 

@@ -69,8 +69,8 @@ def runs(made: Plan, monkeypatch: pytest.MonkeyPatch) -> CountedRuns:
             seen.asked.append((accuracy, seed))
             self.pilot_result = seen
 
-    def decided(look: PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> Plan:
-        seen.decided = look.pilot_result, accuracy, switches
+    def decided(look: PilotRuns, accuracy: float, candidates: Invented) -> Plan:
+        seen.decided = look.pilot_result, accuracy, candidates.switches
         return replace(made, accuracy=accuracy, warnings=(OWN,))
 
     monkeypatch.setattr(pilot, "PilotRuns", PilotRuns)
@@ -166,11 +166,11 @@ def test_closer_looks_take_a_fifth_of_the_run_at_most(
     whole = cheapest(3e-3, ONE_CLASS, {}).work
     looked: Any = Refined(part * whole)
     monkeypatch.setattr(planner, "value_of_refining", lambda *_: (math.inf, Approximation("followed_anchors", 2)))
-    (note,) = planner._refine(looked, 3e-3, {})
+    _, (note,) = planner._refine(looked, 3e-3, {})
     assert looked.refined == ["followed"] * closer
     assert "followed anchors and all that hangs on them are chosen safely" in note and f"the {whole:.1f} s" in note
     monkeypatch.setattr(planner, "value_of_refining", lambda *_: (0.0, Approximation("followed_anchors", 2)))
-    assert not list(planner._refine(looked, 3e-3, {})), "worth nothing"
+    assert not planner._refine(looked, 3e-3, {})[1], "worth nothing"
 
 
 LAUNCH_S, PATH_S = 0.02, 1e-7
