@@ -103,7 +103,7 @@ def draw(folder: Path) -> None:
         "caustics": np.minimum(caustics / np.quantile(caustics, 0.9999), 1),
     }
     for name, values in drawings.items():
-        io.imsave(folder / f"{name}.png", np.round(255 * values).astype(np.uint8), check_contrast=False)
+        io.imsave(folder / f"{name}.png", np.round(255.0 * values).astype(np.uint8), check_contrast=False)
     shipped = Path("scenes/photograph")
     for half in (10, 1):
         (folder / f"{half}").mkdir()

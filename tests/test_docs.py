@@ -263,15 +263,15 @@ def test_the_file_has_what_plans_of_the_photograph_say(tmp_path: Path) -> None:
 
 def test_a_row_of_the_plan_that_differs_is_seen() -> None:
     (line,) = [line for line in figures.printed("plan")[1].splitlines() if line.lstrip().startswith("layers")]
-    reason = "the light is seen from 364 to 450 mm; 3 layers leave 1.3e-05, one 5.4e-03"
-    assert not figures.plan_lines({"layers": ("approximate", reason, "5.4e-03")})
+    reason = "the light is seen from 364 to 450 mm; 3 layers leave 2.0e-05, one 6.6e-03"
+    assert not figures.plan_lines({"layers": ("approximate", reason, "6.6e-03")})
     for row in (
-        ("exact", reason, "5.4e-03"),
-        ("approximate", reason, "5.5e-03"),
-        ("approximate", "no depth", "5.4e-03"),
+        ("exact", reason, "6.6e-03"),
+        ("approximate", reason, "6.7e-03"),
+        ("approximate", "no depth", "6.6e-03"),
     ):
         assert list(figures.plan_lines({"layers": row})) == [line]
-    (new,) = figures.plan_lines({"layers": ("approximate", reason.replace("450", "451"), "5.4e-03")}).values()
+    (new,) = figures.plan_lines({"layers": ("approximate", reason.replace("450", "451"), "6.6e-03")}).values()
     assert new == line.replace("450", "451")
 
 

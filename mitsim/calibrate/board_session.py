@@ -319,9 +319,12 @@ def _lines(n: int) -> Lighting:
 _UNIT_COSTS = replace(FIXED, product=1.1e-11)
 """A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
 two processors)."""
-_MIXED_S, _FORMED_S = 3e-8, 1e-8
+_MIXED_S, _FORMED_S = 8e-9, 1e-8
 """A pixel of a frame that is mixed or formed beside its multiplications: memory that is read and taken anew (sensors of
-512 and 1024 pixels mixed, of 2048 formed; processor seconds, halved for two processors)."""
+512 and 1024 pixels mixed, of 2048 formed; two processors)."""
+_UNWRITTEN = 0.55
+"""Of what exposing a capture's frame takes, that of one which no file is written of (0.62 at 512 pixels, 0.49 at
+1024)."""
 _HELD, _AT_WORK = 5.0, 5.0
 """Frames in double precision: those that a session holds (the uniform one, its rate, a pair's both shots together, two
 noisy uniform ones), and what each response takes that is worked on (light of two shots, their numbers, rates)."""
@@ -366,7 +369,10 @@ def session_seconds(
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
     seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _UNIT_COSTS))
     each = n * _UNIT_COSTS.product + _MIXED_S if mixed else _FORMED_S
-    return {"optics": seconds + 2 * count * pixels**2 * each, "sensor": frame_seconds(board, shots)["sensor"]}
+    return {
+        "optics": seconds + 2 * count * pixels**2 * each,
+        "sensor": _UNWRITTEN * frame_seconds(board, shots)["sensor"],
+    }
 
 
 def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float, exposures: int = 1) -> Cost:

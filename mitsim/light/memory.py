@@ -21,11 +21,12 @@ from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import frames_in_memory
 from mitsim.optics.image_formation import SUMMED_BYTES
 
-_LAUNCH_BYTES = 380e6
-"""Paths in flight, compiled kernels, LLVM; measured about 350e6, once a little above it."""
-_FOLLOWED_BYTES = 300e6
+_LAUNCH_BYTES = 220e6
+"""Paths in flight, compiled kernels, LLVM; measured after plans without a cache of kernels: 1.0e8 (photograph, dots) to
+2.3e8 (compact_disc)."""
+_FOLLOWED_BYTES = 200e6
 """What the pilot's look at light over several surfaces leaves behind: kernels, lights of four looks at several points
-(cookie_bag: 1.05e9 after the plan, the photograph 0.4e9)."""
+(cookie_bag: 3.8e8 after the plan, photograph 1.0e8)."""
 _ENTRY_BYTES = 45.0
 """An entry of a sparse matrix of light (12), the sum that it is added to, and what frames are formed of; measured 32 to
 45 where matrices are large."""
@@ -40,9 +41,9 @@ _TERM_BYTES = 3 * 16.0
 _EXPOSED = 7
 """Frames in double precision that each exposed frame takes as much as: its light, electrons, numbers and squares, and
 electrons, numbers and encoded file of the chunk before, which is written meanwhile."""
-_EXPOSING_S, _WRITING_S = 4e-8, 4e-9
-"""A pixel: 84 ns of processor time on two, of which a quarter writes files while the next frames are exposed; and what
-there is left to wait for. Measured of 49 frames of 2048 x 2048."""
+_EXPOSING_S, _WRITING_S = 2e-8, 8e-9
+"""A pixel on two processors, of which a part writes files while the next frames are exposed; and what there is left to
+wait for. Measured of 49 frames of 512 x 512."""
 _BYTES_PER_PIXEL = 8
 """Two channels, uncompressed: digital number and expected electrons; truth and its standard error."""
 _BYTES_PER_ROW, _HEADER_BYTES = 16, 2000

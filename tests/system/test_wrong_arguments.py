@@ -25,14 +25,14 @@ WRONG: list[Any] = [
 MORE = {
     "ms": [*FACE["ms"], "Request"],
     "bench": [*FACE["bench"], "speckle"],
-    "shots": [*FACE["shots"], "read", "measured", "measurements"],
+    "shots": [*FACE["shots"], "read", "pattern_measurements", "measurements"],
     "factors": FACE["factors"],
-    "light": ["expose", "save", "speckle"],
+    "light": ["expose", "save", "load", "speckle"],
     "image": ["save"],
     "rendered": ["save"],
-    "plan": ["row", "taking"],
+    "plan": ["row", "taking", "save", "load"],
     "Request": ["of"],
-    "request": ["changed"],
+    "request": ["with_values"],
     "clock": ["add"],
 }
 """The same, and those of what they make in turn."""
@@ -67,13 +67,12 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Whatever traces light ends at once."""
     import mitsuba as mi
 
-    from mitsim.light import passes
-    from mitsim.transport import direct
+    from mitsim.transport import direct, integrator
 
     def works(*_: object, **__: object) -> None:
         raise Worked
 
-    monkeypatch.setattr(passes.Stage, "trace", works)
+    monkeypatch.setattr(integrator.Tracer, "_flights", works)
     monkeypatch.setattr(direct.FluxTracer, "sums", works)
     monkeypatch.setattr(mi, "render", works)
     yield

@@ -51,9 +51,9 @@ def test_stripes_are_formed_for_both_sides(
     forming, numbers, formed, _ = asked[0]
     assert formed == frames and forming.lit == lit / CELLS and (forming.pixels, forming.cells) == (pixels, CELLS)
     assert forming.terms == 3 and (forming.shots, forming.classes) == (count, n) and numbers.mixed == 0
-    each = n * 1.1e-11 + 3e-8 if size == HELD else 1e-8
+    each = n * 1.1e-11 + 8e-9 if size == HELD else 1e-8
     assert found["optics"] == pytest.approx(2 * FORMED_S + 2 * count * pixels**2 * each)
-    assert found["sensor"] == pytest.approx(1000 * pixels**2 * 4e-8) and found.keys() == {"optics", "sensor"}
+    assert found["sensor"] == pytest.approx(1000 * pixels**2 * 1.1e-8) and found.keys() == {"optics", "sensor"}
     session.session_seconds(board(*size, "flatcam"), count, 1000, settings)
     assert asked[1][0].terms == 6
 

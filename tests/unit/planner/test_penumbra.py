@@ -134,10 +134,10 @@ def test_where_a_shot_shows_none_or_nothing_else_all_have_the_same_anchors(
 @pytest.mark.slow
 def test_pixels_with_a_pass_of_their_own_are_no_occluded_ones(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """(Planted: the look goes by a simulation without them.)"""
-    found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 1e-3, 0)
+    found = occluded_pixels(Simulation(bench, Settings(depth=Z)), 5e-4, 0)
     sharp = SharpPixels(found[::2], 2, (-0.1, 0.1, -0.1, 0.1))
     monkeypatch.setattr("mitsim.planner.pilot.sharp_pixels", lambda *_: sharp)
-    pilot_result = pilot.PilotRuns(bench, parse_patterns("dots:3", N).lighting, 1e-3, 0).pilot_result
+    pilot_result = pilot.PilotRuns(bench, parse_patterns("dots:3", N).lighting, 5e-4, 0).pilot_result
     assert pilot_result.occluded and not set(pilot_result.occluded) & set(sharp.pixels)
 
 
