@@ -268,7 +268,7 @@ class ErrorCovariance:
 
         def multiply(first: int) -> FloatArray:
             some = np.concatenate([change[:, first : first + _AT_ONCE] for change in flat])
-            return some @ some.T
+            return np.asarray(some @ some.T)
 
         count = len(flat) * REPLICATES
         parts = in_threads(multiply, range(0, flat[0].shape[1] if flat else 0, _AT_ONCE))
