@@ -384,13 +384,13 @@ def test_light_is_followed_only_where_surfaces_see_each_other(
 ) -> None:
     """A sheet, and a plate before it that faces as it does: nothing is followed. Turned by a degree, it is."""
     followed = list[str]()
-    trace = Tracer.trace
+    replicates = Tracer.replicates
 
-    def count(tracer: Tracer, *arguments: Any, **options: Any) -> PathSamples:
+    def count(tracer: Tracer, *arguments: Any, **options: Any) -> list[list[PathSamples]]:
         followed.extend([type(tracer).__name__] * isinstance(tracer, FollowingTracer))
-        return trace(tracer, *arguments, **options)
+        return replicates(tracer, *arguments, **options)
 
-    monkeypatch.setattr(Tracer, "trace", count)
+    monkeypatch.setattr(Tracer, "replicates", count)
     for angle in (180, 181):
         place = f'<scale value="20"/><rotate y="1" angle="{angle}"/><translate z="390"/>'
         bsdf = '<bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf>'
