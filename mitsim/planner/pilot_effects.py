@@ -276,7 +276,10 @@ class EffectRuns:
         tracer = None if none else PASSES[name].tracer(simulation)
         if tracer is None:
             return [PathSamples.none()] * REPLICATES
-        return tracer.replicates([integer(seed, name) for seed in self.seeds], self.sample.followed)[0]
+        seeds, samples = [integer(seed, name) for seed in self.seeds], self.sample.followed
+        if not hasattr(tracer, "replicates"):  # as of a pass that somebody added
+            return [tracer.trace(seed, 0, samples) for seed in seeds]
+        return tracer.replicates(seeds, samples)[0]
 
     @staticmethod
     def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
