@@ -223,9 +223,10 @@ def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
 
 
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
-    """Of each vertex: those of its faces, by the angles that they have there, on the side of those that it has.
+    """Of each vertex: those of its faces, by the angles that they have there.
 
-    Thuermer and Wuethrich 1998, as in Mitsuba, but in whole numbers, whose sums in any order are the same.
+    Thuermer and Wuethrich 1998, as in Mitsuba, but in whole numbers, whose sums in any order are the same. Where the
+    sum is 0, as on a sheet that is folded on itself, that of Mitsuba for a vertex without faces.
     """
     corners = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
     points = [mesh.vertex_position(corner) for corner in corners]
@@ -238,9 +239,8 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
         weighted = across * angle * _WHOLE
         for total, value in zip(sums, weighted, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, total, mi.Int64(dr.round(value)), corner, dr.isfinite(value))
-    own, added = mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())), mi.Vector3f(*map(mi.Float, sums))
-    normal = dr.mulsign(dr.normalize(added), dr.dot(added, own))
-    return dr.select(dr.squared_norm(added) > 0, normal, own)
+    added = mi.Vector3f(*map(mi.Float, sums))
+    return dr.select(dr.squared_norm(added) > 0, mi.Normal3f(dr.normalize(added)), mi.Normal3f(1, 0, 0))
 
 
 def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:

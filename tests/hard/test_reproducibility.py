@@ -29,6 +29,7 @@ from mitsim.optics import forming
 from mitsim.planner import pilot_direct, pilot_samples
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
+from tests.physics.judged_scenes import CAMERA_FILE
 from tests.robustness import Recorder
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.robustness("Reproducibility")]
@@ -62,18 +63,6 @@ bench.capture(patterns, output, accuracy=float(accuracy), seed=3, effects=dict.f
 """
 """A capture in a process of its own: by three threads that take turns all the time, and by a clock and a memory that
 say anything."""
-CAMERA = """name = "128 pixels of 46.88 um"
-pixel_pitch_um = 11.72
-binning = 4
-full_well_e = 32360.0
-read_noise_e = 6.7
-dark_current_e_per_s = 1.5
-quantum_efficiency = 0.75
-gain_dn_per_e = 0.125
-black_level_dn = 40.0
-bits = 12
-source = "test"
-"""
 
 
 def in_a_child(folder: Path, scene: Path, *rest: str, **variables: str) -> dict[str, object]:
@@ -161,7 +150,7 @@ def test_neither_do_those_of_shipped_scenes(tmp_path: Path, threads: Callable[[i
     for old, new in (('value="0.01172"', 'value="0.04688"'), ('value="512"', 'value="128"')):
         text = text.replace(old, new)
     scene.write_text(text)
-    camera.write_text(CAMERA)
+    camera.write_text(CAMERA_FILE)
     bench = open_bench(scene, camera=camera)
     with threads(1):
         bench.capture("dots:3", tmp_path / "run", accuracy=5e-3, seed=3)

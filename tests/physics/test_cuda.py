@@ -19,11 +19,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.unit.scene.test_meshes import write_mesh
+
 SIGMAS, FLOAT = 5.0, 1e-5
 WALL = """<shape type="rectangle"><transform name="to_world">
     <scale x="64" y="30"/> <rotate x="1" angle="-90"/> <translate y="-50" z="370"/></transform>
     <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></bsdf></shape>"""
 BUMPS = """<shape type="ply"><string name="filename" value="bumps.ply"/>
+    <transform name="to_world"><scale x="40" y="40" z="10"/> <translate x="-20" y="-20" z="340"/></transform>
     <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""
 BOUNCES = '<integer name="max_depth" value="-1"/>'
 PROGRAM = """
@@ -54,7 +57,7 @@ def traced(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathF
     folder = tmp_path_factory.mktemp("backends")
     scenes = [shared_scene("sheet"), shared_scene("walls", extra=WALL, integrator_options=BOUNCES)]
     scenes.append(shared_scene("bumps", extra=BUMPS))
-    write_bumps(scenes[-1].parent / "bumps.ply")
+    write_mesh(scenes[-1].parent / "bumps.ply", 60)
 
     @cache
     def get(variant: str, seed: int, run: int = 0) -> Light:
@@ -66,21 +69,6 @@ def traced(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathF
             return dict(arrays)
 
     return get
-
-
-def write_bumps(path: Path, side: int = 60) -> None:
-    """A rough sheet without normals before the scene's, its faces in a random order."""
-    rng = np.random.default_rng(3)
-    y, x = np.mgrid[:side, :side] * (40 / side) - 20
-    at = np.arange(side * side).reshape(side, side)
-    halves = [at[:-1, :-1], at[:-1, 1:], at[1:, :-1]], [at[1:, :-1], at[:-1, 1:], at[1:, 1:]]
-    faces = rng.permutation(np.concatenate([np.stack(half, axis=-1).reshape(-1, 3) for half in halves]))
-    points = np.stack([x, y, 340 + rng.uniform(-0.1, 0.1, x.shape)], axis=-1).reshape(-1, 3)
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
-    lines += [*(f"property float {axis}" for axis in "xyz"), f"element face {len(faces)}"]
-    lines += ["property list uchar int vertex_indices", "end_header"]
-    lines += [" ".join(map(str, (*row,))) for row in points] + [" ".join(map(str, (3, *row))) for row in faces]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def differences(one: Light, other: Light) -> list[str]:

@@ -198,6 +198,28 @@ def test_normals_are_the_same_in_any_number_of_threads(
     assert np.allclose(ours, np.array(mi.traverse(theirs)["vertex_normals"]), rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize(
+    ("faces", "shape"),
+    [([(0, 1, 2), (2, 1, 0)], ""), ([(0, 1, 2), (1, 3, 2)], '<transform name="to_world"><scale x="-1"/></transform>')],
+)
+def test_normals_of_a_folded_and_of_a_mirrored_sheet_are_mitsubas(
+    small_scene: Callable[..., Path], faces: list[tuple[int, ...]], shape: str
+) -> None:
+    """(Planted: a sum of 0 made as long as others, which is no number; corners in the other order.)"""
+    import mitsuba as mi
+
+    path = small_scene(extra=MATT + mesh("sheet.ply").replace("<ref", f"{shape}<ref"))
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz")]
+    header += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+    rows = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.9, 0.9, 0.1), *((3, *face) for face in faces)]
+    text = "\n".join([*header, *(" ".join(map(str, row)) for row in rows)])
+    (path.parent / "sheet.ply").write_text(text + "\n", encoding="utf-8")
+    mirrored = mi.ScalarTransform4f().scale([-1 if shape else 1, 1, 1])
+    theirs = mi.load_dict({"type": "ply", "filename": str(path.parent / "sheet.ply"), "to_world": mirrored})
+    ours = normals_of(load_scene(path))["sheet.ply"]
+    assert np.allclose(ours, np.array(mi.traverse(theirs)["vertex_normals"]), rtol=0, atol=1e-6)
+
+
 def test_whatever_mitsuba_added_up_is_added_up_anew(
     small_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
