@@ -31,7 +31,7 @@ from mitsim.light.settings import (
 from mitsim.light.simulation import Simulation, emission
 from mitsim.optics.fft_shadow import cells_per_pixel, raster
 from mitsim.optics.image_formation import number_of_terms, raster_error
-from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Sample, ladder, noise, norm
+from mitsim.planner.pilot_samples import EVEN_CELLS, GOOD_ENOUGH, Known, Sample, ladder, noise, norm
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.missed import SharpLight, with_neighbours
 from mitsim.transport.records import PathSamples
@@ -83,6 +83,7 @@ class DirectRuns:
 
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
+        self._known: Known = {}
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
         tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
@@ -144,6 +145,8 @@ class DirectRuns:
     def spread(self, light: float) -> SampleCost:
         """The same, as a part of ``light``, of what random points of the sensor see: gloss differs over the sensor, and
         makes noise there."""
+        if self.bench.loaded.one_way and not self.bench.loaded.glossy:
+            return self.sample_cost(light)
         return self._sample_cost(self._spread_noise, light)
 
     def _sample_cost(self, noises: tuple[float, float], light: float) -> SampleCost:
@@ -241,7 +244,7 @@ class DirectRuns:
     ) -> FloatArray:
         sample, light = self.sample, emission(simulation.physics, self.sample.lighting)
         grids = simulation.grids
-        frames = sample.frames(grids["fine"], path_samples, samples, light)
+        frames = sample.frames(grids["fine"], path_samples, samples, light, self._known)
         return frames + sample.frames(grids["sharp"], sharp, sample.sharp(simulation), light) if sharp else frames
 
 
