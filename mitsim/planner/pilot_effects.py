@@ -47,8 +47,8 @@ are taken to: two tell it to a fifth (corner 0.27, 0.32, 0.34, where four tell 0
 paths (cookie_bag 0.98, and the run took 24 processor seconds in place of 20)."""
 _OF_CLOSER = 4
 """Samples of closer replicates over those that tell what layers change of indirect light: it changes alike in all."""
-_OPEN = 0.1
-"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
+_OPEN = 0.15
+"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a fiftieth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
 5e-4, first replicates: 1e-3 open, and 110 processor seconds in place of 33)."""
 
