@@ -328,14 +328,12 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
 
     def once(samples: int) -> float:
         seconds = _seconds(simulation, name, seed, labels, samples)
-        # What disturbs a moment would be multiplied.
-        again = samples <= _TIMED * every
+        # The first may compile the kernel, and what disturbs a moment would be multiplied.
+        unusual = seconds > _USUAL * samples * paths_per_sample * FIXED.passes[name]
+        again = unusual and (samples == 1 or samples <= _TIMED * every)
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
-    launch = _seconds(simulation, name, seed, labels, 1)
-    if launch > _USUAL * paths_per_sample * FIXED.passes[name]:
-        # As the first may compile the kernel.
-        launch = min(launch, _seconds(simulation, name, seed, labels, 1))
+    launch = once(1)
     samples = max(1, _REHEARSED // paths_per_sample)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples
