@@ -108,7 +108,7 @@ class EffectRuns:
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
-        if not any(light.value.size for light in self._bounced):
+        if not any(light.value.size for light in self._closer[0]):
             return {}
         changes = coarsening_changes("indirect", self._indirect, ())
         if self.layers:
@@ -122,8 +122,9 @@ class EffectRuns:
         light = norm(self._indirect(1, ())) if self._coarse else 0.0
         if not light:
             return math.inf, math.inf
-        cells, layer = (self._coarse.get(Approximation(f"indirect {each}", 1)) for each in ("cells", "layers"))
-        return norm(cells) / light, 0.0 if layer is None else norm(layer) / light
+        parts = (Approximation(f"indirect {each}", 1) for each in ("cells", "layers"))
+        cells, layer = (norm(self._coarse[part]) / light if part in self._coarse else 0.0 for part in parts)
+        return cells, layer
 
     def _indirect(self, cells: int, layers: tuple[float, ...], seen: Bounced | None = None) -> FloatArray:
         """Frames of indirect light that was ``seen``, of closer replicates where not given, in coarse cells and layers;
@@ -132,10 +133,6 @@ class EffectRuns:
         coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
         simulation = self.sample.simulation(self.bench, coarse, one_line=True)
         return self._form(simulation, followed={"indirect": bounced}, samples=samples)
-
-    @property
-    def _bounced(self) -> list[PathSamples]:
-        return self._closer[0]
 
     @property
     def _closer(self) -> Bounced:
@@ -219,7 +216,7 @@ class EffectRuns:
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
         """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
         pixels = self.bench.n
-        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._bounced]
+        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer[0]]
         repeats = adaptive_counts(np.sum(moments, axis=0))
         # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
@@ -587,10 +584,7 @@ class FollowedRuns(AnchorRuns):
         if not self.changes:
             return dict.fromkeys(self.passes, SampleCost.none())
         every = self._beyond_mean()
-        if None in tracers:
-            seen = every, every
-        else:
-            seen = every - self._from_camera, self._from_camera
+        seen = (every, every) if None in tracers else (every - self._from_camera, self._from_camera)
         return {
             name: SampleCost.relative(noise(each), light, self._all_samples, tracer.paths_per_sample)
             if tracer

@@ -55,8 +55,8 @@ is said of all by less than predictions are good to."""
 _UNTIMED = 0.15
 """Part of the run that may be untimed tracing: off by 2 at most, it moves what is said of all by so much."""
 _USUAL = 1.5
-"""Times as long as at fixed unit costs that the first launch takes where it neither compiles a kernel nor was disturbed;
-a launch of few paths takes longer for itself, and is cheap to repeat."""
+"""Times as long as at fixed unit costs that a launch takes at most where it neither compiles a kernel nor is disturbed;
+one of few paths takes longer for itself, and is cheap to repeat."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23

@@ -403,9 +403,8 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
     """Where one cell, and one layer, leave little of all light, and anchors see little beyond their mean, neither is.
     (Planted: the part of the mean, not of what is beyond it.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
-    light, beyond = runs.switched.light, pilot_effects.norm(runs.anchored._beyond_mean())
     cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1e-3 * light / (20 * beyond)
+    enough = 1 / (15 * pilot_effects.norm(runs.anchored._beyond_mean()))
     for coarse, looked_at in (
         ((0.9 * enough, 0.9 * enough), set()),
         ((1.1 * enough, 0.9 * enough), {cells}),
@@ -414,6 +413,35 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
         runs.anchored.coarse = coarse
         vars(runs.anchored).pop("changes", None)
         assert {part for part in runs.anchored.changes if part.name.startswith("anchor_")} == looked_at
+
+
+def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
+    """A closer look traces the new samples alone, and tells what one of all samples tells. (Planted: the first samples
+    weighed as the new ones; the same samples twice; the camera's part of the new samples alone.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
+    first = runs.followed
+    runs.refine("followed")
+    closer = runs.followed
+    others = first.tolerance, 3, runs.fine.judging
+    whole = pilot_effects.FollowedRuns(bench, runs._everything, closer.sample, *others)
+    assert (closer._first, closer._samples, whole._samples) == (first._samples, 3 * first._samples, 4 * first._samples)
+    size = float(np.abs(whole._frames(1)).max())
+    for anchors in (1, 2, 3):
+        np.testing.assert_allclose(closer._frames(anchors), whole._frames(anchors), atol=1e-9 * size)
+    for cells in ({}, {"coarse_cells": 2}, {"followed_width": 4}):
+        np.testing.assert_allclose(closer._beyond_mean(**cells), whole._beyond_mean(**cells), atol=1e-9 * size)
+    for name, cost in whole.sample_costs(1.0).items():
+        assert closer.sample_costs(1.0)[name].noise.error == pytest.approx(cost.noise.error, rel=1e-6)
+        assert closer.sample_costs(1.0)[name].noise.samples == cost.noise.samples
+
+
+def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callable[..., Path]) -> None:
+    """No ray is traced for what can be no other; nor where the nearest surface is no nearer than all light."""
+    flat = pilot.PilotRuns(open_bench(small_scene()), parse_patterns("dots:4", N).lighting, 1e-2, 0)
+    assert flat.fine.spread(1.0) == flat.fine.sample_cost(1.0)
+    assert flat.fine._sample_cost(flat.fine._spread_noise, 1.0).noise.error == pytest.approx(
+        flat.fine.sample_cost(1.0).noise.error, rel=0.1
+    )
 
 
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
