@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,24 @@ budget's square. Where more is, the capture follows ten times as many paths as t
 5e-4, first replicates: 1e-3 open, and 110 processor seconds in place of 33)."""
 
 
-Bounced = tuple[list[PathSamples], int]
-"""Light, replicate by replicate, and the samples of each."""
+class Bounced(NamedTuple):
+    """Light from the projector's side, replicate by replicate; what of it is indirect light; and samples of each."""
+
+    replicates: list[PathSamples]
+    indirect: list[PathSamples]
+    samples: int
+
+    @classmethod
+    def of(cls, replicates: list[PathSamples], samples: int) -> Bounced:
+        """That of ``replicates``."""
+        indirect = [light.where(light.kind == records.INDIRECT) for light in replicates]
+        return cls(replicates, indirect, samples)
+
+    @property
+    def is_indirect(self) -> bool:
+        """Whether it is all indirect light; else some came over mirrors or curved glass."""
+        return sum(light.value.size for light in self.indirect) == sum(light.value.size for light in self.replicates)
+
 
 # -------- All effects, and each switched off
 
@@ -108,7 +124,7 @@ class EffectRuns:
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
-        if not any(light.value.size for light in self._closer[0]):
+        if not any(light.value.size for light in self._closer.indirect):
             return {}
         changes = coarsening_changes("indirect", self._indirect, ())
         if self.layers:
@@ -128,15 +144,25 @@ class EffectRuns:
 
     def _indirect(self, cells: int, layers: tuple[float, ...], seen: Bounced | None = None) -> FloatArray:
         """Frames of indirect light that was ``seen``, of closer replicates where not given, in coarse cells and layers;
-        of the mean wavelength alone, as those of :class:`AnchorRuns`."""
-        bounced, samples = seen or self._closer
-        coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
+        of the mean wavelength and of what the shots show alone, as those of :class:`AnchorRuns`."""
+        seen = seen or self._closer
+        effects = self.everything.effects - {"black-level"}
+        coarse = replace(
+            self.everything, effects=effects, coarse_cells=cells, coarse_layers=bool(layers), layers=layers
+        )
         simulation = self.sample.simulation(self.bench, coarse, one_line=True)
-        return self._form(simulation, followed={"indirect": bounced}, samples=samples)
+        return self._form(simulation, followed={"indirect": seen.indirect}, samples=seen.samples)
+
+    def _noise_of_bounced(self, seen: Bounced) -> float:
+        """Error of a replicate of light that was ``seen``."""
+        if seen.is_indirect:
+            return noise(self._indirect(1, (), seen))
+        followed = self._by_kind({"indirect": seen.replicates})
+        return noise(self._form(self.simulation, followed=followed, samples=seen.samples))
 
     @property
     def _closer(self) -> Bounced:
-        """Indirect light from the projector's side in closer replicates, and their samples."""
+        """Light from the projector's side in closer replicates."""
         return self._looks[1]
 
     @property
@@ -147,25 +173,24 @@ class EffectRuns:
     @cached_property
     def _looks(self) -> tuple[Bounced, Bounced]:
         """Looks at the projector's side's light: more where noise hides what coarse cells change."""
-        first, samples = _indirect_of(self.followed["indirect"]), self.sample.followed
-        tracer = self.simulation.indirect
-        if tracer is None or not any(light.value.size for light in first):
-            return (first, samples), (first, samples)
-        seen = coarsening_changes("indirect", partial(self._indirect, seen=(first, samples)), ())
+        first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
+        if tracer is None or not any(light.value.size for light in first.indirect):
+            return first, first
+        seen = coarsening_changes("indirect", partial(self._indirect, seen=first), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
-        wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        most = _OF_INDIRECT * self._indirect_samples((first, samples)) / REPLICATES
+        wanted = math.ceil(first.samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
+        most = _OF_INDIRECT * self._indirect_samples(first) / REPLICATES
         more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
-        if more <= samples:
-            return (first, samples), (first, samples)
+        if more <= first.samples:
+            return first, first
         # Seeds of their own: that the first replicates are vague says nothing of these.
         seeds, few = [integer(seed, "closer") for seed in self.seeds], math.ceil(more / _OF_CLOSER)
-        some, whole = map(_indirect_of, tracer.replicates(seeds, few, more))
-        return (some, few), (whole, more)
+        some, whole = tracer.replicates(seeds, few, more)
+        return Bounced.of(some, few), Bounced.of(whole, more)
 
     def _indirect_samples(self, seen: Bounced) -> float:
         """Samples of all groups that the projector's side's light takes, as noisy as was ``seen``."""
-        cost = SampleCost.relative(noise(self._indirect(1, (), seen)), self.light, seen[1], 1)
+        cost = SampleCost.relative(self._noise_of_bounced(seen), self.light, seen.samples, 1)
         return float(cost.noise.samples_for(self.accuracy))
 
     @property
@@ -216,7 +241,7 @@ class EffectRuns:
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
         """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
         pixels = self.bench.n
-        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer[0]]
+        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer.indirect]
         repeats = adaptive_counts(np.sum(moments, axis=0))
         # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
@@ -234,10 +259,10 @@ class EffectRuns:
         tracer = self._sharing.indirect
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
-        samples = max(1, self._closer[1] // SHARED_COST)
+        samples = max(1, self._closer.samples // SHARED_COST)
         seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
         seen += [PathSamples.none()] * (REPLICATES - _SHARING)
-        frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
+        frames = self._indirect(1, (), Bounced.of(seen, samples))[:_SHARING]
         shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
@@ -266,12 +291,12 @@ class EffectRuns:
         for name, each in self.simulation.passes.items():
             if name in _FOLLOWED:
                 if name == "indirect":
-                    frames, samples = self._indirect(1, ()), self._closer[1]
+                    error, samples = self._noise_of_bounced(self._closer), self._closer.samples
                 else:
                     samples = self.sample.followed
                     seen = self._by_kind({name: self.followed[name]})
-                    frames = self._form(self.simulation, followed=seen, samples=samples)
-                found[name] = noise(frames), samples, each.tracer.paths_per_sample
+                    error = noise(self._form(self.simulation, followed=seen, samples=samples))
+                found[name] = error, samples, each.tracer.paths_per_sample
         return found
 
     def _without(self, effect: Effect) -> FloatArray:
@@ -344,11 +369,6 @@ class EffectRuns:
             frames += sample.lamps(simulation.ambient["fine"], lamps, few, known)
         specular = simulation.specular_frames(sample.lighting.labels)
         return frames if specular is None else frames + np.tensordot(light[:, specular.classes], specular.irradiance, 1)
-
-
-def _indirect_of(replicates: Sequence[PathSamples]) -> list[PathSamples]:
-    """Indirect light in ``replicates``, replicate by replicate."""
-    return [light.where(light.kind == records.INDIRECT) for light in replicates]
 
 
 # -------- Light at anchors of the sensor
