@@ -25,7 +25,7 @@ from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
-from mitsim.transport.records import PathSamples
+from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -332,7 +332,7 @@ def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeyp
     loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
     for found, asked in ((loose, False), (close, True)):
         found.indirect_cost()
-        assert ("_sharing" in vars(found)) == asked and found._closer[1] == sample.followed
+        assert ("_sharing" in vars(found)) == asked and found._closer.samples == sample.followed
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
@@ -413,6 +413,24 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
         runs.anchored.coarse = coarse
         vars(runs.anchored).pop("changes", None)
         assert {part for part in runs.anchored.changes if part.name.startswith("anchor_")} == looked_at
+
+
+def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: Bench) -> None:
+    """Light whose kind is direct light's, as over mirrors and curved glass, comes by the same paths. (Planted: indirect
+    light alone.)"""
+    sample = pilot_samples.Sample.of(
+        parse_patterns("dots:4", N).lighting, bench.geometry.frame_shape, bench.loaded.mirrors
+    )
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = EffectRuns(bench, everything, sample, 5)
+    seen = found._closer
+    halves = [
+        replace(light, kind=np.where(np.arange(light.value.size) % 2, DIRECT, INDIRECT).astype(np.int16))
+        for light in seen.indirect
+    ]
+    parted = pilot_effects.Bounced.of(halves, seen.samples)
+    assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
+    assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
 
 
 def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
