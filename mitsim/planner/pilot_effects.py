@@ -62,7 +62,7 @@ class Bounced(NamedTuple):
 
     @classmethod
     def of(cls, replicates: list[PathSamples], samples: int) -> Bounced:
-        """That of ``replicates``."""
+        """That of ``replicates`` of so many ``samples``."""
         indirect = [light.where(light.kind == records.INDIRECT) for light in replicates]
         return cls(replicates, indirect, samples)
 
@@ -179,7 +179,8 @@ class EffectRuns:
         seen = coarsening_changes("indirect", partial(self._indirect, seen=first), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
         wanted = math.ceil(first.samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        most = _OF_INDIRECT * self._indirect_samples(first) / REPLICATES
+        cost = SampleCost.relative(self._noise_of_bounced(first), self.light, first.samples, 1)
+        most = _OF_INDIRECT * float(cost.noise.samples_for(self.accuracy)) / REPLICATES
         more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
         if more <= first.samples:
             return first, first
@@ -187,11 +188,6 @@ class EffectRuns:
         seeds, few = [integer(seed, "closer") for seed in self.seeds], math.ceil(more / _OF_CLOSER)
         some, whole = tracer.replicates(seeds, few, more)
         return Bounced.of(some, few), Bounced.of(whole, more)
-
-    def _indirect_samples(self, seen: Bounced) -> float:
-        """Samples of all groups that the projector's side's light takes, as noisy as was ``seen``."""
-        cost = SampleCost.relative(self._noise_of_bounced(seen), self.light, seen.samples, 1)
-        return float(cost.noise.samples_for(self.accuracy))
 
     @property
     def received(self) -> float:
@@ -581,6 +577,7 @@ class FollowedRuns(AnchorRuns):
     """From the projector's side, and from the camera's."""
 
     def __init__(self, *arguments: Any, before: FollowedRuns | None = None, **others: Any) -> None:
+        """``arguments`` and ``others`` as for :class:`AnchorRuns`, and what was found ``before``."""
         self.before = before
         super().__init__(*arguments, **others)
 
