@@ -577,7 +577,15 @@ class FollowedRuns(AnchorRuns):
     """From the projector's side, and from the camera's."""
 
     def __init__(self, *arguments: Any, before: FollowedRuns | None = None, **others: Any) -> None:
-        """``arguments`` and ``others`` as for :class:`AnchorRuns`, and what was found ``before``."""
+        """Nothing is traced yet.
+
+        Parameters
+        ----------
+        arguments, others
+            as for :class:`AnchorRuns`.
+        before
+            what the first samples told, if they were looked at.
+        """
         self.before = before
         super().__init__(*arguments, **others)
 
