@@ -433,6 +433,20 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
 
 
+def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: the better of two trials.)"""
+    taken = iter([4.9, 3.5, 3.1, 1.9, 1.8, 1.9])
+    clock = [0.0]
+
+    def wait(*_: object) -> None:
+        clock[0] += next(taken)
+
+    monkeypatch.setattr(pilot_direct, "in_threads", wait)
+    monkeypatch.setattr(pilot_direct.time, "perf_counter", lambda: clock[0])
+    assert pilot_direct._product_seconds() == pytest.approx(1.8 / (4 * 256**3))
+    assert not list(taken)
+
+
 def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
     """A closer look traces the new samples alone, and tells what one of all samples tells. (Planted: the first samples
     weighed as the new ones; the same samples twice; the camera's part of the new samples alone.)"""
