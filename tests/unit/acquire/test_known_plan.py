@@ -173,10 +173,13 @@ def light(bench: Bench) -> Light:
 @pytest.mark.usefixtures("no_plans")
 def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light, tmp_path: Path) -> None:
     """Frames of another family, its lamps' light and truth, and the errors that are stated. (Planted: lamps left out;
-    the second group for the first; the flux's error left out.)"""
+    the second group for the first; the flux and its error exchanged; samples left out; always reached.)"""
     path = light.save(tmp_path / "light.h5")
     found = Light.load(path, bench)
     assert found.plan == light.plan and len(found.groups) == GROUPS and found.summary() == light.summary()
+    assert np.array_equal(found.flux, light.flux) and np.array_equal(found.flux_error, light.flux_error)
+    assert (found.samples, found.reached) == (light.samples, light.reached)
+    assert Light.load(replace(light, reached=False).save(tmp_path / "rough.h5"), bench).reached is False
     for patterns in ("dots:3", "dots:2", "hadamard:4"):
         first, second = light.expose(patterns), found.expose(patterns)
         assert np.abs(second.electrons - first.electrons).max() < 1e-6 * first.electrons.max()
@@ -189,7 +192,8 @@ def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light,
 
 @pytest.mark.usefixtures("no_plans")
 def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path: Path) -> None:
-    """(Planted: another bench is not looked at; a matrix of other cells is read.)"""
+    """(Planted: another bench is not looked at; a matrix of other cells is read; what it takes of memory not held
+    against what is free.)"""
     import h5py
 
     path = light.save(tmp_path / "light.h5")
@@ -213,6 +217,10 @@ def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path
             Light.load(path, bench)
         assert len(str(refusal.value).splitlines()) == 1
 
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("mitsim.core.job.free_memory", lambda: 1e4)
+        with pytest.raises(MitsimError, match=r"^light .*light\.h5: would take about .* of memory"):
+            Light.load(path, bench)
     damaged(lambda file: file.pop("kept"), "is no file of this version's `mitsim transport`; trace it again")
     damaged(lambda file: file["kept"].pop("flux"), "damaged")
     damaged(lambda file: file["light/fine"].attrs.update(shape=(4, 5)), r"damaged.*/light/fine is \(4, 5\)")

@@ -19,6 +19,7 @@ from mitsim.light.cost_model import (
     unit_costs_of,
 )
 from mitsim.light.settings import GROUPS, Forming, Noise, SampleCost, Settings
+from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
 from mitsim.optics.forming import PROBES
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
 
@@ -108,6 +109,32 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({"followed_anchors": 2.0, "followed_width": 4.0, "all_layers": 1.0}, (1 + 0.25) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
+    many = replace(FORMING, geometric_terms=9.0)
+    assert optics_seconds(many, replace(ONE, waves=0.0), entries) == pytest.approx(1.2 * 9 * one)
+
+
+def test_a_frame_by_fft_is_correlations_and_its_raster_is_sharpened() -> None:
+    """One for each cell of a pixel and layer, and as many for each group's probes; no entries of a shadow. Waves take
+    some for each cell. (Planted: cells a side; probes of one group; entries as of sums; cells of waves for nothing.)
+    """
+    forming = replace(FORMING, correlated=(True, True), phases=36.0)
+    for cells, phases in ((0.0, 36), (8.0, 64)):
+        numbers = replace(ONE, raster_cells=cells, layers=2.0)
+        correlations = CORRELATION_PRODUCTS * phases * 2 * 50**2
+        assert forming_seconds(forming, numbers, 7.0, COUNTED) == pytest.approx(7 * (1 + GROUPS) * correlations)
+    costs, numbers = replace(COUNTED, product=FIXED.product, entry=1.0), replace(ONE, raster_cells=8.0)
+    formed = forming_seconds(forming, numbers, FORMING.classes, costs)
+    assert optics_seconds(forming, numbers, costs) - formed == pytest.approx(5e-8 * 50**2 * 64)
+
+
+def test_looks_see_all_classes_or_some_shots_and_more_where_light_is_followed() -> None:
+    """At 0.4 of a frame's time, one round and a half and one more of followed light. (Planted: 64 shots always.)"""
+    many = replace(FORMING, shots=100, classes=200)
+    one = products(5, 3)
+    assert checking_seconds(many, ONE, COUNTED) == pytest.approx(0.4 * 1.5 * 16 * one)
+    followed = forming_seconds(many, replace(ONE, indirect=1.0), 1.0, COUNTED)
+    assert checking_seconds(many, replace(ONE, indirect=1.0), COUNTED) == pytest.approx(0.4 * 2.5 * 64 * followed)
+    assert checking_seconds(FORMING, ONE, COUNTED) == pytest.approx(0.4 * 0.5 * FORMING.classes * one)
 
 
 def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
