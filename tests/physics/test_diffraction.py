@@ -392,8 +392,8 @@ def test_interpolated_shadows_are_as_good_as_their_grid(kind: str, distance: flo
 
 
 def test_rows_columns_and_cells_of_any_size_share_the_waves_behind_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Waves of three lines are worked out once, and to rounding the shadow is what it is without sharing. (Planted:
-    waves kept whatever their wavelength.)"""
+    """Waves of three lines are worked out once at each of two depths, and to rounding the shadow is what it is without
+    sharing. (Planted: waves kept whatever their wavelength; whatever the depth.)"""
     geometry = CameraGeometry(pixels=64, mask_distance=1.7)  # waves of which no other test has kept
     lines = Spectrum(np.array([638.0, 520.0, 445.0]), np.array([0.5, 0.3, 0.2]))
     cells = {
@@ -405,7 +405,7 @@ def test_rows_columns_and_cells_of_any_size_share_the_waves_behind_a_mask(monkey
     }
 
     def shadows() -> list[np.ndarray]:
-        found = [shadow_terms(geometry, rows, columns, 400.0, lines) for rows, columns in cells.values()]
+        found = [shadow_terms(geometry, *axes, depth, lines) for axes in cells.values() for depth in (400.0, 390.0)]
         return [factor for terms in found for term in terms for factor in term]
 
     made = list[float]()
@@ -417,8 +417,8 @@ def test_rows_columns_and_cells_of_any_size_share_the_waves_behind_a_mask(monkey
 
     monkeypatch.setattr(EdgeWaves, "__init__", count)
     shared = shadows()
-    assert sorted(made) == [445.0, 520.0, 638.0]
+    assert sorted(made) == [445.0, 445.0, 520.0, 520.0, 638.0, 638.0]
     monkeypatch.setattr(diffraction, "_LARGEST_KEPT", 0)
     for one, other in zip(shared, shadows(), strict=True):
         assert np.allclose(one, other, rtol=0, atol=1e-11)
-    assert len(made) == 3 + 12
+    assert len(made) == 6 + 24

@@ -23,6 +23,7 @@ from mitsim.calibrate.model import calibrate_model, model_of
 from mitsim.calibrate.session_plan import plan_calibration
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job, Limits
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.plate import Plate
@@ -376,6 +377,25 @@ def test_a_session_behind_a_slanted_bar_is_refused_for_its_mask(
     with pytest.raises(MitsimError, match="one or two separable terms"):
         calibrate_model(bench, Modelling("wave"))
     assert {each.name for each in tmp_path.iterdir()} == {"bar.toml", "bar.npy", "scenes"}
+
+
+@pytest.mark.usefixtures("no_light")
+def test_drawing_the_first_shadow_is_held_against_limits_before_anything_is_looked_at(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path
+) -> None:
+    """Where one is drawn: without diffraction the disc's terms are summed. (Planted: no shadow counted; counted with
+    diffraction off alone.)"""
+    along = np.arange(16) - 7.5
+    disc = (np.hypot(along[:, None], along) < 7).astype(float)
+    bench = open_bench(small_scene(mask_order=8), variant, camera_file(tmp_path, "disc", disc))
+    for limits, sentence in (
+        (Limits(memory_bytes=1e6), "of memory; allowed"),
+        (Limits(1e-4), r" s; allowed are 0\.0001"),
+    ):
+        with pytest.raises(MitsimError, match=f"^dots:2: would take about .*{sentence}"):
+            bench.light("dots:2", Job(limits=limits))
+    with pytest.raises(AssertionError, match="planned"):
+        bench.light("dots:2", Job(limits=Limits(memory_bytes=1e6)), effects="-diffraction")
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,7 @@ def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
 ) -> None:
     """Frames of each line, and of all lines behind filters, are those of the capture that plans itself. Another word
     of --colour, and light by pixel, of which none is told apart, are refused in a line before anything is written.
-    (Planted: lines of a plan not compared; light traced in another variant.)"""
+    (Planted: lines of a plan not compared.)"""
     file, options = tmp_path / "plan.json", (*OF_COLOUR, *(filters if colour == "mosaic" else ()))
     assert shell("plan", *sheet, *options, "--colour", colour, "-o", file).code == 0
     for name, more in (("run", ("--plan", file)), ("own", ())):
@@ -225,7 +225,8 @@ def test_a_plan_in_colour_is_captured_and_serves_no_other_colour(
 def test_light_is_of_no_colour(
     shell: Callable[..., Any], sheet: tuple[object, ...], filters: tuple[object, ...], tmp_path: Path
 ) -> None:
-    """What told no line apart is exposed as no line, by no word of --colour and no camera behind filters."""
+    """What told no line apart is exposed as no line, by no word of --colour and no camera behind filters. (Planted: the
+    variant not compared.)"""
     file = tmp_path / "light.h5"
     assert shell("transport", *sheet, *OF_COLOUR, "-o", file).code == 0
     known = "capture", *sheet, "--light", file, "--patterns", "dots:2", "-o", tmp_path / "none"

@@ -13,6 +13,7 @@ from mitsim.acquire import spectral
 from mitsim.acquire.capture import Light, check_plan
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.request import Request
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.devices.projector import Lines
@@ -99,6 +100,18 @@ def test_what_needs_another_plan_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("patterns", ["hadamard:4", "dots:1x16"])
+def test_other_patterns_of_the_same_classes_or_weights_are_others(bench: Bench, file: Path, patterns: str) -> None:
+    """(Planted: classes of pixels compared alone; how they are lit alone.)"""
+    plan = replace(Plan.load(file), request=Request.of(patterns="dots:4", accuracy=ACCURACY))
+    for same in ("dots:4", "dots:4x4"):
+        check_plan(plan, SpectralBench(bench), Request.of(patterns=same))
+    made, asked = (bench.family(name).lighting for name in ("dots:4", patterns))
+    assert np.array_equal(made.labels, asked.labels) != np.array_equal(made.weights, asked.weights)
+    with pytest.raises(ArgumentError, match=f"^patterns '{patterns}': the plan was made for 'dots:4'"):
+        check_plan(plan, SpectralBench(bench), Request.of(patterns=patterns))
+
+
 def test_patterns_that_another_seed_draws_are_others(bench: Bench) -> None:
     """(Planted: only the family's name is held against the plan's.)"""
     plan = bench.plan("random:4", accuracy=0.1, seed=1)
@@ -173,10 +186,13 @@ def light(bench: Bench) -> Light:
 @pytest.mark.usefixtures("no_plans")
 def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light, tmp_path: Path) -> None:
     """Frames of another family, its lamps' light and truth, and the errors that are stated. (Planted: lamps left out;
-    the second group for the first; the flux's error left out.)"""
+    the second group for the first; the flux and its error exchanged; samples left out; always reached.)"""
     path = light.save(tmp_path / "light.h5")
     found = Light.load(path, bench)
     assert found.plan == light.plan and len(found.groups) == GROUPS and found.summary() == light.summary()
+    assert np.array_equal(found.flux, light.flux) and np.array_equal(found.flux_error, light.flux_error)
+    assert (found.samples, found.reached) == (light.samples, light.reached)
+    assert Light.load(replace(light, reached=False).save(tmp_path / "rough.h5"), bench).reached is False
     for patterns in ("dots:3", "dots:2", "hadamard:4"):
         first, second = light.expose(patterns), found.expose(patterns)
         assert np.abs(second.electrons - first.electrons).max() < 1e-6 * first.electrons.max()
@@ -189,7 +205,8 @@ def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light,
 
 @pytest.mark.usefixtures("no_plans")
 def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path: Path) -> None:
-    """(Planted: another bench is not looked at; a matrix of other cells is read.)"""
+    """(Planted: another bench is not looked at; a matrix of other cells is read; what it takes of memory not held
+    against what is free.)"""
     import h5py
 
     path = light.save(tmp_path / "light.h5")
@@ -213,6 +230,10 @@ def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path
             Light.load(path, bench)
         assert len(str(refusal.value).splitlines()) == 1
 
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("mitsim.core.job.free_memory", lambda: 1e4)
+        with pytest.raises(MitsimError, match=r"^light .*light\.h5: would take about .* of memory"):
+            Light.load(path, bench)
     damaged(lambda file: file.pop("kept"), "is no file of this version's `mitsim transport`; trace it again")
     damaged(lambda file: file["kept"].pop("flux"), "damaged")
     damaged(lambda file: file["light/fine"].attrs.update(shape=(4, 5)), r"damaged.*/light/fine is \(4, 5\)")

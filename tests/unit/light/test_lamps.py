@@ -162,6 +162,10 @@ def through_filters(place: Path, scene: Path, lamp: str) -> dict[str, Any]:
         traced_runs = [tracer.trace(seed, 0, SAMPLES) for seed in range(SEEDS if name == "lines" else 1)]
         lines = [run.by_line(len(LINES) if name == "lines" else 1) for run in traced_runs]
         found[name] = [[np.bincount(one.pixel - bench.n**2, one.value, 12).tolist() for one in run] for run in lines]
+        found[f"replicates {name}"] = [
+            [float(run.value.sum()) for run in runs]
+            for runs in (tracer.replicates((3, 4), 1)[0], [tracer.trace(seed) for seed in (3, 4)])
+        ]
     assert counted_lamps.shares is not None
     return {
         **found,
@@ -217,7 +221,8 @@ def test_each_band_has_its_light(light: Mapping[Any, dict[str, Any]], case: Any)
 def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[str, Any]], lamp: str) -> None:
     """And no filter counts for another; lines share a count as their power, each alone as all together.
 
-    (Planted: the red curve for all; red for blue; a line's part of the count as of its photons.)
+    Light of several seeds at once is parted as each is traced. (Planted: the red curve for all; red for blue; a line's
+    part of the count as of its photons; a path's bands parted as if they stood band by band.)
     """
     (case,) = (each for each in CASES if each[0] == lamp)
     sheet, found, geometry = "coloured" if lamp == "d65" else "grey", light[case]["filtered"], seen("point")
@@ -243,6 +248,9 @@ def test_pixels_count_the_lamp_each_through_its_filter(light: Mapping[Any, dict[
             assert 7 * error < 0.01 * expected
             assert abs(runs.mean() - expected) < 7 * error + 2e-4 * expected, (lamp, name, line)
     assert np.array(found["alone"])[0, 0] == pytest.approx(np.array(found["lines"])[0, 1], rel=1e-6)
+    for name in ("lines", "alone"):
+        together, apart = found[f"replicates {name}"]
+        assert together == pytest.approx(apart, rel=1e-6) and min(apart) > 0
     beyond = max(1 - every[name] / counted(lamp, sheet, curve) for name, curve in FILTERS.items())
     assert found["unknown"] == pytest.approx(beyond, abs=0.01) and found["range"] == [420, 650]
 

@@ -232,6 +232,16 @@ def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
     assert drawing(raster_cells=8.0) == pytest.approx(5) and drawing(layers=2.0) == pytest.approx(15)
 
 
+def test_seconds_of_more_stages_move_all_that_is_predicted() -> None:
+    """(Planted: one end of the range; the ways of colours stay.)"""
+    ways = ColourChoice("mono", (ColourCandidate("mono", None, 2.0), ColourCandidate("lines", 0.0, 5.0)))
+    before = replace(plan(1e-3), predicted_range=(1.5, 4.0), colour=ways)
+    after = before.taking(start=1.0, transport=before.predicted["transport"] + 0.5)
+    assert after.predicted_seconds == pytest.approx(sum(before.predicted.values()) + 1.5)
+    assert after.predicted_range == pytest.approx((3.0, 5.5)) and after.colour is not None
+    assert [each.seconds for each in after.colour.candidates] == pytest.approx([3.5, 6.5])
+
+
 def test_settings_do_not_depend_on_the_machines_pace() -> None:
     """Bit-equal repetition and --resume need it: the same seed must mean the same settings."""
     sample_costs = {

@@ -153,7 +153,7 @@ def test_a_file_is_written_whole_or_not_at_all(file: Path, tmp_path: Path, monke
 
 
 def test_what_is_said_again_is_taken_and_what_needs_another_plan_is_not() -> None:
-    """(Planted: the accuracy that colours were left of is refused when it is said again.)"""
+    """(Planted: the accuracy that colours were left of is refused when it is said again; other seconds taken.)"""
     plan = replace(planned(), colour=None)
     again = plan.request_with({"accuracy": 1e-3, "effects": {"blur": False}, "seed": 5, "exposure": 0.1})
     assert (again.seed, again.exposure, again.patterns, again.accuracy) == (5, 0.1, "dots:3", 1e-3)
@@ -164,6 +164,9 @@ def test_what_is_said_again_is_taken_and_what_needs_another_plan_is_not() -> Non
     ):
         with pytest.raises(ArgumentError, match=sentence):
             plan.request_with(changes)
+    timed = replace(plan, request=Request.of(seconds=3.0))
+    with pytest.raises(ArgumentError, match=r"seconds 4\.0: the plan was made for 3\.0"):
+        timed.request_with({"seconds": 4.0})
     bands = ColourChoice("bands:1", (ColourCandidate("bands:1", 4e-4, 1.0),))
     left = replace(plan, request=Request.of(accuracy=math.sqrt(1e-6 - 16e-8)), colour=bands)
     assert left.request_with({"accuracy": 1e-3}) == left.request

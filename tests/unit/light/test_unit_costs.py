@@ -19,6 +19,7 @@ from mitsim.light.cost_model import (
     unit_costs_of,
 )
 from mitsim.light.settings import GROUPS, Forming, Noise, SampleCost, Settings
+from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
 from mitsim.optics.forming import PROBES
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
 
@@ -35,7 +36,8 @@ def products(rows: float, terms: float = 1.0) -> float:
 
 
 def test_a_slower_machine_is_slower_in_all_that_it_does_with_matrices() -> None:
-    """As much as its products are. (Planted: a frame's own seconds left as they are.)"""
+    """As much as its products are, and in rays of the truth as direct light is. (Planted: a frame's own seconds, or a
+    ray's, left as they are.)"""
     nothing = replace(
         PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=0.0)}),
         forming=replace(PILOT_RESULT.forming, product=0.0),
@@ -48,6 +50,10 @@ def test_a_slower_machine_is_slower_in_all_that_it_does_with_matrices() -> None:
     assert slower == pytest.approx([6.0] * len(names))
     other = PILOT_RESULT.with_sample_costs({"direct": replace(PILOT_RESULT.sample_costs["direct"], seconds=5e-6)})
     assert unit_costs_of(other).passes["direct"] == 5e-6
+    for times in (3.0, 0.0):
+        spread = replace(PILOT_RESULT.spread, seconds=times * FIXED.passes["direct"])
+        ray = unit_costs_of(replace(PILOT_RESULT, spread=spread)).ray
+        assert ray == pytest.approx((times or 1.0) * FIXED.ray)
 
 
 @pytest.mark.parametrize(
@@ -108,6 +114,42 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({"followed_anchors": 2.0, "followed_width": 4.0, "all_layers": 1.0}, (1 + 0.25) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
+    many = replace(FORMING, geometric_terms=9.0)
+    assert optics_seconds(many, replace(ONE, waves=0.0), entries) == pytest.approx(1.2 * 9 * one)
+
+
+def test_a_frame_by_fft_is_correlations_and_its_raster_is_sharpened() -> None:
+    """One for each cell of a pixel and layer, and as many for each group's probes; no entries of a shadow. Waves take
+    some for each cell. (Planted: cells a side; probes of one group; entries as of sums; cells of waves for nothing.)
+    """
+    forming = replace(FORMING, correlated=(True, True), phases=36.0)
+    for cells, phases in ((0.0, 36), (8.0, 64)):
+        numbers = replace(ONE, raster_cells=cells, layers=2.0)
+        correlations = CORRELATION_PRODUCTS * phases * 2 * 50**2
+        assert forming_seconds(forming, numbers, 7.0, COUNTED) == pytest.approx(7 * (1 + GROUPS) * correlations)
+    costs, numbers = replace(COUNTED, product=FIXED.product, entry=1.0), replace(ONE, raster_cells=8.0)
+    formed = forming_seconds(forming, numbers, FORMING.classes, costs)
+    assert optics_seconds(forming, numbers, costs) - formed == pytest.approx(5e-8 * 50**2 * 64)
+
+
+def test_largest_terms_are_summed_where_that_takes_less_and_memory_holds_them() -> None:
+    """One lit row of cells: 100 terms of it take less than a correlation, but 256 MiB do not hold those of 8000 rows.
+    (Planted: held whatever they take; the dearer way.)"""
+    one = replace(FORMING, correlated=(True, True), lit=1 / 2000, cells=2000, largest_terms=(100.0, 100.0))
+    assert forming_seconds(one, ONE, 1.0, COUNTED) == pytest.approx(products(1, 100))
+    correlations = CORRELATION_PRODUCTS * one.phases * 50**2
+    large = replace(one, lit=1 / 8000, cells=8000)
+    assert forming_seconds(large, ONE, 1.0, COUNTED) == pytest.approx((1 + GROUPS) * correlations)
+
+
+def test_looks_see_all_classes_or_some_shots_and_more_where_light_is_followed() -> None:
+    """At 0.4 of a frame's time, one round and a half and one more of followed light. (Planted: 64 shots always.)"""
+    many = replace(FORMING, shots=100, classes=200)
+    one = products(5, 3)
+    assert checking_seconds(many, ONE, COUNTED) == pytest.approx(0.4 * 1.5 * 16 * one)
+    followed = forming_seconds(many, replace(ONE, indirect=1.0), 1.0, COUNTED)
+    assert checking_seconds(many, replace(ONE, indirect=1.0), COUNTED) == pytest.approx(0.4 * 2.5 * 64 * followed)
+    assert checking_seconds(FORMING, ONE, COUNTED) == pytest.approx(0.4 * 0.5 * FORMING.classes * one)
 
 
 def test_tracing_takes_a_path_of_every_sample_in_every_group_and_connections_to_all_anchors() -> None:
@@ -154,8 +196,8 @@ def test_every_shot_is_looked_through_once_more_than_it_is_formed() -> None:
 
 
 def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
-    """Three lines: two fifths more tracing, and all else three times. (Planted: shadows of one line; accumulating of
-    one.)"""
+    """Three lines: two fifths more tracing, or three times as much where glass parts them, and all else three times.
+    (Planted: shadows of one line; accumulating of one; paths shared whatever parts them.)"""
     three = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, lines=3))
     settings = plan(pilot_result=PILOT_RESULT).settings
     numbers = Numbers.of(settings)
@@ -168,6 +210,8 @@ def test_lines_share_paths_and_form_and_file_each_its_own() -> None:
         assert seconds(three.forming) == pytest.approx(3 * seconds(PILOT_RESULT.forming))  # type: ignore[no-untyped-call]
     one, several = (tracing_seconds(pilot_result, settings, FIXED) for pilot_result in (PILOT_RESULT, three))
     assert several == pytest.approx({name: 1.4 * each for name, each in one.items()})
+    parted = tracing_seconds(replace(three, forming=replace(three.forming, parted=True)), settings, FIXED)
+    assert parted == pytest.approx({name: 3 * each for name, each in one.items()})
     assert truth_seconds(three, settings, FIXED) == pytest.approx(1.4 * truth_seconds(PILOT_RESULT, settings, FIXED))
 
 
@@ -177,6 +221,17 @@ def test_truth_takes_rays_until_it_is_off_by_a_sixth_of_what_the_frames_are(rate
     pixel and 8 of a board in each of four groups. (Planted: a sixth of the samples; none saved.)"""
     assert predicted_rays(1000, 5.0, rate) == pytest.approx(4 * 1000 * (16 + 8) + 0.5 * 4 * 1000 * 5 * times)
     assert predicted_rays(1000, 1e6, rate) == 2**22 and predicted_rays(10**6, 1e6, rate) == 128 * 10**6
+
+
+def test_truth_is_as_rough_as_direct_light_where_the_sensor_sees_it() -> None:
+    """At points of all the sensor where frames have anchors, else at its centre. (Planted: one for the other.)"""
+    direct = replace(PILOT_RESULT.sample_costs["direct"], paths=1000, noise=Noise(2e-3, 16, 0.5))
+    found = replace(PILOT_RESULT, spread=replace(direct, noise=Noise(2e-3, 16, 1.0)))
+    found = found.with_sample_costs({"direct": direct})
+    for anchors, rate in ((1, 0.5), (3, 1.0)):
+        settings = Settings(depth=400.0, anchors=anchors, samples={"direct": 6.0})
+        rays = predicted_rays(1000, 6.0, rate)
+        assert truth_seconds(found, settings, FIXED) == pytest.approx(FIXED.ray * rays)
 
 
 def test_an_accumulator_is_emptied_and_looked_through_where_it_has_room() -> None:

@@ -17,6 +17,14 @@ def test_neighbours_of_equal_value_are_merged_and_outside_is_zero() -> None:
     assert np.array_equal(steps.at(np.array([-1.01, -1.0, 0.2, 0.5, 0.99, 1.0])), [0, 1, 0, 2, 2, 0])
 
 
+def test_functions_are_equal_by_edges_and_values() -> None:
+    """What is kept of one serves an equal one alone. (Planted: equal by edges.)"""
+    one, same, other = (
+        Steps(np.array([0.0, 1.0, 2.0]), np.array(values)) for values in ([1.0, 3.0], [1.0, 3.0], [2.0, 3.0])
+    )
+    assert one == same and hash(one) == hash(same) and one != other
+
+
 def test_a_product_holds_at_every_point() -> None:
     rng = np.random.default_rng(4)
     one, other = (Steps.of(rng.integers(-1, 2, 12), 0.3) for _ in range(2))

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mitsim.api.bench import open_bench
-from mitsim.light.memory import path_sample_bytes
+from mitsim.light.cost_model import Numbers, entries
+from mitsim.light.memory import light_bytes, path_sample_bytes
 from mitsim.light.sampling import Group, trace_groups
-from mitsim.light.settings import PATHS_AT_ONCE, Settings, SharpPixels
+from mitsim.light.settings import GROUPS, PATHS_AT_ONCE, Settings, SharpPixels
 from mitsim.light.simulation import Simulation
 from mitsim.transport.records import DIRECT, Bundle, CellAxis, CellGrid, PathSamples
 
@@ -63,3 +64,14 @@ def test_rounds_beyond_the_plan_trace_no_larger_blocks_than_are_counted(
     trace_groups([Group(simulation, np.zeros(simulation.bench.n**2, dtype=np.int64), 3)], {"direct": wanted})
     assert sum(blocks) == wanted
     assert max(blocks) * simulation.direct.paths_per_sample <= simulation.paths_at_once
+
+
+def test_light_of_each_line_is_held(
+    shared_scene: Callable[..., Path], variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three lines' entries, at 45 bytes each; one worker accumulates one line after the other. (Planted: of one.)"""
+    monkeypatch.setattr("mitsim.light.memory.workers", lambda: 1)
+    bench, settings = open_bench(shared_scene("light"), variant), Settings(depth=400.0, samples={"direct": 9.0})
+    one, three = (light_bytes(bench, bench.n**2, settings, lines) for lines in (1, 3))
+    held = float(entries(bench.n**2, bench.n**2, Numbers.of(settings), settings))
+    assert three - one == pytest.approx(2 * GROUPS * 45 * held)

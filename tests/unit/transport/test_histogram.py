@@ -1,5 +1,7 @@
 """Paths to light per cell: nothing lost, nothing moved, kinds and layers kept apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,14 @@ def unpacked(made: Bundle, light: np.ndarray) -> np.ndarray:
     """(rows, layers, anchors, y, anchors, x)"""
     shape = (len(made.depths), made.anchors, made.cells[0], made.anchors, made.cells[1])
     return np.asarray(light).reshape(-1, *shape)
+
+
+def test_chosen_light_keeps_what_is_told_of_each_line() -> None:
+    """(Planted: lines left out.)"""
+    found = replace(path_samples(), lines=np.random.default_rng(5).random((4, 400)).astype(np.float32))
+    for chosen in (slice(20, 50), found.pixel == 3):
+        some = found.where(chosen)
+        assert some.lines is not None and np.array_equal(some.lines, found.lines[:, chosen])  # type: ignore[index]
 
 
 LABELS = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])

@@ -44,8 +44,9 @@ def alike(one: PathSamples, other: PathSamples) -> bool:
 def test_light_does_not_hang_on_how_paths_are_launched(
     bench: Bench, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Launches of one sample and a part, of each seed that a generator takes; another seed finds other light. (Planted:
-    every launch begins with the first sample.)"""
+    """Launches of one sample and a part, of each seed that a generator takes; another seed finds other light, and later
+    samples are what the first ones leave. (Planted: every launch begins with the first sample; the first one that is
+    asked for not heeded.)"""
     settings = Settings(depth=bench.geometry.scene_distance, effects=frozenset(effects.present(bench)))
     simulation = Simulation(bench, replace(settings, anchors=2, followed_anchors=2))
     tracer = simulation.at_anchors[0] if name == "at anchors" else getattr(simulation, name)
@@ -54,6 +55,7 @@ def test_light_does_not_hang_on_how_paths_are_launched(
     assert whole[0].value.size and not alike(whole[0], whole[1])
     for seed, found in zip(SEEDS, whole, strict=True):
         assert alike(found, tracer.trace(seed, 0, 3))
+    assert alike(whole[0], PathSamples.join([tracer.trace(SEEDS[0], 0, 1), tracer.trace(SEEDS[0], 1, 2)]))
 
 
 @pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "shared", "at anchors", "from_camera"])
@@ -72,3 +74,15 @@ def test_replicates_in_one_kernel_are_what_each_seed_traces(
         for samples, replicates in ((1, of_one), (3, of_all)):
             for seed, found in zip(SEEDS, replicates, strict=True):
                 assert alike(found, tracer.trace(seed, first, samples))
+
+
+def test_replicates_have_the_light_of_all_wavelengths(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is traced alone where glass parts them. (Planted: lanes counted on from one wavelength to the next; sums of
+    one wavelength.)"""
+    tracer = Simulation(bench, Settings(depth=bench.geometry.scene_distance)).direct
+    monkeypatch.setattr(Tracer, "per_wavelength", property(lambda self: [self, self]))
+    for samples, replicates in zip((1, 2), tracer.replicates(SEEDS, 1, 2), strict=True):
+        for seed, found in zip(SEEDS, replicates, strict=True):
+            assert alike(found, tracer.trace(seed, 0, samples))
+    sums, found = tracer.sums(SEEDS[0], 2), tracer.trace(SEEDS[0], 0, 2)
+    assert np.allclose(sums.ravel(), np.bincount(found.pixel, found.value, sums.size), rtol=1e-6)
