@@ -156,7 +156,11 @@ class Candidates:
 
     def best(self, accuracy: float, sure: float = SURE) -> tuple[_Table, int]:
         """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``, ``sure`` as it takes it."""
-        found = [(table, table.best) for table in (each.at(accuracy, sure) for each in self._tables)]
+        tables = [each.at(accuracy, sure) for each in self._tables]
+        # Most leave out what no choice of numbers makes up for.
+        found = [(table, table.best) for table in tables if table.accurate.any()]
+        if not any(table.fits[index] for table, index in found):
+            found = [(table, table.best) for table in tables]
         return min(found, key=lambda each: each[0].rank(each[1]))
 
     def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
@@ -406,9 +410,14 @@ class _Table:
     # ---- samples and work
 
     @cached_property
+    def accurate(self) -> npt.NDArray[np.bool_]:
+        """(m,) whether anything is left for sampling."""
+        return self._avoidable < _MARGIN * self.accuracy
+
+    @cached_property
     def fits(self) -> npt.NDArray[np.bool_]:
         """(m,) whether anything is left for sampling, and the light can be held."""
-        return (self._avoidable < _MARGIN * self.accuracy) & (self._entries <= _MOST_ENTRIES)
+        return self.accurate & (self._entries <= _MOST_ENTRIES)
 
     @cached_property
     def target(self) -> FloatArray:

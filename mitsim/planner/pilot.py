@@ -218,7 +218,7 @@ class PilotRuns:
         if run == "cells":
             self.fine = DirectRuns(bench, base, sample, self.accuracy, seed)
         elif run == "effects":
-            judged = self.fine.judging, self.accuracy
+            judged = self.fine.judging, self.accuracy, lambda: self.fine.coarse
             self.switched = EffectRuns(bench, self._everything, sample, seed, *judged)
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0

@@ -22,7 +22,17 @@ from mitsim.light.passes import PASSES, PassTracer
 from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost, Settings
 from mitsim.light.simulation import Simulation, emission
 from mitsim.planner.pilot_direct import SHARP_RATE, shown_pixels, tracer_of
-from mitsim.planner.pilot_samples import EVEN_CELLS, Known, Sample, coarsening_changes, heavy_paths, ladder, noise, norm
+from mitsim.planner.pilot_samples import (
+    EVEN_CELLS,
+    GOOD_ENOUGH,
+    Known,
+    Sample,
+    coarsening_changes,
+    heavy_paths,
+    ladder,
+    noise,
+    norm,
+)
 from mitsim.transport import records
 from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
 from mitsim.transport.integrator import KINDS
@@ -90,6 +100,8 @@ class EffectRuns:
         depths [mm] that judge one layer; none for a flat scene.
     accuracy
         what coarse cells change of indirect light is told to a small part of it, where that is cheap.
+    as_direct
+        gives parts that one cell a pixel, and one layer, leave of direct light, as far as known.
     """
 
     def __init__(
@@ -100,9 +112,10 @@ class EffectRuns:
         seed: int,
         layers: tuple[float, ...] = (),
         accuracy: float = math.inf,
+        as_direct: Callable[[], tuple[float, float]] = lambda: (math.inf, math.inf),
     ) -> None:
         self.bench, self.everything, self.sample, self.layers = bench, everything, sample, layers
-        self.accuracy = accuracy
+        self.accuracy, self._as_direct = accuracy, as_direct
         self.seeds = [integer(seed, "pilot", "effects", replicate) for replicate in range(REPLICATES)]
         self.simulation = sample.simulation(bench, everything)
         self.direct = self._direct(self.simulation)
@@ -124,13 +137,20 @@ class EffectRuns:
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
-        if not any(light.value.size for light in self._closer.indirect):
+        if self._is_faint or not any(light.value.size for light in self._closer.indirect):
             return {}
         changes = coarsening_changes("indirect", self._indirect, ())
         if self.layers:
             layered, one = (self._indirect(1, layers, self._few) for layers in (self.layers, ()))
             changes[Approximation("indirect layers", 1)] = layered - one
         return changes
+
+    @cached_property
+    def _is_faint(self) -> bool:
+        """Whether so little light is indirect that one coarse cell a pixel, and one layer, serve."""
+        direct = sum(float(light.value.sum()) for light in self.direct) / (REPLICATES * self.sample.direct)
+        part = self.received / (direct + self.received) if self.received else 0.0
+        return part > 0 and _AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
 
     @property
     def coarse(self) -> tuple[float, float]:
@@ -174,7 +194,7 @@ class EffectRuns:
     def _looks(self) -> tuple[Bounced, Bounced]:
         """Looks at the projector's side's light: more where noise hides what coarse cells change."""
         first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
-        if tracer is None or not any(light.value.size for light in first.indirect):
+        if tracer is None or self._is_faint or not any(light.value.size for light in first.indirect):
             return first, first
         seen = coarsening_changes("indirect", partial(self._indirect, seen=first), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
@@ -378,7 +398,8 @@ _AT_ONCE = 2**20
 """Connections that are traced at a time: 0.5 GB while they are accumulated."""
 _AS_ROUGH = 15.0
 """Part that one cell, or layer, leaves of what a few anchors see beyond their mean, over what it leaves of all their
-light, at most (photograph 3.9, cards 4.2, gift_card 5.6, metal_blade 6.3, cookie_bag 7.4)."""
+light, at most (photograph 3.9, cards 4.2, gift_card 5.6, metal_blade 6.3, cookie_bag 7.4); and that part of indirect
+light over that of direct light (corner 0.13, cookie_bag 1.3, metal_blade 5 to 9, most of it noise)."""
 _FOLLOWED_JUDGE = 1
 """Index of the number that judges at first, for light that is followed."""
 

@@ -7,6 +7,7 @@ against frames of many more samples; the pilot sees a few, so a factor of 1.5 ei
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -431,6 +432,22 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     parted = pilot_effects.Bounced.of(halves, seen.samples)
     assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
     assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
+
+
+def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) -> None:
+    """Where the bound on what they leave of it, by what they leave of direct light, is below the accuracy. (Planted: the
+    bound of direct light, not of its part.)"""
+    lighting = parse_patterns("dots:4", N).lighting
+    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    followed = EffectRuns(bench, everything, sample, 5)
+    direct = sum(float(light.value.sum()) for light in followed.direct) / (REPLICATES * sample.direct)
+    part = followed.received / (direct + followed.received)
+    enough = pilot_samples.GOOD_ENOUGH * 1e-2 / (15 * part)
+    for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True)):
+        found = EffectRuns(bench, everything, sample, 5, (), 1e-2, partial(tuple, (left / 2, left)))
+        assert bool(found._coarse) == looked_at
+        assert found.sample_cost("indirect").noise.error
 
 
 def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.MonkeyPatch) -> None:
