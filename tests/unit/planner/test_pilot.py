@@ -435,7 +435,7 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
 
 
 def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) -> None:
-    """Where the bound on what they leave of it, by what they leave of direct light, is below the accuracy. (Planted: the
+    """Where the bound on what they leave, by what they leave of direct light, is below the accuracy. (Planted: the
     bound of direct light, not of its part.)"""
     lighting = parse_patterns("dots:4", N).lighting
     sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
