@@ -400,6 +400,8 @@ _AS_ROUGH = 15.0
 """Part that one cell, or layer, leaves of what a few anchors see beyond their mean, over what it leaves of all their
 light, at most (photograph 3.9, cards 4.2, gift_card 5.6, metal_blade 6.3, cookie_bag 7.4); and that part of indirect
 light over that of direct light (corner 0.13, cookie_bag 1.3, metal_blade 5 to 9, most of it noise)."""
+_FAINT = 0.6
+"""Part of the tolerance for followed light that makes up what direct light may leave."""
 _FOLLOWED_JUDGE = 1
 """Index of the number that judges at first, for light that is followed."""
 
@@ -638,6 +640,14 @@ class FollowedRuns(AnchorRuns):
             for name, each, tracer in zip(self.passes, seen, tracers, strict=True)
         }
 
+    @property
+    def _camera_is_faint(self) -> bool:
+        """Whether more anchors than few need not see the camera's part: it and its noise differ little from anchor to
+        anchor."""
+        if None in self._simulation(self.few).at_anchors:
+            return False
+        return math.sqrt(float(np.square(self._from_camera).sum()) / REPLICATES) < _FAINT * self.tolerance
+
     @cached_property
     def _from_camera(self) -> FloatArray:
         """The camera's part of the frames of what a few anchors see beyond their mean."""
@@ -680,8 +690,11 @@ class FollowedRuns(AnchorRuns):
         grids, tracers = self._grids(simulation), _tracers(simulation)
         if anchors == self.few:
             return self._with_first(self._form(grids, self._few), lambda before: before._frames(anchors))
-        each = max(1, _AT_ONCE // (REPLICATES * sum(tracer.paths_per_sample for tracer in tracers)))
         found = []
+        if anchors > self.few and self._camera_is_faint:
+            tracers = tracers[:1]
+            found.append(self._form(self._grids(self._simulation(self.few)), self._few_by_tracer[1]))
+        each = max(1, _AT_ONCE // (REPLICATES * sum(tracer.paths_per_sample for tracer in tracers)))
         for first in range(0, samples, each):
             some = min(each, samples - first)
             traced = [tracer.replicates(self._seeds, some, first=self._first + first)[0] for tracer in tracers]

@@ -434,6 +434,31 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
 
 
+def test_more_anchors_see_a_faint_camera_part_as_few_do(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then it is not traced again, and nothing of it is lost. (Planted: frames without it; those of one anchor.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
+    others = runs.samples["followed"], math.inf, 3, runs.fine.judging
+    whole = pilot_effects.FollowedRuns(bench, runs._everything, *others)
+    monkeypatch.setattr(pilot_effects, "_FAINT", 0.0)
+    apart = whole._frames(3)
+    monkeypatch.setattr(pilot_effects, "_FAINT", 0.6)
+    faint = pilot_effects.FollowedRuns(bench, runs._everything, *others)
+    traced = list[str]()
+    replicates = Tracer.replicates
+
+    def count(tracer: Tracer, *arguments: Any, **options: Any) -> list[list[PathSamples]]:
+        traced.append(type(tracer).__name__)
+        return replicates(tracer, *arguments, **options)
+
+    faint._frames(2)
+    monkeypatch.setattr(Tracer, "replicates", count)
+    seen = faint._frames(3)
+    assert len(traced) == 1 and "Camera" not in traced[0]
+    camera = float(np.linalg.norm(whole._form(whole._grids(whole._simulation(2)), whole._few_by_tracer[1])))
+    assert float(np.linalg.norm(seen - apart)) < 0.5 * camera
+    assert camera > 0.1 * float(np.linalg.norm(apart))
+
+
 def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) -> None:
     """Where the bound on what they leave, by what they leave of direct light, is below the accuracy. (Planted: the
     bound of direct light, not of its part.)"""
