@@ -113,8 +113,8 @@ def captured(
 
 
 def shares(frames: Frames, halves: Frames) -> npt.NDArray[np.floating[Any]]:
-    """(2, pairs, shots): squared error of each of ``frames`` without the noise of the answer, and the energy of that, by
-    all pairs of its ``halves``."""
+    """(2, pairs, shots): squared error of each of ``frames`` without the noise of the answer, and the energy of that,
+    by all pairs of its ``halves``."""
     pairs = list(itertools.combinations(range(len(halves)), 2))
     found = np.empty((2, len(pairs), len(frames)))
     for shot, a in enumerate(frames.astype(np.float64)):
