@@ -203,11 +203,14 @@ class Apparatus:
 
     @check_arguments
     def parallax_from(self, depth: float) -> Parallax:
-        """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask."""
-        from mitsim.core.manifests import Parallax
+        """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask, or farther
+        than 1e10."""
+        from mitsim.core.manifests import FARTHEST, Parallax
 
         if depth <= self.geometry.mask_distance:
             raise ArgumentError("depth", f"{depth:g}: the mask is at {self.geometry.mask_distance:g} mm; give more")
+        if depth > FARTHEST:
+            raise ArgumentError("depth", f"{depth:g}: give at most {FARTHEST:g} mm")
         window = self.windows_at(depth)
         farther = self.windows_at(2 * depth)  # in 1/z halfway to infinity: far enough that rounding of uv does not show
         shift = 1 / (2 * depth) - 1 / depth

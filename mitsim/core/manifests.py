@@ -53,8 +53,9 @@ Rows = Annotated[tuple[Row, ...], Field(strict=False, max_length=MOST_PIXELS), F
 BinnedSum = Annotated[float, Field(ge=0, le=LARGEST * _MOST_BINNED, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(ge=-1e7, le=1e7, allow_inf_nan=False)]
 """Within 10 km, and tan-angles of any lens."""
-Distance = Annotated[float, Field(gt=0, le=1e10, allow_inf_nan=False)]
-"""Up to the largest `scene_distance`."""
+FARTHEST = 1e10
+"""The largest `scene_distance` [mm]."""
+Distance = Annotated[float, Field(gt=0, le=FARTHEST, allow_inf_nan=False)]
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 Plain = Annotated[dict[str, Any], BeforeValidator(plain)]
 """A part that others than the solver read, as JSON holds it."""

@@ -292,10 +292,7 @@ def _reflectivity_figures(results: Results) -> Mapping[str, Figure]:
             drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
     rows = [row for row in peak.rows if row["subject"] not in swept]
     names = [str(row["subject"]).replace("_", " ") for row in rows]
-    shown = [
-        (*(_caption(results, row, name) for name in _TRUTHS), *_gloss_images(results, row, results.table))
-        for row in rows
-    ]
+    shown = [_gloss_images(results, row, results.table) for row in rows]
     titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in GLOSS_FAMILIES)]
     drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
     causes = [[_caption(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
