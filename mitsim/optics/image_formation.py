@@ -52,6 +52,9 @@ _FINER = 2
 """Times as many cells a side of the raster that judges."""
 
 
+# -------- One layer behind a mask, as terms or on a raster
+
+
 @dataclass(frozen=True, eq=False)
 class _Lit:
     """Light of one layer in the rows and columns that any of several estimates lights.
