@@ -8,6 +8,7 @@ noise. When n is no Hadamard order the next one is used and its first n rows: ro
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,11 +25,19 @@ from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
+from mitsim.devices.plate import MOST_TERMS
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.memory import first_shadow, frame_seconds, frames_at_once, light_bytes
+from mitsim.light.memory import (
+    drawing_seconds,
+    first_shadow,
+    frame_seconds,
+    frames_at_once,
+    light_bytes,
+    raster_bytes,
+)
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
@@ -44,8 +53,10 @@ from mitsim.reconstruct.session_side import odd_responses, too_many
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
 be of diffraction."""
-_TERMS_BYTES = 2**30
-"""Memory of a drawn shadow's largest terms that are looked at in place of all: there are at most as many."""
+_TOLD, _TOLD_S = 4.0, 6e-11
+"""Times the terms of a mask that telling how far it is from a separable one takes in memory, with their sides stacked
+and factorised; and seconds of that for each term and byte of all (a drawing that is turned by one degree, 512
+pixels, 192 terms: 0.8 GiB, 3.1 processor seconds)."""
 _DARK = 1e-12
 """Transmission below which nothing is seen: rounding of sums."""
 _LINES = 4
@@ -135,16 +146,40 @@ class Session:
         found = self._inseparable
         return () if found is None else (f"{found.words}, and images of these factors lack it; {found.remedy}",)
 
-    def check_mask(self) -> None:
+    def check_mask(self, job: Job | None = None) -> None:
         """MitsimError for a mask behind which more patterns of the session are of another shape than may be left out of
-        it, which its frames would show after all the work."""
-        found, count = self._inseparable, self.signs.shape[1]
+        it, which its frames would show after all the work; and when to tell so takes more than a ``job`` allows."""
+        job, count = job or Job(), self.signs.shape[1]
+        self._first_cost.check("calibration", job.limits)
+        self._mask_cost.check("calibration", job.limits)
+        with job.clock.stage("mask"):
+            found = self._inseparable
         if found is not None and too_many(found.patterns, count):
             raise MitsimError(
                 f"{found.words}, and {found.patterns} of {2 * count} patterns of a session would show no shape that "
                 f"the others do, too many for factors; {found.remedy}: without factors it can be planned and captured, "
                 "and no image is solved"
             )
+
+    @property
+    def _first_cost(self) -> Cost:
+        """Memory and time of the session, as far as they are known before a look at the board."""
+        count, first = self.signs.shape[1], Settings(self.distance)
+        seconds = session_seconds(self.board, count, self.shots, first)
+        return session_cost(self.board, count, first, sum(seconds.values()), len(self.recipe.exposure_ladder))
+
+    @property
+    def _mask_cost(self) -> Cost:
+        """Memory and time of comparing the mask with separable ones, at most."""
+        geometry, most = self.bench.geometry, 1.0
+        seconds = bytes_drawn = 0.0
+        if geometry.is_drawn(waves=False):
+            most, seconds = float(MOST_TERMS), drawing_seconds(geometry, None)
+            bytes_drawn = raster_bytes(geometry, None)
+        elif self._told is None:
+            most = float(geometry.mask_terms)
+        bytes_told = 8.0 * most * self.bench.n * sum(geometry.frame_shape)
+        return Cost(seconds=seconds + _TOLD_S * most * bytes_told, memory_bytes=bytes_drawn + _TOLD * bytes_told)
 
     @cached_property
     def _inseparable(self) -> _Inseparable | None:
@@ -153,6 +188,9 @@ class Session:
         seen = self._transmissions(geometry, told)
         terms = centre_terms(seen) if self.centre else seen
         residual = best_term(terms).residual
+        if geometry.is_drawn(waves=False):
+            left_out = raster(geometry, self.distance).largest.left_out
+            residual = math.sqrt(1 - (1 - residual**2) * (1 - left_out**2))
         if residual <= SEPARABLE_RESIDUAL:
             return None
         rays, cause = residual if told is None else best_term(self.shadow(geometry)).residual, ""
@@ -201,10 +239,11 @@ class Session:
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )
-        largest = None
         if geometry.is_drawn(waves=False):
-            largest = largest_terms(geometry, rows, columns, self.distance, most_bytes=_TERMS_BYTES)
-        return largest or shadow_terms(geometry, rows, columns, self.distance, spectrum)
+            seen = largest_terms(geometry, rows, columns, self.distance, rough=True)
+            assert seen is not None
+            return seen
+        return shadow_terms(geometry, rows, columns, self.distance, spectrum)
 
     @cached_property
     def signs(self) -> FloatArray:
@@ -256,16 +295,19 @@ class Session:
 
         MitsimError when that is more memory or time than the ``job`` allows: before the look at the board, or after it.
         """
-        n, count, starting = self.bench.n, self.signs.shape[1], job.clock.seconds()["total"]
-        first = Settings(self.distance)
-        seconds = session_seconds(self.board, count, self.shots, first)
-        exposures = len(self.recipe.exposure_ladder)
-        session_cost(self.board, count, first, sum(seconds.values()), exposures).check("calibration", job.limits)
+        n, count, spent = self.bench.n, self.signs.shape[1], job.clock.seconds()
+        self._first_cost.check("calibration", job.limits)
         with job.planning("calibration", first_shadow(self.board, {})):
-            plan = make_plan(self.board, _lines(n), accuracy, self.seed)
-        seconds = session_seconds(self.board, count, self.shots, plan.settings, self._terms_of(plan.settings))
+            plan, started = make_plan(self.board, _lines(n), accuracy, self.seed), time.perf_counter()
+            # Drawn here in the cells that were chosen, a shadow is the session's own.
+            terms = self._terms_of(plan.settings)
+            planning = plan.predicted["plan"] + time.perf_counter() - started
+        seconds = session_seconds(self.board, count, self.shots, plan.settings, terms)
+        if told := spent.get("mask", 0.0):
+            seconds["mask"] = told
         # There is no truth to be traced, and other frames are formed than those that the plan looks at.
-        plan = plan.taking(start=starting, truth=0.0, **seconds)
+        plan = plan.taking(start=spent["total"] - told, plan=planning, truth=0.0, **seconds)
+        exposures = len(self.recipe.exposure_ladder)
         cost = session_cost(self.board, count, plan.settings, plan.predicted_seconds, exposures)
         cost.check("calibration", job.limits)
         job.clock.predict(plan.predicted)
@@ -322,6 +364,9 @@ two processors)."""
 _MIXED_S, _FORMED_S = 8e-9, 1e-8
 """A pixel of a frame that is mixed or formed beside its multiplications: memory that is read and taken anew (sensors of
 512 and 1024 pixels mixed, of 2048 formed; two processors)."""
+_READ_S = 1.75e-9
+"""A number of a drawn shadow's terms, all of one side of which a stripe's frame and its probes read; 0.7 of the
+processor seconds of 60 and 102 terms at 512 pixels."""
 _UNWRITTEN = 0.55
 """Of what exposing a capture's frame takes, that of one which no file is written of (0.62 at 512 pixels, 0.49 at
 1024)."""
@@ -367,7 +412,13 @@ def session_seconds(
         largest_terms=(largest_terms,) * 2,
     )
     numbers = replace(Numbers.of(settings), mixed=0.0)  # what black pixels leak is added to frames
-    seconds = 2 * float(forming_seconds(forming, numbers, n if mixed else count, _UNIT_COSTS))
+    frames = n if mixed else count
+    costs = _UNIT_COSTS if math.isfinite(largest_terms) else FIXED  # correlations are no products
+    seconds = 2 * float(forming_seconds(forming, numbers, frames, costs))
+    if 1 < largest_terms < math.inf:
+        of_anchors = (settings.anchors > 1) * settings.anchors * settings.coarse_cells
+        lit_cells = cells * len(settings.depths) + n * of_anchors
+        seconds += 2 * frames * _READ_S * largest_terms * lit_cells * pixels
     each = n * _UNIT_COSTS.product + _MIXED_S if mixed else _FORMED_S
     return {
         "optics": seconds + 2 * count * pixels**2 * each,

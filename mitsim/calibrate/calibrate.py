@@ -203,7 +203,7 @@ def _run_sessions(
         folder that the frames of a single one are written to.
     """
     for session in lines:
-        session.check_mask()
+        session.check_mask(task.job)
     found, job, whole = list[Factors](), task.job, lines[0].whole or lines[0]
     plan: Plan | None = None
     lights: list[SampledLight] = []

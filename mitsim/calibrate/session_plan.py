@@ -221,7 +221,7 @@ def plan_calibration(
         )
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe, seed)
-    session.check_mask()
+    session.check_mask(job)
     job.progress("capture", 0.0)
     with job.clock.stage("capture"):
         request = Request.of(patterns=patterns, seed=seed, accuracy=accuracy)

@@ -16,7 +16,7 @@ Behind a turned mask there is the same light, turned.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, cast
@@ -482,9 +482,14 @@ class _Side:
 
 
 def terms_of_raster(
-    shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float, places: Places | None
+    shadow: ShadowGeometry,
+    rows: Directions,
+    columns: Directions,
+    fill_factor: float,
+    places: Places | None,
+    terms: Sequence[Term],
 ) -> SeparableTerms:
-    """The largest separable terms of a raster's shadow, [(left (m, r), right (m', c)), ...].
+    """Some separable terms of a raster's shadow, [(left (m, r), right (m', c)), ...].
 
     Parameters
     ----------
@@ -492,6 +497,8 @@ def terms_of_raster(
         as for :class:`Correlation`.
     places
         rows and columns of a frame; None: all.
+    terms
+        of the raster.
     """
     sides = _Side.both(shadow, rows, columns)
     at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
@@ -500,7 +507,7 @@ def terms_of_raster(
         weight, row, column = term
         return fill_factor * weight * sides[0].factor(row, at[0]), sides[1].factor(column, at[1])
 
-    return in_threads(factors, shadow.mask.terms)
+    return in_threads(factors, terms)
 
 
 def _mask_values(shadow: ShadowGeometry) -> FloatArray:

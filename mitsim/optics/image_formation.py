@@ -52,6 +52,9 @@ _FINER = 2
 """Times as many cells a side of the raster that judges."""
 
 
+# -------- One layer behind a mask, as terms or on a raster
+
+
 @dataclass(frozen=True, eq=False)
 class _Lit:
     """Light of one layer in the rows and columns that any of several estimates lights.
@@ -105,15 +108,26 @@ class _Terms:
 
     def _factors(self, lit: _Lit) -> list[tuple[FloatArray, FloatArray]]:
         """By term (r, m) and (c, m'): the factors of the lit rows and columns, each by its anchor's weights."""
-        places = lit.rows, lit.columns
-        return [
-            tuple(  # type: ignore[misc]
-                self.weights[axis].T[anchor] * factor.T[cell]
-                for axis, factor in enumerate(term)
-                for anchor, cell in [np.divmod(places[axis], factor.shape[1])]
-            )
-            for term in self.terms
-        ]
+        return list(zip(self._side(0, lit.rows), self._side(1, lit.columns), strict=True))
+
+    def _side(self, axis: int, places: IntArray) -> list[FloatArray]:
+        """The same of one ``axis``; of all places they are kept, as a stripe lights all of its columns, or rows."""
+        every = self.weights[axis].shape[1] * self.terms[0][axis].shape[1]
+        if len(places) < every:
+            return self._pick(axis, places)
+        if axis not in self._whole:
+            self._whole[axis] = self._pick(axis, np.arange(every))
+        return self._whole[axis]
+
+    @cached_property
+    def _whole(self) -> dict[int, list[FloatArray]]:
+        """Factors of all places, by axis, as far as they were asked for."""
+        return {}
+
+    def _pick(self, axis: int, places: IntArray) -> list[FloatArray]:
+        anchor, cell = np.divmod(places, self.terms[0][axis].shape[1])
+        weights = self.weights[axis].T[anchor]
+        return [weights * term[axis].T[cell] for term in self.terms]
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +380,7 @@ def raster_error(
         shadow = replace(ShadowGeometry.of(drawn, depth), mask=raster(drawn, depth, spectrum))
         if finer == 1 and not known and math.isfinite(number_of_terms(raster(drawn, depth, spectrum))):
             # As runs may form it: what its largest terms leave out is then part of what is told.
-            return sum_of(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None))
+            return sum_of(terms_of_raster(shadow, rows, columns, drawn.pixel_fill_factor, None, shadow.mask.terms))
         return Correlation(shadow, rows, columns, drawn.pixel_fill_factor).image(light, row, column)
 
     def sum_of(terms: SeparableTerms) -> FloatArray:
@@ -392,7 +406,7 @@ def largest_terms(
     depth: float,
     spectrum: Spectrum | None = None,
     places: Places | None = None,
-    most_bytes: float = SUMMED_BYTES,
+    rough: bool = False,
 ) -> SeparableTerms | None:
     """The shadow of a mask that is drawn on a raster, but for 1e-4 of it, as separable terms; None where these would
     take too much memory.
@@ -401,16 +415,17 @@ def largest_terms(
     ----------
     geometry, rows, columns, depth, spectrum, places
         as for :func:`mitsim.optics.terms.shadow_terms`.
-    most_bytes
-        that they may take.
+    rough
+        that as many as are ever looked for are taken, whatever they leave and take.
     """
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
     sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
-    if 8 * number_of_terms(drawn) * sides > most_bytes:
+    if not rough and 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
         return None
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
-    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places)
+    terms = drawn.largest.terms() if rough else drawn.terms
+    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places, terms)
 
 
 @lru_cache(maxsize=RASTERS_KEPT)

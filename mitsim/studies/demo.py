@@ -95,7 +95,7 @@ def demo(bench: Bench, output: Path | str, request: Request | None = None, job: 
     request, job = request or Request.of(), job or Job()
     Exposure().check(bench.sensor, bench.devices.camera_file)
     names = _fitting(bench, request)
-    Session(bench, load_recipe(), request.seed).check_mask()
+    Session(bench, load_recipe(), request.seed).check_mask(job)
     # Only now, with nothing left to refuse, is an earlier demo taken away.
     with study_folder(output, "demo") as folder:
         for part in DEMO_FOLDERS:

@@ -423,6 +423,6 @@ def test_a_mask_is_refused_where_its_session_would_be(
     known = pytest.raises(MitsimError, match="is not separable") if refused else nullcontext()
     with known:
         session.check_mask()
-    monkeypatch.setattr(Session, "check_mask", lambda _: None)
+    monkeypatch.setattr(Session, "check_mask", lambda *_: None)
     with pytest.raises(MitsimError, match="no shape in common") if refused else nullcontext():
         assert not bench.calibrate(accuracy=0.02).ok
