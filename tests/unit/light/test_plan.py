@@ -220,8 +220,8 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 
 
 def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
-    """In more cells, which without waves take as much longer, or of several layers, it is. (Planted: drawn again; never;
-    more cells in less time.)"""
+    """In more cells, which take longer without waves, or of several layers, it is. (Planted: drawn again; never; more
+    cells in less time.)"""
     forming = replace(PILOT_RESULT.forming, correlated=(True, True), phases=36.0)
 
     def drawing(**numbers: float) -> float:
