@@ -8,8 +8,9 @@ threads, because each product is computed by one.
 from __future__ import annotations
 
 import os
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
@@ -23,7 +24,12 @@ Result = TypeVar("Result")
 
 
 _counting = threading.Lock()
-_inside_blas, _before = 0, list[int]()
+_inside_blas = 0
+_before = dict[str, tuple[Any, int]]()
+"""Libraries of BLAS that are kept to one thread, by path, each with the number that it had."""
+
+_BRING_BLAS = "scipy.linalg", "scipy.special"
+"""Modules that load SciPy's own library of BLAS; whatever else of SciPy does imports one of them."""
 
 
 @contextmanager
@@ -33,24 +39,25 @@ def single_threaded_blas() -> Iterator[None]:
     Their number is the process's, and contexts of several threads overlap by chance. So what was found is put back when
     the last of all is left: at the first one's end BLAS had its threads again while another thread worked.
     """
-    global _inside_blas, _before
+    global _inside_blas
     with _counting:
-        if _inside_blas == 0:
-            _before = [library.num_threads for library in _libraries()]
+        for library in _libraries(*(name in sys.modules for name in _BRING_BLAS)):
+            _before.setdefault(library.filepath, (library, library.num_threads))
         _inside_blas += 1
-        _set_threads([1] * len(_before))
+        _set_threads((library, 1) for library, _ in _before.values())
     try:
         yield
     finally:
         with _counting:
             _inside_blas -= 1
             if _inside_blas == 0:
-                _set_threads(_before)
+                _set_threads(_before.values())
+                _before.clear()
 
 
-def _set_threads(numbers: Sequence[int]) -> None:
-    """Let each library of BLAS have so many threads."""
-    for library, number in zip(_libraries(), numbers, strict=True):
+def _set_threads(numbers: Iterable[tuple[Any, int]]) -> None:
+    """Let each of some libraries of BLAS have so many threads."""
+    for library, number in numbers:
         # Since 3.8 threadpoolctl heeds one thread's wishes at a time, and ignores those of others in silence.
         forget = getattr(library, "clear_controlling_thread", lambda **_: None)
         forget(force=True)
@@ -59,8 +66,9 @@ def _set_threads(numbers: Sequence[int]) -> None:
 
 
 @cache
-def _libraries() -> tuple[Any, ...]:
-    """Libraries of BLAS in this process; looking for them takes a millisecond, so once."""
+def _libraries(*_: bool) -> tuple[Any, ...]:
+    """Libraries of BLAS in this process, which has imported these of :data:`_BRING_BLAS`. Looking for them takes a
+    millisecond, so it is done once, and again after such an import."""
     # Imported here: threadpoolctl sets an environment variable when it is imported, and importing mitsim sets none.
     from threadpoolctl import ThreadpoolController
 

@@ -100,6 +100,14 @@ def test_what_needs_another_plan_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.usefixtures("no_plans")
+def test_a_plan_that_takes_longer_than_is_allowed_is_refused(bench: Bench, file: Path, tmp_path: Path) -> None:
+    """(Planted: what is known before a plan held against the limits alone.)"""
+    with pytest.raises(MitsimError, match=r"^dots:3: would take about 1e\+09 s; allowed are 8\.64e\+04 s"):
+        bench.capture(Plan.load(file).taking(transport=1e9), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("patterns", ["hadamard:4", "dots:1x16"])
 def test_other_patterns_of_the_same_classes_or_weights_are_others(bench: Bench, file: Path, patterns: str) -> None:
     """(Planted: classes of pixels compared alone; how they are lit alone.)"""
@@ -186,7 +194,8 @@ def light(bench: Bench) -> Light:
 @pytest.mark.usefixtures("no_plans")
 def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light, tmp_path: Path) -> None:
     """Frames of another family, its lamps' light and truth, and the errors that are stated. (Planted: lamps left out;
-    the second group for the first; the flux and its error exchanged; samples left out; always reached.)"""
+    the second group for the first; the flux and its error exchanged; samples left out; always reached; the request's
+    seed for the light's.)"""
     path = light.save(tmp_path / "light.h5")
     found = Light.load(path, bench)
     assert found.plan == light.plan and len(found.groups) == GROUPS and found.summary() == light.summary()
@@ -201,6 +210,16 @@ def test_light_of_a_file_is_exposed_as_it_was_traced(bench: Bench, light: Light,
             assert getattr(second.manifest, name) == pytest.approx(getattr(first.manifest, name), rel=1e-5)
         assert second.manifest.configuration == first.manifest.configuration
         assert second.manifest.configuration["light"] == {"patterns": "dots:3", "seed": SEED}
+    assert found.expose("dots:3", seed=9).manifest.configuration["light"]["seed"] == SEED
+
+
+@pytest.mark.usefixtures("no_plans")
+def test_frames_that_are_noisier_than_the_lights_own_say_so(light: Light) -> None:
+    """Where the accuracy is not reached. (Planted: no comparison.)"""
+    rough = replace(light, sampling_error=1e-7, plan=replace(light.plan, accuracy=1e-6, warnings=()))
+    for patterns, said in (("dots:2", True), ("dots:3", False)):
+        (warning,) = [each for each in rough.expose(patterns).warnings if "accuracy 1e-06 was not reached" in each]
+        assert ("trace it for dots:2" in warning and "as much noisier" in warning) is said
 
 
 @pytest.mark.usefixtures("no_plans")

@@ -1,5 +1,7 @@
 """Work in threads: what is waited for, what is raised, what an interruption leaves, and threads of BLAS meanwhile."""
 
+import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -91,6 +93,30 @@ def test_blas_has_its_threads_again_after_an_error() -> None:
         with suppress(MitsimError), single_threaded_blas():
             raise MitsimError("inside")
         assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {2}
+
+
+@pytest.mark.parametrize("module", ["scipy.linalg", "scipy.special"])
+def test_blas_that_is_loaded_later_has_one_thread_too(module: str) -> None:
+    """SciPy brings a library of its own, which a capture need not load. (Seen failing: it had all threads in a process
+    that had kept NumPy's to one before.)"""
+    program = f"""if True:
+        from threadpoolctl import threadpool_info, threadpool_limits
+        from mitsim.core.parallel import single_threaded_blas
+        import numpy
+
+        def threads():
+            return {{pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}}
+
+        with single_threaded_blas():
+            import {module}
+            threadpool_limits(2)
+            with single_threaded_blas():
+                inside = threads()
+        with single_threaded_blas():
+            print(inside, threads())
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "{1} {1}\n"
 
 
 def test_items_of_items_do_not_wait_for_each_other() -> None:

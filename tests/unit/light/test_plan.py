@@ -220,7 +220,8 @@ def test_many_terms_are_summed_or_formed_by_fft_whichever_takes_less() -> None:
 
 
 def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
-    """In more cells, or of several layers, it is. (Planted: drawn again; never.)"""
+    """In more cells, which take longer without waves, or of several layers, it is. (Planted: drawn again; never; more
+    cells in less time.)"""
     forming = replace(PILOT_RESULT.forming, correlated=(True, True), phases=36.0)
 
     def drawing(**numbers: float) -> float:
@@ -230,6 +231,7 @@ def test_a_shadow_that_the_pilot_has_drawn_is_not_drawn_again() -> None:
 
     assert drawing() == 0
     assert drawing(raster_cells=8.0) == pytest.approx(5) and drawing(layers=2.0) == pytest.approx(15)
+    assert drawing(raster_cells=12.0, waves=0.0) == pytest.approx(5 * 144 / 36)
 
 
 def test_seconds_of_more_stages_move_all_that_is_predicted() -> None:
