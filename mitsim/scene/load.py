@@ -107,9 +107,10 @@ def load_scene(
         notes = emit_by_faces(checked)  # before thin shapes are meshes, too
         with with_thin_shapes_as_meshes(checked.outline, checked.state):
             scene = mi.parser.instantiate(checked.config, checked.state)
-    check_texels(path, scene, checked.limits)
     check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)
+    # After normals were added up: once Mitsuba's own had a NaN, which loading the same files again did not.
+    check_texels(path, scene, checked.limits)
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
