@@ -64,7 +64,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.session",
     "mitsim.devices.framelist",
     "mitsim.exchange.formats",
-    "mitsim.exchange.formats",
+    "mitsim.exchange.capture_list",
 )
 """What looks at words, manifests and lists before work begins."""
 

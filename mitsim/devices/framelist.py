@@ -64,10 +64,14 @@ def _with_name(camera: Any) -> Any:
     return {"name": camera} if isinstance(camera, str) else camera
 
 
+Identity = Annotated[Plain, BeforeValidator(_with_name)]
+"""Of a camera: a name, or anything as a run's manifest has it."""
+
+
 class FrameList(Configuration):
     """What a real session's frames are of, and how they are read."""
 
-    camera: Annotated[Plain, BeforeValidator(_with_name)]
+    camera: Identity
     """Identity that a run must share: a name, or anything as a run's manifest has it."""
     n: int = Field(ge=1, le=MOST_PIXELS)
     """Projector pixels a side."""
