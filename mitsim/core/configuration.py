@@ -147,7 +147,8 @@ def _range(model: Any, location: tuple[int | str, ...]) -> str:
     """What a number at ``location`` of a model may be, where it has two ends."""
     marks: list[Any] = []
     for part in location:
-        field = getattr(model, "model_fields", {}).get(part)
+        holders = (getattr(kind, "model_fields", {}) for kind in (model, *get_args(model)))  # a part may be optional
+        field = next((fields[part] for fields in holders if part in fields), None)
         if field is None:
             return ""
         model, marks = field.annotation, field.metadata

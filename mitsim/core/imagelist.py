@@ -28,6 +28,10 @@ PLANES = ("r", "gb", "gr", "b")
 """Planes of a mosaic of colour filters, as FlatCam names them: gb is the green one in the rows of blue pixels."""
 ALL = "all"
 """In a plane's place: every one."""
+WAVELENGTHS_NM = 600.0, 540.0, 460.0
+"""Of red, green and blue planes, where nobody says others [nm]: middles of what usual filters pass, as those of
+calibration/ov5647.toml."""
+_Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 BGGR = "BGGR"
 """The mosaic of cameras that do not state theirs: FlatCam's."""
 TO_FILE = "file"
@@ -121,6 +125,8 @@ class Preparation(Configuration):
     """Colour filters of the first 2 x 2 pixels, row by row; none: the camera file's, else BGGR."""
     channel: Literal["r", "gb", "gr", "b", "all"] | None = None
     """Plane of the mosaic that is taken, or all of them; none: the picture is no mosaic."""
+    wavelengths_nm: Annotated[tuple[_Wavelength, ...], Field(strict=False, min_length=3, max_length=3)] = WAVELENGTHS_NM
+    """What red, green and blue planes count as in a colour image [nm]."""
     orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
     """How to turn the picture or plane: an orientation of Exif and TIFF, or as the file says; none: as it is stored,
     and a file that is to be shown turned is refused."""

@@ -23,6 +23,9 @@ from mitsim.core.manifests import Digital
 LEAST_RESPONSE = 0.1
 """Of a pixel to even light, over the mean one, below which it is not corrected: it is defective or dark, and what
 divides it would multiply its noise by ten."""
+PLAIN = 16
+"""Numbers that differ, from which a common factor is no chance: of so many whole numbers all are even once in 2^16
+times."""
 _EDGE = 1e-9
 """Pixels beyond the last one that rounding of a sine and cosine leaves."""
 

@@ -7,20 +7,24 @@ their names.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mitsim.core.configuration import Configuration, Positive, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json
-from mitsim.core.imagelist import Raw, Wanted, image_files
+from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
+
+if TYPE_CHECKING:  # numpy takes 0.1 s to import, and a refusal needs none of it
+    from mitsim.core.images import Numbers
+    from mitsim.core.prepare import Preparer
 
 LISTS = ("session.toml", "session.json")
 """Names of the list."""
@@ -93,6 +97,8 @@ class FrameList(Configuration):
     """How the factors move with depth; none: not known, and no `--focus`."""
     raw: Raw | None = None
     """How frames without a header are read; none: there are none."""
+    prepare: Preparation = Preparation()
+    """Table: what is done to the files' numbers before they are frames."""
     frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
     """Every frame; none: by the order of their names."""
     dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
@@ -121,17 +127,52 @@ class SessionFrames:
         frame by side, number of the pattern, sign and repeat.
     dark
         frames with the projector off.
+    preparer
+        makes frames of the files' numbers; None: nothing is done to them.
     """
 
     folder: Path
     listed: FrameList
     shots: dict[Key, StripeFile]
     dark: tuple[DarkFile, ...]
+    preparer: Preparer | None = None
 
     @property
     def wanted(self) -> Wanted:
         """How its frames are read."""
-        return Wanted(raw=self.listed.raw)
+        return Wanted.of(self.listed.raw, self.listed.prepare)
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """Planes of a mosaic that its frames are of, where each is calibrated; "" alone where they are of one."""
+        return PLANES if self.listed.prepare.channel == ALL else ("",)
+
+    def of_plane(self, name: str) -> SessionFrames:
+        """The same of one of the :attr:`planes`, whose camera's identity names it."""
+        if not name:
+            return self
+        prepare = self.listed.prepare.model_copy(update={"channel": name})
+        camera = {**self.listed.camera, "channel": name}
+        return replace(self, listed=self.listed.model_copy(update={"prepare": prepare, "camera": camera}))
+
+    def with_preparer(self) -> SessionFrames:
+        """The same with what makes frames of the files' numbers, and the end of its scale; MitsimError for dark and
+        flat frames that cannot be read, and where the list is of all planes."""
+        if self.preparer is not None or self.listed.prepare == Preparation():
+            return self
+        from mitsim.core.prepare import Preparer
+
+        if self.listed.prepare.channel == ALL:
+            raise MitsimError(f"frames {self.folder}: prepare.channel all is of every plane; take one, by `of_plane`")
+        preparer = Preparer.of(self.listed.prepare, self.listed.digital, self.wanted, self.folder)
+        return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
+
+    def read(self, name: str) -> Numbers:
+        """The frame in the file called ``name``, (rows, columns)."""
+        from mitsim.core.images import read_image
+
+        values = read_image(self.folder / name, self.wanted)
+        return values if self.preparer is None else self.preparer.frame(self.folder / name, values)
 
     @property
     def pairs(self) -> bool:

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import Field, model_validator
 
 from mitsim.core.configuration import Configuration, locate, read_toml, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain, read_json
-from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
+from mitsim.core.imagelist import ALL, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, read_colours
+from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 
-WAVELENGTHS_NM = 600.0, 540.0, 460.0
-"""Of red, green and blue planes, where nobody says others [nm]: middles of what usual filters pass, as those of
-calibration/ov5647.toml."""
+_OTHERS = {
+    "full_well_e": "a camera's file; give it to --camera, and the list of a capture to --list",
+    "signed_capture": "the list of a calibration's frames; `mitsim calibrate --frames` reads it, in their folder",
+}
+"""What other files are, by a field that each of them has."""
 TURNED = "turn_deg"
 """Of a calibration's configuration: angle by which its frames are turned, as `turn_deg` of a list."""
-Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 
 
 class CaptureList(Configuration):
@@ -52,8 +53,6 @@ class CaptureList(Configuration):
     """How files without a header are read; none: there are none."""
     centre: bool | None = None
     """Whether calibrations of these frames take row and column means off (FlatCam masks); none: they say it."""
-    wavelengths_nm: Annotated[tuple[Wavelength, ...], Field(strict=False, min_length=3, max_length=3)] = WAVELENGTHS_NM
-    """What red, green and blue planes count as in a colour image [nm]."""
     prepare: Preparation = Preparation()
     """Table: what is done to the files' numbers before they are frames."""
     source: str | None = None
@@ -79,6 +78,9 @@ def load_capture_list(name: Path | str) -> tuple[CaptureList, Path]:
     data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
     if not isinstance(data, dict):
         raise MitsimError(f"list {path}: holds a {type(data).__name__}; give a table of names and values")
+    for name_of_field, kind in _OTHERS.items():
+        if name_of_field in data:
+            raise MitsimError(f"list {path}: is {kind}")
     return validate(CaptureList, data, f"list {path}"), path.parent
 
 
@@ -169,7 +171,7 @@ class RealCapture:
     @property
     def colours(self) -> ColourManifest | None:
         """All planes as lines of a coloured folder; None of a single plane, or a picture that is no mosaic."""
-        return lines_of_planes(RUN, self.listed.wavelengths_nm) if self.prepare.channel == ALL else None
+        return lines_of_planes(RUN, self.prepare.wavelengths_nm) if self.prepare.channel == ALL else None
 
     def electronics(self) -> tuple[Electronics, Preparation]:
         """The camera, by its file or the list; and what is done to its numbers, with its mosaic.
@@ -244,18 +246,3 @@ class RealCapture:
                     f"calibration {folder / line}: is of frames turned by {turned} degrees, not by "
                     f"{self.prepare.turn_deg:g}; give --turn {turned}"
                 )
-
-
-def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...] = WAVELENGTHS_NM) -> ColourManifest:
-    """All planes of a mosaic as lines of a coloured folder.
-
-    Parameters
-    ----------
-    kind
-        of the folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
-    wavelengths_nm
-        of red, green and blue [nm].
-    """
-    lengths = dict(zip("rgb", wavelengths_nm, strict=True))
-    lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
-    return validate(ColourManifest, {"kind": kind, "channels": lines}, "planes")

@@ -30,11 +30,11 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, is_hdf5, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
-from mitsim.core.imagelist import ALL, BGGR, check_channel, planes_of
+from mitsim.core.imagelist import ALL, BGGR, WAVELENGTHS_NM, check_channel, planes_of
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
 from mitsim.core.recorders import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
-from mitsim.exchange.capture_list import TURNED, lines_of_planes
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest, lines_of_planes
+from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.hdf5 import read_matlab
 from mitsim.exchange.packed import (
     FACTORS,
@@ -577,6 +577,6 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
 
     if channel != ALL:
         return Content({"": part(channel)})
-    colours = lines_of_planes(CALIBRATION)
+    colours = lines_of_planes(CALIBRATION, WAVELENGTHS_NM)
     text = json.dumps(colours.model_dump(mode="json"))
     return Content({name: part(name) for name in colours.names}, colours, text)

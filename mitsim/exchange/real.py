@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,7 @@ from mitsim.core.imagelist import Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
-from mitsim.core.prepare import LEAST_RESPONSE, Preparer, factor_of
+from mitsim.core.prepare import LEAST_RESPONSE, PLAIN, Preparer, factor_of
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.exchange.capture_list import Electronics, RealCapture
@@ -34,9 +34,6 @@ from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
-_PLAIN = 16
-"""Numbers that differ, from which a common factor is no chance: of so many whole numbers all are even once in 2^16
-times."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
@@ -236,8 +233,8 @@ class _Scan:
                 whole = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame))
                 self._numbers.append(_Numbers(path, float(frame.min()), float(frame.max()), whole, frame.dtype))
                 self._factor = factor_of(frame, self._factor)
-                if len(self._differ) < _PLAIN:
-                    self._differ.update(np.unique(frame)[:_PLAIN].tolist())
+                if len(self._differ) < PLAIN:
+                    self._differ.update(np.unique(frame)[:PLAIN].tolist())
 
     def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
         """What all numbers are divided by, what is said of it, and what is doubtful.
@@ -258,7 +255,7 @@ class _Scan:
                 raise ArgumentError("divide_by", f"{stated}: the numbers' common factor is {found}; give that, or 1")
             return stated, [], []
         high = max(each.high for each in self._numbers)
-        chance = len(self._differ) < _PLAIN
+        chance = len(self._differ) < PLAIN
         if largest is not None and high > largest and found > 1:
             bits = 8 * self._numbers[0].kind.itemsize - largest.bit_length()
             shifted = 2 ** max(bits, 0)
@@ -305,7 +302,7 @@ class _Shots:
     def frame(self, path: Path, values: Numbers) -> Channel:
         """The frame of ``values`` (rows, columns) of the file ``path``."""
         made = part_of(path, self._preparer.frame(path, values), self._preparer.how, self._fit.shape)
-        return made.astype(self._kind, copy=False)
+        return cast(Channel, made.astype(self._kind, copy=False))
 
 
 def part_of(path: Path, frame: Channel, how: Preparation, shape: tuple[int, int] | None) -> Channel:
