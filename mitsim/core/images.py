@@ -44,6 +44,10 @@ _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
 """Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
 _BIG = 43
 """Version of a TIFF whose places have 8 bytes, and numbers of entries too (BigTIFF)."""
+_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
+"""Of TIFF and BigTIFF."""
+_DNG_VERSION = 50706
+"""Tag that every DNG has in its first page (Digital Negative Specification 1.4)."""
 _PLAIN = 1
 """Compression of a TIFF that has none."""
 _PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
@@ -247,6 +251,8 @@ def orient(values: Numbers, orientation: int) -> Numbers:
 
 def _tiff(path: Path, wanted: Wanted) -> _Header:
     pages, places = _pages_of(path)
+    if not pages:
+        raise wanted.refusal(path, "is no TIFF, or has no page; write it again")
     if pages > _MOST_PAGES:
         raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
 
@@ -375,6 +381,13 @@ def _dng(path: Path, wanted: Wanted) -> _Header:
     except ImportError:
         raise wanted.refusal(path, "rawpy is not installed; pip install 'mitsim[raw]', or save it as TIFF") from None
 
+    with open(path, "rb") as file:
+        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
+        file.seek(4)
+        file.seek(int.from_bytes(file.read(4), order))
+        entries = file.read(2 + 12 * _MOST_ENTRIES)
+    if _DNG_VERSION.to_bytes(2, order) not in (entries[start : start + 2] for start in range(2, len(entries), 12)):
+        raise ValueError("its header is none of a DNG")
     with stderr_silenced(), rawpy.imread(str(path)) as raw:
         sizes = raw.sizes
         colours = raw.color_desc.decode("ascii", "replace")
@@ -463,7 +476,13 @@ def _open_picture(
         try:
             opened = Image.open(source, formats=(kind,))
         except UnidentifiedImageError:
-            raise ValueError(f"its header is none of a {kind}") from None
+            file.seek(0)
+            if file.read(4) not in _BEGINNINGS:
+                raise ValueError(f"its header is none of a {kind}") from None
+            unread = "such as real numbers of 16 or 64 bits, or transparency"
+            raise MitsimError(
+                f"file {path}: its pixels are of a kind that is not read, {unread}; save it anew"
+            ) from None
         with opened as picture:
             yield picture
 

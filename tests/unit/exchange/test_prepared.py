@@ -7,7 +7,10 @@ libraries and against closed forms.
 
 from __future__ import annotations
 
+import io
 import json
+import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +32,7 @@ from mitsim.core.images import image_size, read_image, read_images
 from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
-from mitsim.exchange.capture_list import load_capture_list
+from mitsim.exchange.capture_list import RealCapture, load_capture_list
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.real import import_frames
 from mitsim.reconstruct.captured_session import calibrate_frames
@@ -467,3 +470,95 @@ def test_dng_without_the_extra_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     write_dng(tmp_path / "a.dng", np.ones((4, 4)))
     with pytest.raises(MitsimError, match=r"rawpy is not installed; pip install 'mitsim\[raw\]'"):
         read_image(tmp_path / "a.dng")
+
+
+# -------- Files that lie, or are of no use
+
+
+def tiff(**how: Any) -> bytes:
+    """A TIFF of 12 x 10 numbers in the high bits of 16."""
+    buffer = io.BytesIO()
+    values = how.pop("values", np.arange(300, 420, dtype=np.uint16).reshape(12, 10) * 16)
+    tifffile.imwrite(buffer, values, **{"photometric": "minisblack", **how})
+    return buffer.getvalue()
+
+
+def lied(tag: int, value: int) -> bytes:
+    """The same, one ``tag`` of whose first page claims another ``value``."""
+    data = bytearray(tiff())
+    start = int.from_bytes(data[4:8], "little")
+    entries = range(start + 2, start + 2 + 12 * int.from_bytes(data[start : start + 2], "little"), 12)
+    (place,) = (entry for entry in entries if int.from_bytes(data[entry : entry + 2], "little") == tag)
+    data[place + 2 : place + 12] = struct.pack("<HII", 4, 1, value)
+    return bytes(data)
+
+
+def looped() -> bytes:
+    """The same, whose second page is its first."""
+    data = bytearray(tiff())
+    start = int.from_bytes(data[4:8], "little")
+    end = start + 2 + 12 * int.from_bytes(data[start : start + 2], "little")
+    data[end : end + 4] = data[4:8]
+    return bytes(data)
+
+
+def picture(mode: str, kind: str, **how: Any) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.arange(120, dtype=np.uint8).reshape(12, 10)).convert(mode).save(buffer, kind, **how)
+    return buffer.getvalue()
+
+
+NOT_FINITE = np.full((12, 10), np.nan, np.float32)
+HOSTILE = {
+    "palette.png": (picture("P", "png"), "is no grey PNG of 8 or 16 bits"),
+    "transparent.png": (picture("LA", "png"), "is no grey PNG"),
+    "animated.png": (
+        picture("L", "png", save_all=True, append_images=[Image.new("L", (10, 12), 9)]),
+        "is an animated PNG of several",
+    ),
+    "animated.gif": (picture("L", "gif"), "ends in .gif; read are"),
+    "lossy.jpg": (picture("L", "jpeg"), "ends in .jpg; read are"),
+    "inks.tif": (picture("CMYK", "tiff"), "is no grey TIFF of 8, 12, 16 or 32 bits"),
+    "transparent.tif": (
+        tiff(values=np.ones((12, 10, 2), np.uint16), extrasamples=["unassalpha"]),
+        "its pixels are of a kind that is not read",
+    ),
+    "double.tif": (tiff(values=np.ones((12, 10))), "such as real numbers of 16 or 64 bits"),
+    "not finite.tif": (tiff(values=NOT_FINITE), "120 values are not finite"),
+    "no page.tif": (b"II*\0\0\0\0\0", "is no TIFF, or has no page"),
+    "cut.tif": (tiff()[:-50], "cannot be read"),
+    "gigapixel.tif": (lied(256, 10**6), "gigapixel.tif: "),
+    "looped.tif": (looped(), "has over 65536 pages"),
+    "orientation 9.tif": (tiff(extratags=[(274, "H", 1, 9, True)]), "has the orientation 9; there are 1 to 8"),
+    "orientation of a sign.tif": (tiff(extratags=[(274, "h", 1, 6, True)]), "states an orientation in no usual way"),
+    "a tiff.dng": (tiff(), "its header is none of a DNG"),
+}  # fmt: skip
+GOOD = {
+    "big-endian.tif": tiff(byteorder=">"),
+    "tiled.tif": tiff(tile=(16, 16)),
+    "big.tif": tiff(bigtiff=True),
+    "big, turned.tif": tiff(bigtiff=True, extratags=[(274, "I", 1, 3, True)]),
+    "signed.tif": tiff(values=np.arange(300, 420, dtype=np.int16).reshape(12, 10) * 16),
+    "real.tif": tiff(values=np.arange(300, 420, dtype=np.float32).reshape(12, 10) * 16),
+}
+
+
+@pytest.mark.parametrize("name", [*HOSTILE, *GOOD])
+def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
+    """Refused with what is wrong, and nothing is left; or read to the number."""
+    if name.endswith(".dng"):
+        pytest.importorskip("rawpy", reason="an extra")
+    path, output = tmp_path / name, tmp_path / "run"
+    content = HOSTILE[name][0] if name in HOSTILE else GOOD[name]
+    path.write_bytes(content)
+    how = Preparation(orientation="file")
+    about = RealCapture("uniform", twelve(tmp_path), 0.02, n=4, black_level_dn=40.0, prepare=how)
+    if name in HOSTILE:
+        with pytest.raises(MitsimError, match=re.escape(HOSTILE[name][1])):
+            import_frames(path, output, about)
+        assert not output.exists()
+        return
+    result = import_frames(path, output, about)
+    expected = np.arange(300, 420).reshape(12, 10)
+    assert result["divided_by"] == 16
+    assert np.array_equal(ms.load_run(output).dn[0], expected[::-1, ::-1] if "turned" in name else expected)
