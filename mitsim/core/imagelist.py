@@ -102,7 +102,7 @@ class Crop(Configuration):
 
     @classmethod
     def of(cls, text: str) -> Crop:
-        """From what the command line says, ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS; MitsimError for what is none."""
+        """From the ``text`` ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS of a command line; MitsimError for another."""
         numbers = re.fullmatch(r"([0-9]{1,5}),([0-9]{1,5})(?:,([0-9]{1,5}),([0-9]{1,5}))?", text)
         if not numbers:
             raise ArgumentError("crop", f"{text!r}: give ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS [pixels]")

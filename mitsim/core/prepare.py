@@ -100,7 +100,13 @@ class Preparer:
         return plain.with_correction(dark, np.where(response < LEAST_RESPONSE, 1.0, response), int(unlit.sum()))
 
     def with_correction(self, dark: FloatArray | None, response: FloatArray | None, unlit: int) -> Preparer:
-        """The same with ``dark`` and ``response`` (rows, columns), ``unlit`` pixels of them without light."""
+        """The same with dark and flat frames.
+
+        Parameters
+        ----------
+        dark, response, unlit
+            as the class has them.
+        """
         digital = self.digital
         if self.end is not None:
             top = (self.end - (self.level if dark is None else dark)) / (1.0 if response is None else response)
@@ -126,7 +132,8 @@ class Preparer:
         return values[row::2, column::2]
 
     def mean(self, source: Path, wanted: Wanted) -> FloatArray:
-        """Mean of all frames in ``source``, a file or folder, as they are stored but for the common factor."""
+        """Mean of all frames in ``source``, a file or folder read as ``wanted``, as they are stored but for the common
+        factor. MitsimError where one cannot be read, or is of another size."""
         total, count = np.zeros(()), 0
         for path in image_files(source, wanted):
             for values in read_images(path, wanted):

@@ -148,7 +148,7 @@ class SessionFrames:
         return PLANES if self.listed.prepare.channel == ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
-        """The same of one of the :attr:`planes`, whose camera's identity names it."""
+        """The same of the one of the :attr:`planes` called ``name``, which its camera's identity then has."""
         if not name:
             return self
         prepare = self.listed.prepare.model_copy(update={"channel": name})
