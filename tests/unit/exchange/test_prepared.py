@@ -562,3 +562,25 @@ def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
     expected = np.arange(300, 420).reshape(12, 10)
     assert result["divided_by"] == 16
     assert np.array_equal(ms.load_run(output).dn[0], expected[::-1, ::-1] if "turned" in name else expected)
+
+
+# -------- Published captures
+
+FLATCAM = Path(__file__).parents[4] / "shared" / "data" / "flatcam"
+
+
+@pytest.mark.skipif(not FLATCAM.is_dir(), reason="published captures are not here")
+@pytest.mark.parametrize("number", [6, 7])
+def test_captures_of_a_flatcam_are_prepared_as_its_authors_do(number: int, tmp_path: Path) -> None:
+    """Planes, turn and crop by skimage, as in their loader, to single precision; numbers of 10 bits in the high bits."""
+    words = f"import {FLATCAM / f'fc_{number}.png'} --list flatcam -o {tmp_path / 'run'} --json"
+    result = CliRunner().invoke(app, words.split())
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["divided_by"] == 64
+    with Image.open(FLATCAM / f"fc_{number}.png") as capture:
+        stored = np.array(capture) / 64.0
+    for name, (row, column) in {"b": (0, 0), "gb": (0, 1), "gr": (1, 0), "r": (1, 1)}.items():
+        plane = warp(stored[row::2, column::2], SimilarityTransform(rotation=0.00174))[6:506, 10:630]
+        run = ms.load_run(tmp_path / "run" / name)
+        assert np.abs(run.dn[0] - plane).max() < 1e-3
+        assert run.manifest.camera == {"name": "FlatCam prototype", "channel": name}
