@@ -143,18 +143,6 @@ def import_(
     return finish(common.as_json, payload, lines, payload["warnings"])
 
 
-_PREPARED = {
-    "channel": "channel",
-    "mosaic": "mosaic",
-    "divide": "divide_by",
-    "dark_frame": "dark",
-    "flat_frame": "flat",
-    "flat_dark_frame": "flat_dark",
-    "turn": "turn_deg",
-}
-"""Fields of a list's `prepare` by the option that takes their place."""
-
-
 def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
     from mitsim.core.imagelist import BARE, Raw
     from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
@@ -201,10 +189,11 @@ def _preparation(frames: Frames, listed: Preparation) -> Preparation:
     """What is done to numbers by a list's ``listed``, and options in the place of what it says."""
     from mitsim.core.imagelist import Crop, check_channel
 
-    given = {field: getattr(frames, name) for name, field in _PREPARED.items() if getattr(frames, name) is not None}
-    for field in ("dark", "flat", "flat_dark"):
-        if field in given:  # of where the command runs, not of the list's folder
-            given[field] = str(Path(given[field]).absolute())
+    paths = {"dark": frames.dark_frame, "flat": frames.flat_frame, "flat_dark": frames.flat_dark_frame}
+    stated = {"channel": frames.channel, "mosaic": frames.mosaic, "divide_by": frames.divide, "turn_deg": frames.turn}
+    given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    # Of where the command runs, not of the list's folder.
+    given.update({name: str(Path(path).absolute()) for name, path in paths.items() if path is not None})
     if frames.channel is not None:
         check_channel(frames.channel)
     if frames.orientation is not None:
@@ -214,8 +203,8 @@ def _preparation(frames: Frames, listed: Preparation) -> Preparation:
         given["crop"] = Crop.of(frames.crop)
     if "turn_deg" in given:
         given["turn_about"] = "centre"
-    stated = {name: value for name, value in listed if name in listed.model_fields_set}
-    return validate(type(listed), {**stated, **given}, "import")
+    known = {name: value for name, value in listed if name in listed.model_fields_set}
+    return validate(type(listed), {**known, **given}, "import")
 
 
 @dataclass(frozen=True)

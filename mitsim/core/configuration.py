@@ -119,6 +119,8 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
     if problem["type"] == "value_error":  # a validator of ours, whose text says all
         return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
     rule = problem["msg"][0].lower() + problem["msg"][1:]
+    if problem["type"] == "string_pattern_mismatch" and "/" in problem["ctx"]["pattern"]:
+        rule = "a name without folders is needed"
     hint = _range(model, problem["loc"])
     if problem["type"] in ("extra_forbidden", "missing") and (holder := _holder(model, problem["loc"][:-1])):
         known = [*holder.model_fields]

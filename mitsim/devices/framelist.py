@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mitsim.core.configuration import Configuration, Positive, read_toml, validate
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import read_json
 from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
@@ -233,7 +233,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
                 f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
                 f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
                 f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
-                f"frame in {lists[0].name}"
+                f"frame in {lists[0].name}{_not_counted(folder, names)}"
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
@@ -243,6 +243,13 @@ def load_frames(folder: Path | str) -> SessionFrames:
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
     _check_files(session)
     return session
+
+
+def _not_counted(folder: Path, names: Sequence[str]) -> str:
+    """Which files of the ``folder`` are none of the frames called ``names``, in words: nothing where all are."""
+    known = {*names, *LISTS}
+    others = sorted(path.name for path in folder.iterdir() if path.is_file() and path.name not in known)
+    return f" (not counted: {', '.join(map(cut, others[:3]))}{', ...' if others[3:] else ''})" if others else ""
 
 
 def _keys_of_session(listed: FrameList) -> Iterator[Key]:
@@ -292,7 +299,10 @@ def _check_files(session: SessionFrames) -> None:
             raise MitsimError(f"frames {folder}: {name} is listed twice; give each frame its own file")
         seen.add(name)
         if not (folder / name).is_file():
-            raise MitsimError(f"frames {folder}: {name} is listed, but no file of that name is there; copy it there")
+            near = near_name(name, [path.name for path in folder.iterdir()])
+            raise MitsimError(
+                f"frames {folder}: {name} is listed, but no file of that name is there; {near}copy it there"
+            )
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
     _check_ladder(session)
     for (side, index, sign, exposure, repeat), shot in session.shots.items():

@@ -32,6 +32,7 @@ from mitsim.core.images import image_size, read_image, read_images
 from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
+from mitsim.devices.framelist import load_frames
 from mitsim.exchange.capture_list import RealCapture, load_capture_list
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.real import import_frames
@@ -335,6 +336,25 @@ def test_a_lists_mistake_is_told_with_its_cause(name: str, tmp_path: Path) -> No
         load_capture_list(text if name == "a camera's file" else path)
 
 
+def test_a_sessions_list_says_what_is_wrong(tmp_path: Path) -> None:
+    """Files that do not count, names with a folder, and one that is nearly right."""
+    folder = RealSession().write(tmp_path / "frames", name="f_{}.png".format)
+    (folder / "f_3.png").rename(folder / "f_3.jpg")
+    with pytest.raises(MitsimError, match=r"holds 15 frames, .* \(not counted: f_3\.jpg\)"):
+        load_frames(folder)
+    (folder / "f_3.jpg").rename(folder / "F_3.png")
+    shown = [{"side": s, "index": i, "sign": sign} for s, i, sign, _ in RealSession().shown("pair")]
+    write_list(folder, frames=[{"file": f"f_{number}.png", **each} for number, each in enumerate(shown)])
+    with pytest.raises(MitsimError, match=r"f_3\.png is listed, but no file of that name is there; did you mean"):
+        load_frames(folder)
+    write_list(folder, frames=[{"file": "frames/f_0.png", **shown[0]}])
+    with pytest.raises(MitsimError, match=r"frames\.0\.file: got 'frames/f_0.png', a name without folders is needed"):
+        load_frames(folder)
+    write_list(folder, prepare={"channel": "gr", "orientation": "file"})
+    with pytest.raises(MitsimError, match="prepare: orientation 'file' would exchange the mosaic's colours"):
+        load_frames(folder)
+
+
 def test_a_list_says_what_options_do_not(tmp_path: Path) -> None:
     """Paths are from its folder; an option takes the place of what it says. (Planted: paths from where the command
     runs.)"""
@@ -572,7 +592,7 @@ FLATCAM = Path(__file__).parents[4] / "shared" / "data" / "flatcam"
 @pytest.mark.skipif(not FLATCAM.is_dir(), reason="published captures are not here")
 @pytest.mark.parametrize("number", [6, 7])
 def test_captures_of_a_flatcam_are_prepared_as_its_authors_do(number: int, tmp_path: Path) -> None:
-    """Planes, turn and crop by skimage, as in their loader, to single precision; numbers of 10 bits in the high bits."""
+    """Planes, turn and crop by skimage, as in their loader, to single precision; 10 bits in the high ones of 16."""
     words = f"import {FLATCAM / f'fc_{number}.png'} --list flatcam -o {tmp_path / 'run'} --json"
     result = CliRunner().invoke(app, words.split())
     assert result.exit_code == 0, result.output
