@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from mitsim.core.imagelist import Raw
+from mitsim.core.imagelist import Crop, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
@@ -36,6 +36,7 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
+from mitsim.exchange.capture_list import CaptureList
 from mitsim.light.plan import PlanFile
 
 FORMATS = Path(__file__).with_name("formats.md")
@@ -44,7 +45,8 @@ MODELS = (
     *(SensorModel, EfficiencyCurve),
     *(SessionRecipe, BoardShape, Drift),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
-    *(FrameList, StripeFile, DarkFile, Raw),
+    *(FrameList, StripeFile, DarkFile, Raw, Preparation, Crop),
+    CaptureList,
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
     PlanFile,

@@ -221,7 +221,8 @@ def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, A
     payload = payload_of_lines(CALIBRATION, results, output)
     lines = [
         f"{part['name']}: {part['frames']} frames of {part['n']} stripes, separability residual "
-        f"{_percent(part['separability_residual'])}, factor error {part['phi_error']:.1e}"
+        f"{_percent(part['separability_residual'])}, factor error "
+        f"{part['predicted_phi_error'] if part['phi_error'] is None else part['phi_error']:.1e}"
         for part in payload["channels"]
     ]
     return payload, [*lines, total_of_lines(payload)]
@@ -244,16 +245,21 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
     from mitsim.devices.framelist import load_frames
 
     session = load_frames(folder)  # refused before the estimator is imported
-    from mitsim.reconstruct.captured_session import calibrate_frames
+    from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
     held = memory_from_here()
     with limited.job() as job:
+        if session.planes != ("",):
+            payload, lines = _of_lines(calibrate_planes(session, output, job, camera), output)
+            payload["memory_bytes"] = memory_since(held)
+            return finish(limited.as_json, payload, lines, payload["warnings"])
         factors = calibrate_frames(session, output, job, camera)
     payload = {**factors.manifest.result, "memory_bytes": memory_since(held), "output": str(output)}
     residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
         f"separability residual {residual:.2%}, factor error {error:.1e} by its noise, condition {condition:.2e}",
+        *([] if payload["divided_by"] == 1 else [f"numbers are divided by {payload['divided_by']}, which all have"]),
         *(f"not known: {text}" for text in payload["not_known"]),
     ]
     return finish(limited.as_json, payload, lines, factors.warnings)

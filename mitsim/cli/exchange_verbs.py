@@ -19,13 +19,16 @@ from mitsim.cli.options import (
     Projector,
     Scene,
     Seed,
+    is_given,
     option,
     pop_patterns,
     refuse_unused,
     verb,
 )
 from mitsim.cli.screen import finish
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.imagelist import Preparation
 from mitsim.core.seeds import check_root
 from mitsim.devices.patterns import pattern_names, read_name, takes_seed
 
@@ -66,6 +69,9 @@ def export(
 class Frames:
     """What a person knows of a real camera's frames."""
 
+    list: str | None = option(
+        None, "of frames: list of what is known of them; options take its place", metavar="NAME|FILE"
+    )
     patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
     camera: str | None = option(None, "of frames: camera electronics, name or TOML file", metavar="NAME|FILE")
     exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
@@ -81,7 +87,19 @@ class Frames:
     shape: str | None = option(None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
     bits: int | None = option(None, "of a number in such a file", metavar="N")
     byte_order: str = option("little", "of such a file: little or big")
-    channel: str | None = option(None, "plane of a colour sensor, as FlatCam names it", metavar="r|gb|gr|b")
+    channel: str | None = option(
+        None, "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
+    )
+    mosaic: str | None = option(
+        None, "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
+    )
+    divide: int | None = option(None, "of frames: factor that all numbers have; found if not given", metavar="N")
+    dark_frame: str | None = option(None, "frame, or folder of frames, without any light", metavar="PATH")
+    flat_frame: str | None = option(None, "the same of even light without a mask", metavar="PATH")
+    flat_dark_frame: str | None = option(None, "the same without light, of the flat's exposure", metavar="PATH")
+    orientation: str | None = option(None, "of frames: Exif's, or as the file says", metavar="1..8|file")
+    turn: float | None = option(None, "of frames: turned counter-clockwise after that", metavar="DEGREES")
+    crop: str | None = option(None, "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]")
     seed: Seed = 0
 
 
@@ -119,6 +137,7 @@ def import_(
         lines.append(f"calibration: {payload['calibration_output']}")
     elif "calibration" in payload["holds"]:
         lines.append("The file holds a calibration too; give --calibration-output to have it")
+    lines += payload.get("notes", ())
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     return finish(common.as_json, payload, lines, payload["warnings"])
@@ -126,33 +145,66 @@ def import_(
 
 def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
     from mitsim.core.imagelist import BARE, Raw
-    from mitsim.exchange.formats import RealCapture
+    from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 
-    if frames.patterns is None or frames.camera is None or frames.exposure is None:
-        missing = next(name for name in ("patterns", "camera", "exposure") if getattr(frames, name) is None)
-        raise ArgumentError(missing, "is not given, and frames do not say it; give it")
+    listed, base = (CaptureList(), Path()) if frames.list is None else load_capture_list(frames.list)
+    patterns = frames.patterns or listed.patterns
+    if patterns is None:
+        raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
+    if frames.patterns is None and patterns.endswith(".json"):
+        patterns = str(base / patterns)
     bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
     if frames.shape is None or not bare:
         refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
-    if not takes_seed(frames.patterns):
+    if not takes_seed(patterns):
         refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
+    ambient, raw = frames.ambient_frame, listed.raw
+    if frames.shape is not None:
+        raw = Raw.of(frames.shape, frames.bits, frames.byte_order)
+    if ambient is None and listed.ambient is not None:
+        ambient = base / listed.ambient
+    n = frames.projector_pixels
     known = RealCapture(
-        frames.patterns,
+        patterns,
         frames.camera,
         frames.exposure,
         calibration=frames.calibration,
-        n=frames.projector_pixels,
+        n=listed.n if n is None and frames.calibration is None else n,
         black_level_dn=frames.black_level,
-        ambient=frames.ambient_frame,
-        ambient_shots=frames.ambient_shots,
-        raw=None if frames.shape is None else Raw.of(frames.shape, frames.bits, frames.byte_order),
-        channel=frames.channel,
-        seed=frames.seed,
+        ambient=ambient,
+        ambient_shots=frames.ambient_shots if frames.ambient_frame else listed.ambient_shots or frames.ambient_shots,
+        raw=raw,
+        seed=frames.seed if is_given(context, "seed") else listed.seed,
+        prepare=_preparation(frames, listed.prepare),
+        base=base,
+        listed=listed,
     )
     known.check(source)  # refused before numpy is imported
     from mitsim.exchange.real import import_frames
 
     return import_frames(source, output, known)
+
+
+def _preparation(frames: Frames, listed: Preparation) -> Preparation:
+    """What is done to numbers by a list's ``listed``, and options in the place of what it says."""
+    from mitsim.core.imagelist import Crop, check_channel
+
+    paths = {"dark": frames.dark_frame, "flat": frames.flat_frame, "flat_dark": frames.flat_dark_frame}
+    stated = {"channel": frames.channel, "mosaic": frames.mosaic, "divide_by": frames.divide, "turn_deg": frames.turn}
+    given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    # Of where the command runs, not of the list's folder.
+    given.update({name: str(Path(path).absolute()) for name, path in paths.items() if path is not None})
+    if frames.channel is not None:
+        check_channel(frames.channel)
+    if frames.orientation is not None:
+        number = frames.orientation
+        given["orientation"] = int(number) if number.isascii() and number.isdecimal() else number
+    if frames.crop is not None:
+        given["crop"] = Crop.of(frames.crop)
+    if "turn_deg" in given:
+        given["turn_about"] = "centre"
+    known = {name: value for name, value in listed if name in listed.model_fields_set}
+    return validate(type(listed), {**known, **given}, "import")
 
 
 @dataclass(frozen=True)

@@ -246,6 +246,8 @@ _HEAD = 128
 """Bytes before the first variable: a text, the version and the order of bytes."""
 _HDF5, _HDF5_MARK = 2, b"\x89HDF\r\n\x1a\n"
 """Version of a file that is an HDF5 file behind its head."""
+_USER_BLOCK = 512
+"""Bytes that MATLAB puts before HDF5 in a file of version 7.3."""
 _MATRIX, _COMPRESSED = 14, 15
 """Kinds of elements: an array, and one that is packed."""
 _COMPLEX = 0x08
@@ -280,6 +282,15 @@ def write_variables(path: Path, variables: Mapping[str, Any]) -> None:
         savemat(file, dict(variables), do_compression=True, long_field_names=True)
 
 
+def is_hdf5(path: Path) -> bool:
+    """Whether the file ``path`` is HDF5, as MATLAB files of version 7.3 are behind their head; MitsimError where it is
+    no plain file."""
+    check_plain(path)
+    with open(path, "rb") as file:
+        head = file.read(_USER_BLOCK + len(_HDF5_MARK))
+    return head.startswith(_HDF5_MARK) or head[_USER_BLOCK:] == _HDF5_MARK
+
+
 def read_variables(path: Path) -> dict[str, Any]:
     """The arrays of real numbers and the texts of the MATLAB file ``path``, by name; cells, structures and objects,
     which files of `mitsim export` and FlatCam have none of, are not looked into.
@@ -298,7 +309,7 @@ def read_variables(path: Path) -> dict[str, Any]:
     except MitsimError:
         raise
     except NotImplementedError:
-        raise MitsimError(f"{path}: is HDF5 (version 7.3); save it in MATLAB with -v7, or name an export .h5") from None
+        raise MitsimError(f"{path}: is HDF5, or of version 7.3; save it in MATLAB with -v7") from None
     except Exception as error:  # SciPy's reader raises of all kinds
         raise MitsimError(f"{path}: damaged, or no MATLAB file ({reason_of(error)}); write or copy it again") from error
 

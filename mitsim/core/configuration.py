@@ -119,6 +119,8 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
     if problem["type"] == "value_error":  # a validator of ours, whose text says all
         return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
     rule = problem["msg"][0].lower() + problem["msg"][1:]
+    if problem["type"] == "string_pattern_mismatch" and "/" in problem["ctx"]["pattern"]:
+        rule = "a name without folders is needed"
     hint = _range(model, problem["loc"])
     if problem["type"] in ("extra_forbidden", "missing") and (holder := _holder(model, problem["loc"][:-1])):
         known = [*holder.model_fields]
@@ -147,7 +149,8 @@ def _range(model: Any, location: tuple[int | str, ...]) -> str:
     """What a number at ``location`` of a model may be, where it has two ends."""
     marks: list[Any] = []
     for part in location:
-        field = getattr(model, "model_fields", {}).get(part)
+        holders = (getattr(kind, "model_fields", {}) for kind in (model, *get_args(model)))  # a part may be optional
+        field = next((fields[part] for fields in holders if part in fields), None)
         if field is None:
             return ""
         model, marks = field.annotation, field.metadata

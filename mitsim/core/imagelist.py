@@ -1,4 +1,5 @@
-"""Which pictures are read, and how: a folder in, its files in the order of their numbers out; none is opened."""
+"""Which pictures are read, how, and what is done to their numbers before they are frames: a folder in, its files in the
+order of their numbers out; none is opened."""
 
 from __future__ import annotations
 
@@ -8,20 +9,37 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from mitsim.core.configuration import Configuration
+from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import MOST_SIDE, check_plain
 
 if TYPE_CHECKING:
     import numpy as np
 
-FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr")
+FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr", ".dng")
 """Endings of files that say themselves what they hold."""
 BARE = (".raw", ".bin", ".dat")
 """Endings of files without a header."""
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
+_Place = Annotated[int, Field(ge=0, lt=MOST_SIDE)]
+PLANES = ("r", "gb", "gr", "b")
+"""Planes of a mosaic of colour filters, as FlatCam names them: gb is the green one in the rows of blue pixels."""
+ALL = "all"
+"""In a plane's place: every one."""
+WAVELENGTHS_NM = 600.0, 540.0, 460.0
+"""Of red, green and blue planes, where nobody says others [nm]: middles of what usual filters pass, as those of
+calibration/ov5647.toml."""
+_Wavelength = Annotated[float, Field(ge=1, le=1e6)]
+BGGR = "BGGR"
+"""The mosaic of cameras that do not state theirs: FlatCam's."""
+TO_FILE = "file"
+"""The orientation that a file states."""
+_LARGEST_TURN = 45.0
+"""Degrees: what is turned by more is turned by an orientation first, or no corner of it stays."""
+_LARGEST_FACTOR = 1 << 24
+"""Of whole numbers that single precision tells apart: no camera's numbers lie farther from each other."""
 
 
 class Raw(Configuration):
@@ -70,6 +88,83 @@ class Raw(Configuration):
         return np.dtype(f"{'<' if self.byte_order == 'little' else '>'}u{width}")
 
 
+class Crop(Configuration):
+    """The part of a picture that is a frame."""
+
+    row: _Place = 0
+    """First row."""
+    column: _Place = 0
+    """First column."""
+    rows: _Side | None = None
+    """How many; none: all that follow."""
+    columns: _Side | None = None
+    """How many; none: all that follow."""
+
+    @classmethod
+    def of(cls, text: str) -> Crop:
+        """From the ``text`` ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS of a command line; MitsimError for another."""
+        numbers = re.fullmatch(r"([0-9]{1,5}),([0-9]{1,5})(?:,([0-9]{1,5}),([0-9]{1,5}))?", text)
+        if not numbers:
+            raise ArgumentError("crop", f"{text!r}: give ROW,COLUMN or ROW,COLUMN,ROWS,COLUMNS [pixels]")
+        found = {name: int(each) for name, each in zip(cls.model_fields, numbers.groups(), strict=True) if each}
+        return validate(cls, found, f"crop {text!r}")
+
+
+class Preparation(Configuration):
+    """What is done to the numbers of a file before they are a frame, in the order of these fields."""
+
+    divide_by: int | None = Field(default=None, ge=1, le=_LARGEST_FACTOR)
+    """Factor that all numbers have; none: found, where a camera's numbers were shifted to the high bits."""
+    dark: str | None = None
+    """Frame without any light, or a folder of such, whose mean is taken off; a path from the list's folder."""
+    flat: str | None = None
+    """Frame, or a folder of such, of even light and no mask: its mean, over its own mean, divides frames."""
+    flat_dark: str | None = None
+    """Frames without light of the flat's exposure; none: those of `dark`, or the black level."""
+    mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
+    """Colour filters of the first 2 x 2 pixels, row by row; none: the camera file's, else BGGR."""
+    channel: Literal["r", "gb", "gr", "b", "all"] | None = None
+    """Plane of the mosaic that is taken, or all of them; none: the picture is no mosaic."""
+    wavelengths_nm: Annotated[tuple[_Wavelength, ...], Field(strict=False, min_length=3, max_length=3)] = WAVELENGTHS_NM
+    """What red, green and blue planes count as in a colour image [nm]."""
+    orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
+    """How to turn the picture or plane: an orientation of Exif and TIFF, or as the file says; none: as it is stored,
+    and a file that is to be shown turned is refused."""
+    turn_deg: float = Field(default=0.0, ge=-_LARGEST_TURN, le=_LARGEST_TURN)
+    """Angle that it is turned by after that, counter-clockwise [degrees], by bilinear interpolation."""
+    turn_about: Literal["centre", "corner"] = "centre"
+    """What stays in place: the middle of the picture, or the centre of its first pixel."""
+    crop: Crop | None = None
+    """The part that is taken in the end; none: all, or as much as a calibration has, from the middle of a plane."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Preparation:
+        if self.mosaic is not None and self.channel is None:
+            raise ValueError("mosaic is of planes; give channel too")
+        if self.channel is not None and self.orientation == TO_FILE:
+            raise ValueError("orientation 'file' would exchange the mosaic's colours; give the number, 1 to 8")
+        if self.flat_dark is not None and self.flat is None:
+            raise ValueError("flat_dark is taken off a flat; give flat too")
+        return self
+
+
+def planes_of(mosaic: str) -> dict[str, tuple[int, int]]:
+    """First row and column of each of the :data:`PLANES` of a ``mosaic`` such as RGGB."""
+    places = {(index // 2, index % 2): colour.lower() for index, colour in enumerate(mosaic)}
+    names = {
+        colour if colour != "g" else colour + places[row, 1 - column]: (row, column)
+        for (row, column), colour in places.items()
+    }
+    return {name: names[name] for name in PLANES}
+
+
+def check_channel(name: str) -> str:
+    """The ``name``, where a plane is called so, or all are; ArgumentError otherwise."""
+    if name not in (*PLANES, ALL):
+        raise ArgumentError("channel", f"{name!r}: use {', '.join(PLANES)} or {ALL}")
+    return name
+
+
 @dataclass(frozen=True)
 class Wanted:
     """What pictures are of, and which of them are read.
@@ -86,6 +181,10 @@ class Wanted:
         whether red, green and blue of 8 bits are read too.
     raw
         how files without a header are read; None: such files are refused.
+    orientation
+        what pictures that are to be shown turned are: None: refused; `file`: turned so; a number: as they are stored.
+    mosaic
+        colour filters that the frames are behind; None: nobody says. A file that states others is refused.
     """
 
     what: str = "frame"
@@ -93,6 +192,13 @@ class Wanted:
     bits: Sequence[int] = (8, 12, 16, 32)
     colour: bool = False
     raw: Raw | None = None
+    orientation: Literal["file", 1, 2, 3, 4, 5, 6, 7, 8] | None = None
+    mosaic: str | None = None
+
+    @classmethod
+    def of(cls, raw: Raw | None, how: Preparation) -> Wanted:
+        """Frames without a header as ``raw`` says, to be prepared as ``how`` does."""
+        return cls(raw=raw, orientation=how.orientation, mosaic=how.mosaic)
 
     def refusal(self, path: Path, reason: str) -> MitsimError:
         """A line that says for what ``reason`` the file ``path`` is not read."""

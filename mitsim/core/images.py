@@ -1,7 +1,8 @@
 """Pictures: of other programs (PNG, TIFF, NPY, OpenEXR, bare numbers), a path in, size or numbers as stored out; and
 for people, numbers in, PNG bytes and the text that shows them in a notebook out.
 
-Nothing is scaled, inverted, turned or made grey: a file whose numbers its reader would change is refused. What a header
+Nothing is scaled, inverted or made grey, and turned only where that is asked for: a file whose numbers its reader would
+change is refused. What a header
 claims is bounded before pixels are read, and files are copied, not mapped: one that is cut short meanwhile is refused.
 """
 
@@ -12,7 +13,6 @@ import html
 import io
 import logging
 import math
-import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import Npy
-from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import FRAME_LIMITS, check_plain, fits_a_frame, stderr_silenced
-from mitsim.core.imagelist import BARE, FORMATS, FRAME, Wanted
+from mitsim.core.imagelist import BARE, FORMATS, FRAME, TO_FILE, Wanted
 from mitsim.core.job import Cost, Limits
 
 if TYPE_CHECKING:
@@ -44,6 +44,10 @@ _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
 """Tags of TIFF 6.0: BitsPerSample, Compression, PhotometricInterpretation, SampleFormat."""
 _BIG = 43
 """Version of a TIFF whose places have 8 bytes, and numbers of entries too (BigTIFF)."""
+_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"
+"""Of TIFF and BigTIFF."""
+_DNG_VERSION = 50706
+"""Tag that every DNG has in its first page (Digital Negative Specification 1.4)."""
 _PLAIN = 1
 """Compression of a TIFF that has none."""
 _PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
@@ -55,12 +59,22 @@ _TILE_MARGIN = 1024
 """Pixels by which a tile may exceed a picture, chosen beyond usual tiles (64 to 512): readers allocate whole ones."""
 _UPRIGHT = 1
 """Orientation of a picture whose row 0 is at the top and column 0 at the left, as stored."""
+_TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (-1, True), 6: (-1, False), 7: (1, True)}
+_TURNS[8] = (1, False)
+"""Quarters of a turn counter-clockwise, and whether left and right change places after it, by orientation (TIFF 6.0,
+tag 274)."""
 _MOST_PAGES = 1 << 16
 """Of a file: as many as shots of a run."""
+_MOST_ENTRIES = 512
+"""Of a page that are looked through for its orientation; chosen: ten times what cameras write."""
+_WIDTHS = {1: 1, 3: 2, 4: 4}
+"""Bytes of whole numbers in TIFF, by type."""
 _PIXEL_BYTES = 24
 """Of memory for a pixel while a page is read and checked; measured at most 21, of a PNG of 16 bits."""
 _BLACK_IS_ZERO, _RGB = 1, 2
 """PhotometricInterpretation of files that are read; 0 stores black as the largest number."""
+_FLIPS = {0: 1, 3: 3, 5: 8, 6: 6}
+"""Orientations by LibRaw's names of them."""
 _UNSIGNED = 1
 """SampleFormat of whole numbers from 0, which is also meant where the tag is missing."""
 _CHANNEL = "DN"
@@ -202,25 +216,49 @@ def _png(path: Path, wanted: Wanted) -> _Header:
                 raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
             # Some versions of Pillow give 16 bits of a PNG as 32.
             values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
-            _check_upright(path, picture, wanted)  # a PNG may say it behind its pixels
-            yield values
+            yield _upright(path, values, _orientation(picture), wanted)  # a PNG may say it behind its pixels
 
     return _Header(1, (rows, columns), read)
 
 
-def _check_upright(path: Path, picture: Image, wanted: Wanted) -> None:
-    """MitsimError for a ``picture`` that is to be shown turned or mirrored: what is stored is then another picture."""
-    turned = picture.getexif().get(_ORIENTATION, _UPRIGHT)
-    if turned != _UPRIGHT:
+def _orientation(picture: Image) -> Any:
+    """How a ``picture`` is to be shown."""
+    return picture.getexif().get(_ORIENTATION, _UPRIGHT)
+
+
+def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Numbers:
+    """The numbers of a picture as they are ``wanted`` of a file that states how it is to be shown; MitsimError where
+    nobody says whether what is stored is meant, or what is shown."""
+    if wanted.orientation is None and stated != _UPRIGHT:
         raise wanted.refusal(
-            path, f"has the orientation {turned}: it is to be shown turned or mirrored; save it as it is to be read"
+            path,
+            f"has the orientation {stated}: it is to be shown turned or mirrored; save it as it is to be read"
+            + ("" if wanted.colour else ", or give --orientation file to turn it so, or 1 to read it as it is stored"),
         )
+    if wanted.orientation != TO_FILE:
+        return values
+    if stated not in _TURNS:
+        raise wanted.refusal(path, f"has the orientation {stated}; there are 1 to 8, so give the one that is meant")
+    return orient(values, stated)
+
+
+def orient(values: Numbers, orientation: int) -> Numbers:
+    """``values`` (rows, columns) as they are to be shown by an ``orientation`` of TIFF 6.0 and Exif, 1 to 8."""
+    turns, mirrored = _TURNS[orientation]
+    turned = np.rot90(values, turns)
+    return turned[:, ::-1] if mirrored else turned
 
 
 def _tiff(path: Path, wanted: Wanted) -> _Header:
+    pages, places = _pages_of(path)
+    if not pages:
+        raise wanted.refusal(path, "is no TIFF, or has no page; write it again")
+    if pages > _MOST_PAGES:
+        raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
+
     def read() -> Iterator[Numbers]:
         """Its pages."""
-        with _open_picture(path, "TIFF", packed) as picture:
+        with _open_picture(path, "TIFF", packed, places) as picture:
             for page in range(pages):
                 picture.seek(page)
                 unsigned = _check_tags(path, picture, wanted)
@@ -228,21 +266,37 @@ def _tiff(path: Path, wanted: Wanted) -> _Header:
                 with stderr_silenced():
                     values = np.array(picture)
                 # Pillow holds 32 bits as if they had a sign.
-                yield values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
+                values = values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
+                yield _upright(path, values, places[page].value if page in places else _UPRIGHT, wanted)
 
-    with _open_picture(path, "TIFF") as picture:
+    with _open_picture(path, "TIFF", places=places) as picture:
         _check_tags(path, picture, wanted)
         size = picture.height, picture.width
         packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
-    pages = _pages_of(path)
-    if pages > _MOST_PAGES:
-        raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
-    held = path.stat().st_size / max(math.prod(size), 1) if packed else 0.0
+    if 0 in places and wanted.orientation is None:
+        _upright(path, np.empty((0, 0)), places[0].value, wanted)
+    if 0 in places and wanted.orientation == TO_FILE and abs(_TURNS.get(places[0].value, (0, False))[0]) == 1:
+        size = size[::-1]
+    held = path.stat().st_size / max(math.prod(size), 1) if packed or places else 0.0
     return _Header(pages, size, read, held + _PIXEL_BYTES)
 
 
-def _pages_of(path: Path) -> int:
-    """How many pages a TIFF has, one more than :data:`_MOST_PAGES` at most. Pillow takes a millisecond for each."""
+@dataclass(frozen=True)
+class _Stated:
+    """The orientation that a page of a TIFF states, if not upright: its value, and its bytes in the file."""
+
+    value: int
+    start: int
+    upright: bytes
+
+
+def _pages_of(path: Path) -> tuple[int, dict[int, _Stated]]:
+    """How many pages a TIFF has, one more than :data:`_MOST_PAGES` at most, and orientations by page.
+
+    Pillow takes a millisecond for each page, and turns a picture as it loads it: of files that are packed and of others
+    in different ways, which change with its version. It is given upright ones.
+    """
+    found: dict[int, _Stated] = {}
     with open(path, "rb") as file:
         order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
         big = int.from_bytes(file.read(2), order) == _BIG
@@ -251,9 +305,18 @@ def _pages_of(path: Path) -> int:
         following, pages = int.from_bytes(file.read(place), order), 0
         while following and pages <= _MOST_PAGES:
             file.seek(following)
-            file.seek(int.from_bytes(file.read(counted), order) * entry, os.SEEK_CUR)
+            count = int.from_bytes(file.read(counted), order)
+            entries = file.read(min(count, _MOST_ENTRIES) * entry)
+            for start in range(0, len(entries) - entry + 1, entry):
+                tag, kind = (int.from_bytes(entries[start + at : start + at + 2], order) for at in (0, 2))
+                width = _WIDTHS.get(kind, 0) if tag == _ORIENTATION else 0
+                value = int.from_bytes(entries[start + entry - place :][:width], order)
+                if width and value != _UPRIGHT:
+                    upright = _UPRIGHT.to_bytes(width, order)
+                    found[pages] = _Stated(value, following + counted + start + entry - place, upright)
+            file.seek(following + counted + count * entry)
             following, pages = int.from_bytes(file.read(place), order), pages + 1
-    return pages
+    return pages, found
 
 
 def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
@@ -265,9 +328,10 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
         raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
     if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
         raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
+    if tags.get(_ORIENTATION, _UPRIGHT) != _UPRIGHT:
+        raise wanted.refusal(path, "states an orientation in no usual way; save it upright")
     if any(tags.get(tag, 0) > max(picture.size) + _TILE_MARGIN for tag in _TILES):
         raise wanted.refusal(path, "is of tiles larger than the picture; save it in strips")
-    _check_upright(path, picture, wanted)
     return bool(samples[0] == _UNSIGNED)
 
 
@@ -311,6 +375,39 @@ def _exr(path: Path, wanted: Wanted) -> _Header:
     return _Header(1, (header.height, header.width), read)
 
 
+def _dng(path: Path, wanted: Wanted) -> _Header:
+    try:
+        import rawpy  # an extra: most benches write other files
+    except ImportError:
+        raise wanted.refusal(path, "rawpy is not installed; pip install 'mitsim[raw]', or save it as TIFF") from None
+
+    with open(path, "rb") as file:
+        order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
+        file.seek(4)
+        file.seek(int.from_bytes(file.read(4), order))
+        entries = file.read(2 + 12 * _MOST_ENTRIES)
+    if _DNG_VERSION.to_bytes(2, order) not in (entries[start : start + 2] for start in range(2, len(entries), 12)):
+        raise ValueError("its header is none of a DNG")
+    with stderr_silenced(), rawpy.imread(str(path)) as raw:
+        sizes = raw.sizes
+        colours = raw.color_desc.decode("ascii", "replace")
+        corner = [(sizes.top_margin + row, sizes.left_margin + column) for row in (0, 1) for column in (0, 1)]
+        mosaic = "".join(colours[raw.raw_color(*place)] for place in corner) if raw.num_colors > 1 else None
+    if mosaic is not None and mosaic != (wanted.mosaic or mosaic):
+        raise wanted.refusal(path, f"its mosaic is {cut(mosaic)}, and {wanted.mosaic} is stated; correct that")
+
+    def read() -> Iterator[Numbers]:
+        """Its one picture."""
+        with stderr_silenced(), rawpy.imread(str(path)) as raw:
+            flat = raw.raw_type == rawpy.RawType.Flat
+            values = raw.raw_image_visible.copy() if flat else np.empty(0)
+        if values.ndim != 2:
+            raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
+        yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
+
+    return _Header(1, (sizes.height, sizes.width), read)
+
+
 def _bare(path: Path, wanted: Wanted) -> _Header:
     raw = wanted.raw
     if raw is None:
@@ -335,7 +432,7 @@ def _bare(path: Path, wanted: Wanted) -> _Header:
 
 
 _READERS: dict[str, Callable[[Path, Wanted], _Header]] = {
-    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr), strict=True)),
+    **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr, _dng), strict=True)),
     **dict.fromkeys(BARE, _bare),
 }
 """What looks into a file, by the end of its name in small letters."""
@@ -349,9 +446,20 @@ def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
 
 
 @contextmanager
-def _open_picture(path: Path, kind: str, whole: bool = False) -> Iterator[Image]:
-    """A picture file of that ``kind``, its pixels not yet read; ``whole``: from a copy in memory, as the library for
-    packed TIFF would map the file, or read all of it for each page."""
+def _open_picture(
+    path: Path, kind: str, whole: bool = False, places: Mapping[int, _Stated] | None = None
+) -> Iterator[Image]:
+    """A picture file of that ``kind``, its pixels not yet read.
+
+    Parameters
+    ----------
+    path, kind
+        of the file.
+    whole
+        from a copy in memory, as the library for packed TIFF would map the file, or read all of it for each page.
+    places
+        orientations in it that are made upright, in a copy too.
+    """
     from PIL import Image, UnidentifiedImageError  # most work reads no picture
 
     logs = logging.getLogger("PIL")
@@ -360,11 +468,21 @@ def _open_picture(path: Path, kind: str, whole: bool = False) -> Iterator[Image]
     with open(path, "rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         warnings.simplefilter("error", Image.DecompressionBombWarning)
-        source = io.BytesIO(file.read()) if whole else cast("IO[bytes]", _Copied(file))
+        source = io.BytesIO(file.read()) if whole or places else cast("IO[bytes]", _Copied(file))
+        for stated in (places or {}).values():
+            source.seek(stated.start)
+            source.write(stated.upright)
+        source.seek(0)
         try:
             opened = Image.open(source, formats=(kind,))
         except UnidentifiedImageError:
-            raise ValueError(f"its header is none of a {kind}") from None
+            file.seek(0)
+            if file.read(4) not in _BEGINNINGS:
+                raise ValueError(f"its header is none of a {kind}") from None
+            unread = "such as real numbers of 16 or 64 bits, or transparency"
+            raise MitsimError(
+                f"file {path}: its pixels are of a kind that is not read, {unread}; save it anew"
+            ) from None
         with opened as picture:
             yield picture
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.files import read_json, write_json
+from mitsim.core.imagelist import PLANES
 
 COLOUR = "colour.json"
 RUN, CALIBRATION, IMAGE, MOSAIC = KINDS = ("colour-run", "colour-calibration", "colour-image", "mosaic-run")
@@ -123,6 +124,21 @@ class MosaicManifest(ColourManifest):
                 f"pixels one for each of {len(self.channels)} lines"
             )
         return self
+
+
+def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...]) -> ColourManifest:
+    """All planes of a mosaic as lines of a coloured folder.
+
+    Parameters
+    ----------
+    kind
+        of the folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
+    wavelengths_nm
+        of red, green and blue [nm].
+    """
+    lengths = dict(zip("rgb", wavelengths_nm, strict=True))
+    lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
+    return validate(ColourManifest, {"kind": kind, "channels": lines}, "planes")
 
 
 def is_coloured(folder: Path | str) -> bool:

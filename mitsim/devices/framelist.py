@@ -7,20 +7,24 @@ their names.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mitsim.core.configuration import Configuration, Positive, read_toml, validate
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.files import read_json
-from mitsim.core.imagelist import Raw, Wanted, image_files
+from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
+
+if TYPE_CHECKING:  # numpy takes 0.1 s to import, and a refusal needs none of it
+    from mitsim.core.images import Numbers
+    from mitsim.core.prepare import Preparer
 
 LISTS = ("session.toml", "session.json")
 """Names of the list."""
@@ -64,10 +68,14 @@ def _with_name(camera: Any) -> Any:
     return {"name": camera} if isinstance(camera, str) else camera
 
 
+Identity = Annotated[Plain, BeforeValidator(_with_name)]
+"""Of a camera: a name, or anything as a run's manifest has it."""
+
+
 class FrameList(Configuration):
     """What a real session's frames are of, and how they are read."""
 
-    camera: Annotated[Plain, BeforeValidator(_with_name)]
+    camera: Identity
     """Identity that a run must share: a name, or anything as a run's manifest has it."""
     n: int = Field(ge=1, le=MOST_PIXELS)
     """Projector pixels a side."""
@@ -89,6 +97,8 @@ class FrameList(Configuration):
     """How the factors move with depth; none: not known, and no `--focus`."""
     raw: Raw | None = None
     """How frames without a header are read; none: there are none."""
+    prepare: Preparation = Preparation()
+    """Table: what is done to the files' numbers before they are frames."""
     frames: Annotated[tuple[StripeFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
     """Every frame; none: by the order of their names."""
     dark: Annotated[tuple[DarkFile, ...], FailFast()] = Field(default=(), strict=False, max_length=MOST_SHOTS)
@@ -117,17 +127,52 @@ class SessionFrames:
         frame by side, number of the pattern, sign and repeat.
     dark
         frames with the projector off.
+    preparer
+        makes frames of the files' numbers; None: nothing is done to them.
     """
 
     folder: Path
     listed: FrameList
     shots: dict[Key, StripeFile]
     dark: tuple[DarkFile, ...]
+    preparer: Preparer | None = None
 
     @property
     def wanted(self) -> Wanted:
         """How its frames are read."""
-        return Wanted(raw=self.listed.raw)
+        return Wanted.of(self.listed.raw, self.listed.prepare)
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """Planes of a mosaic that its frames are of, where each is calibrated; "" alone where they are of one."""
+        return PLANES if self.listed.prepare.channel == ALL else ("",)
+
+    def of_plane(self, name: str) -> SessionFrames:
+        """The same of the one of the :attr:`planes` called ``name``, which its camera's identity then has."""
+        if not name:
+            return self
+        prepare = self.listed.prepare.model_copy(update={"channel": name})
+        camera = {**self.listed.camera, "channel": name}
+        return replace(self, listed=self.listed.model_copy(update={"prepare": prepare, "camera": camera}))
+
+    def with_preparer(self) -> SessionFrames:
+        """The same with what makes frames of the files' numbers, and the end of its scale; MitsimError for dark and
+        flat frames that cannot be read, and where the list is of all planes."""
+        if self.preparer is not None or self.listed.prepare == Preparation():
+            return self
+        from mitsim.core.prepare import Preparer
+
+        if self.listed.prepare.channel == ALL:
+            raise MitsimError(f"frames {self.folder}: prepare.channel all is of every plane; take one, by `of_plane`")
+        preparer = Preparer.of(self.listed.prepare, self.listed.digital, self.wanted, self.folder)
+        return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
+
+    def read(self, name: str) -> Numbers:
+        """The frame in the file called ``name``, (rows, columns)."""
+        from mitsim.core.images import read_image
+
+        values = read_image(self.folder / name, self.wanted)
+        return values if self.preparer is None else self.preparer.frame(self.folder / name, values)
 
     @property
     def pairs(self) -> bool:
@@ -188,7 +233,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
                 f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
                 f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
                 f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
-                f"frame in {lists[0].name}"
+                f"frame in {lists[0].name}{_not_counted(folder, names)}"
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
@@ -198,6 +243,13 @@ def load_frames(folder: Path | str) -> SessionFrames:
     session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
     _check_files(session)
     return session
+
+
+def _not_counted(folder: Path, names: Sequence[str]) -> str:
+    """Which files of the ``folder`` are none of the frames called ``names``, in words: nothing where all are."""
+    known = {*names, *LISTS}
+    others = sorted(path.name for path in folder.iterdir() if path.is_file() and path.name not in known)
+    return f" (not counted: {', '.join(map(cut, others[:3]))}{', ...' if others[3:] else ''})" if others else ""
 
 
 def _keys_of_session(listed: FrameList) -> Iterator[Key]:
@@ -247,7 +299,10 @@ def _check_files(session: SessionFrames) -> None:
             raise MitsimError(f"frames {folder}: {name} is listed twice; give each frame its own file")
         seen.add(name)
         if not (folder / name).is_file():
-            raise MitsimError(f"frames {folder}: {name} is listed, but no file of that name is there; copy it there")
+            near = near_name(name, [path.name for path in folder.iterdir()])
+            raise MitsimError(
+                f"frames {folder}: {name} is listed, but no file of that name is there; {near}copy it there"
+            )
     exposures = {session.exposure_s(shot) for shot in session.shots.values()}
     _check_ladder(session)
     for (side, index, sign, exposure, repeat), shot in session.shots.items():

@@ -170,6 +170,45 @@ def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
         yield Loaded(run, calibration)
 
 
+# -------- MATLAB files of version 7.3, which are HDF5
+
+
+_MOST_VARIABLES = 10_000
+"""Of a file, as of one of version 5."""
+_LETTERS = "char"
+"""What MATLAB calls texts; they are stored as numbers of 16 bits."""
+_CLASSES = {_LETTERS, "single", "double", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+"""What it calls arrays of numbers and texts."""
+
+
+def read_matlab(path: Path) -> dict[str, Any]:
+    """The arrays of real numbers and the texts of the MATLAB file ``path`` of version 7.3, by name; cells, structures
+    and sparse matrices are not looked into.
+
+    MitsimError for a file that is damaged, leads to another one, or takes more memory than is free.
+    """
+    import h5py
+
+    found = dict[str, Any]()
+    with hdf5_errors(path), h5py.File(path, "r") as file:
+        if len(file) > _MOST_VARIABLES:
+            raise MitsimError(f"{path}: holds {len(file)} variables; at most {_MOST_VARIABLES} are read")
+        datasets = {}
+        for name in file:
+            if isinstance(file.get(name, getlink=True), h5py.HardLink) and not isinstance(file[name], h5py.Dataset):
+                continue  # a structure, a sparse matrix, or what cells refer to
+            dataset = _inside(file, name, h5py.Dataset, path)
+            known = bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
+            if known in _CLASSES and dataset.dtype.kind in "uif" and "MATLAB_empty" not in dataset.attrs:
+                datasets[name] = _dataset(file, name, path), known
+        Cost(memory_bytes=2 * sum(each.nbytes for each, _ in datasets.values())).check(f"{path}", Limits())
+        for name, (dataset, known) in datasets.items():
+            values = dataset[()].T  # MATLAB stores columns first
+            text = known == _LETTERS
+            found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
+    return found
+
+
 class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
     """Files of a folder by name, read at every look."""
 

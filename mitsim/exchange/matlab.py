@@ -10,11 +10,12 @@ https://github.com/tanjasper/flatcam takes plane b from row 0 and column 0 on, e
 coloured run has a whole frame of each line: it is a plane of a frame of twice the rows and columns, so that nothing is
 left out.
 
-Files are of version 5, which SciPy, GNU Octave and every MATLAB read.
+Files that are written are of version 5, which SciPy, GNU Octave and every MATLAB read; version 7.3 is read, too.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,13 +27,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, read_variables, write_variables
+from mitsim.core.arrays import FloatArray, is_hdf5, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
+from mitsim.core.imagelist import ALL, BGGR, WAVELENGTHS_NM, check_channel, planes_of
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
 from mitsim.core.recorders import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest
-from mitsim.exchange.formats import PLANES, check_channel
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest, lines_of_planes
+from mitsim.exchange.capture_list import TURNED
+from mitsim.exchange.hdf5 import read_matlab
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,
@@ -47,6 +50,8 @@ from mitsim.exchange.packed import (
     unpack_run,
 )
 
+PLANES = planes_of(BGGR)
+"""First row and first column of each plane of a frame, as FlatCam has them."""
 ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
 Variables = dict[str, Any]
@@ -115,6 +120,14 @@ class MatFile:
             )
             for name, end in endings(names, self.path).items()
         }
+
+
+def variables_in(path: Path) -> dict[str, Any]:
+    """The arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name.
+
+    MitsimError for a file that is missing, damaged, of version 4, or that takes more memory than is free.
+    """
+    return read_matlab(path) if is_hdf5(path) else read_variables(path)
 
 
 COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
@@ -378,7 +391,7 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
     path
         of the file.
     channel
-        the file is the calibration of a real FlatCam, of which this plane is taken.
+        the file is the calibration of a real FlatCam, of which this plane is taken, or `all`.
 
     Raises
     ------
@@ -386,9 +399,9 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
         for a file that is none of these, or is damaged.
     """
     if channel is not None:
-        yield Loaded(None, Content({"": flatcam_calibration(path, channel)}))
+        yield Loaded(None, flatcam_calibration(path, channel))
         return
-    file = MatFile(path, read_variables(path))
+    file = MatFile(path, variables_in(path))
     run, lines = _run_in(file)
     held = {name: _calibration_part(own, run.of_line(name).manifest.digital) for name, own in lines.items()}
     yield Loaded(run, _calibration_in(file, held, run), (ELECTRONS,))
@@ -527,20 +540,21 @@ def _calibration_part(own: MatFile, digital: Digital) -> Packed[CalibrationManif
     return Packed(manifest, text, FACTORS, read, own.path)
 
 
-def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]:
-    """The factors of one plane of a real FlatCam, from its calibration file.
+def flatcam_calibration(path: Path, channel: str) -> Calibration:
+    """The factors of one plane of a real FlatCam, or of all, from its calibration file.
 
     Parameters
     ----------
     path
         of the file, with `P1*` and `Q1*`.
     channel
-        a key of :data:`mitsim.exchange.formats.PLANES`.
+        one of :data:`mitsim.core.imagelist.PLANES`, or `all`.
 
     Returns
     -------
-    Packed
-        a calibration for frames of that plane; flagged where the frames must be turned first.
+    Content
+        a calibration for frames of that plane, of all planes a coloured one. Its manifests' configuration holds the
+        angle by which the frames are turned first.
 
     Raises
     ------
@@ -548,14 +562,21 @@ def flatcam_calibration(path: Path, channel: str) -> Packed[CalibrationManifest]
         for a file without that plane.
     """
     check_channel(channel)
-    file = MatFile(path, {"angle": [[0.0]], **read_variables(path)})
-    sides = {name: file.image(f"{stem}{channel}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
+    file = MatFile(path, {"angle": [[0.0]], **variables_in(path)})
     angle = float(file.matrix("angle")[0, 0])
-    turned = f"its frames were turned by {angle:g} degrees, and import turns none: turn them before, or shifts remain"
-    camera = {"name": path.stem, "channel": channel}
-    manifest = CalibrationManifest(camera=camera, centre=True, warnings=(turned,) if angle else ())
 
-    def read(name: str) -> tuple[Channels, Metadata]:
-        return {"factor": sides[name]}, {}
+    def part(plane: str) -> Packed[CalibrationManifest]:
+        """Of one plane."""
+        sides = {name: file.image(f"{stem}{plane}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
+        manifest = CalibrationManifest(
+            camera={"name": path.stem, "channel": plane},
+            centre=True,
+            configuration={TURNED: angle} if angle else {},
+        )
+        return Packed(manifest, "", FACTORS, lambda name: ({"factor": sides[name]}, {}), path)
 
-    return Packed(manifest, "", FACTORS, read, path)
+    if channel != ALL:
+        return Content({"": part(channel)})
+    colours = lines_of_planes(CALIBRATION, WAVELENGTHS_NM)
+    text = json.dumps(colours.model_dump(mode="json"))
+    return Content({name: part(name) for name in colours.names}, colours, text)

@@ -1,34 +1,36 @@
-"""Frames of a real camera and what is known of it in; a RUN folder that `mitsim reconstruct` takes out.
+"""Frames of a real camera and what is known of it in; a RUN folder that `mitsim reconstruct` takes out, of all planes
+of a mosaic a coloured one.
 
 What a real capture lacks - truth, scene, expected electrons, predicted error - is left out.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.configuration import locate, validate
+from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
-from mitsim.core.files import read_json
-from mitsim.core.imagelist import image_files
+from mitsim.core.files import read_json, whole_folder
+from mitsim.core.imagelist import Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest
+from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
+from mitsim.core.prepare import LEAST_RESPONSE, PLAIN, Preparer, factor_of
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.devices.sensor import SensorModel, digital_of, load_sensor
-from mitsim.exchange.formats import PLANES, RealCapture
-from mitsim.exchange.packed import FACTORS, Packed, pack_calibration
+from mitsim.exchange.capture_list import Electronics, RealCapture
+from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
@@ -37,7 +39,7 @@ LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 
 
 def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, Any]:
-    """Write the RUN folder of a real capture, whole or not at all.
+    """Write the RUN folder of a real capture, of all planes a coloured one, whole or not at all.
 
     Parameters
     ----------
@@ -51,8 +53,8 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
     Returns
     -------
     dict
-        `frames`, `shape`, `output`, `calibration_output` (None), `holds`, `left_out`, `warnings`: what the command line
-        prints.
+        `frames`, `shape`, `output`, `calibration_output` (None), `holds`, `left_out`, `divided_by`, `planes`,
+        `notes`, `warnings`: what the command line prints.
 
     Raises
     ------
@@ -61,32 +63,91 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
         a place that holds something.
     """
     known.check(source)
-    sensor = load_sensor(locate(known.camera, "calibration", ".toml"))
-    fit = _Fit.of(known)
-    digital = digital_of(sensor, known.exposure_s)
-    if known.black_level_dn is not None:
-        stated = {**digital.model_dump(), "black_level_dn": known.black_level_dn}
-        digital = validate(Digital, stated, "black_level")
-    patterns = _patterns(known, fit.scene)
     files = image_files(source, known.wanted)
-    pages, count = [image_pages(path, known.wanted) for path in files], len(patterns.captures)
+    camera, prepare = known.electronics()
+    colours = known.colours
+    fits = {name: _Fit.of(known, name) for name in (colours.names if colours else ("",))}
+    patterns = {name: _patterns(known, fit.scene) for name, fit in fits.items()}
+    count = len(next(iter(patterns.values())).captures)
+    pages = [image_pages(path, known.wanted) for path in files]
     if (held := sum(number for number, _ in pages)) != count:
         raise MitsimError(
             f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}, in the order "
-            "(row, column), of signed ones + before -; give all of them and no others"
+            f"(row, column), of signed ones + before -; give all of them and no others{_many_pages(files, pages)}"
         )
     pixels = sum(number * math.prod(size) for number, size in pages)
     cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
     cost.check(f"import of {count} frames", Limits(), output)
-    shots = _Shots(files, known, sensor, fit)
-    ambient = None if known.ambient is None else _ambient(known, sensor, fit)
+    scan = _Scan(files, known, camera)
+    factor, notes, warnings = scan.factor(prepare.divide_by)
+    prepare = prepare.model_copy(update={"divide_by": factor})
+    scan.check(factor)
+    runs = {}
+    for name, fit in fits.items():
+        how = prepare.model_copy(update={"channel": name}) if name else prepare
+        runs[name], shape, unlit = _run_of(source, known, camera, how, fit, patterns[name], scan)
+        if unlit:
+            warnings.append(
+                f"flat: {unlit} pixels{f' of {name}' if name else ''} have less than {LEAST_RESPONSE:g} of the mean "
+                "response, and are not corrected; leave them out by a crop, or take a flat without a mask"
+            )
+    if prepare.turn_deg:
+        notes.append(
+            f"turned by {prepare.turn_deg:g} degrees: noise of neighbouring pixels is no more independent, so an "
+            "image's stated uncertainty is rough"
+        )
+    text = "" if colours is None else json.dumps(colours.model_dump(mode="json"))
+    content = Content(runs, colours, text)
+    with whole_folder(output) as place:
+        content.fill(place)
+    return {
+        "frames": count * len(runs),
+        "shape": [*shape],
+        "output": str(output),
+        "calibration_output": None,
+        "holds": ["run"],
+        "left_out": [*LEFT_OUT],
+        "divided_by": factor,
+        "planes": [name for name in runs if name],
+        "notes": notes,
+        "warnings": warnings,
+    }
+
+
+def _run_of(
+    source: Path,
+    known: RealCapture,
+    camera: Electronics,
+    how: Preparation,
+    fit: _Fit,
+    patterns: Patterns,
+    scan: _Scan,
+) -> tuple[Packed[RunManifest], tuple[int, ...], int]:
+    """The run of one plane, the size of its frames, and how many pixels are not corrected for want of light.
+
+    Parameters
+    ----------
+    source, known, camera
+        of the capture.
+    how
+        what is done to its numbers.
+    fit, patterns
+        of its calibration, and what is shown.
+    scan
+        of all frames.
+    """
+    preparer = Preparer.of(how, camera.digital, known.wanted, known.base)
+    shots = _Shots(known, preparer, fit, scan.places, camera.largest is not None)
+    shape = shots.frame(scan.places[0][0], scan.first).shape
+    ambient = None if known.ambient is None else _ambient(known, camera, preparer, fit, shape)
     names = (*(shot.file for shot in patterns.captures), *((AMBIENT,) if ambient else ()))
-    head = RunHead.of(_configuration(known, sensor, files))
+    head = RunHead.of(_configuration(known, camera, how, scan.files))
+    identity = camera.identity if known.prepare.channel == how.channel else {**camera.identity, "channel": how.channel}
     manifest = RunManifest(
         configuration=head.configuration,
         configuration_sha256=head.configuration_sha256,
-        camera=fit.camera or {"name": sensor.name},
-        digital=digital,
+        camera=fit.camera or identity,
+        digital=preparer.digital,
         patterns=patterns,
         sensor_noise=None,
         ambient_frame=None if ambient is None else AmbientFile(file=AMBIENT, shots=ambient[1]),
@@ -97,27 +158,23 @@ def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, A
 
     def read(name: str) -> tuple[Channels, Metadata]:
         if name not in index and ambient is not None:
-            return {"DN": ambient[0]}, {"shots": ambient[1], "exposure_s": known.exposure_s}
-        shot, (path, _) = patterns.captures[index[name]], shots.places[index[name]]
+            return {"DN": ambient[0]}, {"shots": ambient[1], "exposure_s": camera.digital.exposure_s}
+        shot, (path, _) = patterns.captures[index[name]], scan.places[index[name]]
         about: Metadata = {
             "row": shot.row,
             "column": shot.column,
             "sign": shot.sign,
             "source": path.name,
-            "exposure_s": known.exposure_s,
+            "exposure_s": camera.digital.exposure_s,
         }
         return {"DN": shots.read(index[name])}, about
 
-    Packed(manifest, "", names, read, source).save(output)
-    return {
-        "frames": count,
-        "shape": list(shots.shape),
-        "output": str(output),
-        "calibration_output": None,
-        "holds": ["run"],
-        "left_out": list(LEFT_OUT),
-        "warnings": [],
-    }
+    return Packed(manifest, "", names, read, source), shape, preparer.unlit
+
+
+def _many_pages(files: tuple[Path, ...], pages: list[tuple[int, tuple[int, int]]]) -> str:
+    several = [f"{path.name} has {number}" for path, (number, _) in zip(files, pages, strict=True) if number > 1]
+    return f" (each page is a frame: {several[0]})" if several else ""
 
 
 @dataclass(frozen=True)
@@ -129,12 +186,13 @@ class _Fit:
     scene: tuple[int, int]
 
     @classmethod
-    def of(cls, known: RealCapture) -> _Fit:
+    def of(cls, known: RealCapture, line: str = "") -> _Fit:
+        """Of a ``line`` of the calibration; of the whole one by ""."""
         if known.calibration is None:
             if known.n is None:
                 raise AssertionError  # refused by RealCapture.check
             return cls(None, None, (known.n, known.n))
-        calibration: Packed[CalibrationManifest] = pack_calibration(known.calibration)
+        calibration: Packed[CalibrationManifest] = pack_calibration(known.calibration / line)
         left, right = (calibration.read(name)[0]["factor"].shape for name in FACTORS)
         if known.n is not None and (known.n, known.n) != (left[1], right[1]):
             raise ArgumentError(
@@ -143,43 +201,112 @@ class _Fit:
         return cls(dict(calibration.manifest.camera), (left[0], right[0]), (left[1], right[1]))
 
 
-class _Shots:
-    """Every frame of some files, checked when it is first looked at and read again when it is written."""
+@dataclass(frozen=True)
+class _Numbers:
+    """What the numbers of one frame are: smallest and largest, whether all are whole, and the type of their file."""
 
-    def __init__(self, files: tuple[Path, ...], known: RealCapture, sensor: SensorModel, fit: _Fit) -> None:
-        self._known, self._sensor, self._fit = known, sensor, fit
-        self._pages: tuple[int, Iterator[Numbers]] = (0, iter(()))
+    path: Path
+    low: float
+    high: float
+    whole: bool
+    kind: np.dtype[Any]
+
+
+class _Scan:
+    """All frames, looked at once: where they are, their size and numbers."""
+
+    def __init__(self, files: tuple[Path, ...], known: RealCapture, camera: Electronics) -> None:
+        self.files, self._camera = files, camera
         self.places: list[tuple[Path, int]] = []
-        self.shape: tuple[int, int] = (0, 0)
+        self._numbers: list[_Numbers] = []
+        self._factor, self._differ = 0, set[float]()
         for path in files:
             for number, frame in enumerate(read_images(path, known.wanted)):
-                digital = self._digital(path, frame)
-                self.shape = digital.shape if not self.places else self.shape
-                if digital.shape != self.shape:
+                if not self.places:
+                    self.first = frame
+                elif frame.shape != self.first.shape:
                     raise MitsimError(
-                        f"{path}: is {_size(digital.shape)}, but {self.places[0][0].name} {_size(self.shape)}; "
+                        f"{path}: is {_size(frame.shape)}, but {self.places[0][0].name} {_size(self.first.shape)}; "
                         "give frames of one size"
                     )
                 self.places.append((path, number))
+                whole = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame))
+                self._numbers.append(_Numbers(path, float(frame.min()), float(frame.max()), whole, frame.dtype))
+                self._factor = factor_of(frame, self._factor)
+                if len(self._differ) < PLAIN:
+                    self._differ.update(np.unique(frame)[:PLAIN].tolist())
+
+    def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
+        """What all numbers are divided by, what is said of it, and what is doubtful.
+
+        Parameters
+        ----------
+        stated
+            factor that somebody states; None: numbers beyond the camera's range are divided by the one that they have.
+
+        Raises
+        ------
+        MitsimError
+            for a stated one that they do not have.
+        """
+        largest, found = self._camera.largest, self._factor
+        if stated is not None:
+            if found % stated:
+                raise ArgumentError("divide_by", f"{stated}: the numbers' common factor is {found}; give that, or 1")
+            return stated, [], []
+        high = max(each.high for each in self._numbers)
+        chance = len(self._differ) < PLAIN
+        if largest is not None and high > largest and found > 1:
+            bits = 8 * self._numbers[0].kind.itemsize - largest.bit_length()
+            shifted = 2 ** max(bits, 0)
+            factor = shifted if found % shifted == 0 else found
+            if high / factor <= largest and (factor == shifted or not chance):
+                kind = f" ({largest.bit_length()} bits in the high bits of {self._numbers[0].kind.itemsize * 8})"
+                all_are = f"numbers are divided by {factor}, which all are multiples of"
+                return factor, [all_are + (kind if factor == shifted else "")], []
+        if found > 1 and not chance:
+            doubt = (
+                f"all numbers are multiples of {found}, and are taken as they are: if the camera's numbers were "
+                f"shifted or scaled, give --divide {found}, else --divide 1"
+            )
+            return 1, [], [doubt]
+        return 1, [], []
+
+    def check(self, factor: int) -> None:
+        """MitsimError for numbers that, divided by a ``factor``, this camera does not give."""
+        for each in self._numbers:
+            check_numbers(each.path, each, self._camera, factor)
+
+
+class _Shots:
+    """Every frame of the ``places``, read again when it is asked for, and prepared."""
+
+    def __init__(
+        self, known: RealCapture, preparer: Preparer, fit: _Fit, places: list[tuple[Path, int]], counts: bool
+    ) -> None:
+        self._known, self._preparer, self._fit, self._places = known, preparer, fit, places
+        self._kind = np.uint32 if counts and preparer.counts else np.float32
+        self._pages: tuple[int, Iterator[Numbers]] = (0, iter(()))
 
     def read(self, index: int) -> Channel:
         """The frame number ``index``, (rows, columns) digital numbers."""
-        (path, page), (expected, pages) = self.places[index], self._pages
+        (path, page), (expected, pages) = self._places[index], self._pages
         if page == 0 or index != expected:
             pages = islice(read_images(path, self._known.wanted), page, None)
         self._pages = index + 1, pages  # of one file, page after page is asked for
         frame = next(pages, None)
         if frame is None:
             raise MitsimError(f"{path}: has fewer frames than before; leave it alone while it is read")
-        return self._digital(path, frame)
+        return self.frame(path, frame)
 
-    def _digital(self, path: Path, frame: Numbers) -> Channel:
-        """The wanted part of a ``frame`` of the file ``path``, checked against the camera."""
-        return part_of(path, digital_numbers(path, frame, self._sensor), self._known.channel, self._fit.shape)
+    def frame(self, path: Path, values: Numbers) -> Channel:
+        """The frame of ``values`` (rows, columns) of the file ``path``."""
+        made = part_of(path, self._preparer.frame(path, values), self._preparer.how, self._fit.shape)
+        return cast(Channel, made.astype(self._kind, copy=False))
 
 
-def part_of(path: Path, frame: Channel, channel: str | None, shape: tuple[int, int] | None) -> Channel:
-    """The plane of a ``channel``, and of that the middle that a calibration is of.
+def part_of(path: Path, frame: Channel, how: Preparation, shape: tuple[int, int] | None) -> Channel:
+    """Of a frame of a plane the middle that a calibration is of, where nobody states another part.
 
     Parameters
     ----------
@@ -187,39 +314,39 @@ def part_of(path: Path, frame: Channel, channel: str | None, shape: tuple[int, i
         of the frame, for messages.
     frame
         (rows, columns).
-    channel
-        plane of a colour sensor; None: the frame as it is.
+    how
+        what was done to it.
     shape
-        of the calibration's frames; None: no calibration. Without a channel it must be the frame's.
+        of the calibration's frames; None: no calibration. Without a plane, or with a part stated, it must be the
+        frame's.
 
     Raises
     ------
     MitsimError
         for a frame of another size.
     """
-    if channel is not None:
-        row, column = PLANES[channel]
-        frame = frame[row::2, column::2]
-        if shape is not None and all(side >= wanted for side, wanted in zip(frame.shape, shape, strict=True)):
-            # As FlatCam's loader cuts it.
-            row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, shape, strict=True))
+    if how.channel is not None and how.crop is None and shape is not None:
+        row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, shape, strict=True))
+        if min(row, column) >= 0:  # as FlatCam's loader cuts it
             frame = frame[row : row + shape[0], column : column + shape[1]]
     if shape is not None and frame.shape != shape:
         raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(shape)}")
     return frame.copy()
 
 
-def digital_numbers(path: Path, frame: Numbers, sensor: SensorModel, mean: bool = False) -> Channel:
-    """Numbers of a file as a frame of a camera holds them, uint32 or float32.
+def check_numbers(path: Path, numbers: _Numbers, camera: Electronics, factor: int = 1, mean: bool = False) -> None:
+    """Whether a camera gives such numbers.
 
     Parameters
     ----------
     path
         of the file, for messages.
-    frame
-        (rows, columns).
-    sensor
-        the camera.
+    numbers
+        of a frame.
+    camera
+        whose they are to be.
+    factor
+        that they are divided by.
     mean
         whether this is a mean of frames, which need not be whole.
 
@@ -228,41 +355,38 @@ def digital_numbers(path: Path, frame: Numbers, sensor: SensorModel, mean: bool 
     MitsimError
         for numbers that this camera does not give.
     """
-    largest = sensor.largest_dn
-    if largest is None or mean:
-        top = float(frame.max())
-        if largest is not None and top > largest:
-            raise MitsimError(_beyond(path, top, sensor))
-        return frame.astype(np.float32)
-    if frame.dtype.kind == "f" and not np.array_equal(frame, np.rint(frame)):
-        raise MitsimError(f"{path}: holds fractions, but camera {sensor.name} counts whole numbers; give single shots")
-    if frame.min() < 0 or frame.max() > largest:
-        raise MitsimError(_beyond(path, float(frame.min() if frame.min() < 0 else frame.max()), sensor))
-    if frame.dtype.kind != "f" and np.iinfo(frame.dtype).max < largest:
+    largest = camera.largest
+    if largest is None:
+        return
+    low, high = numbers.low / factor, numbers.high / factor
+    if not mean and not numbers.whole:
+        raise MitsimError(f"{path}: holds fractions, but camera {camera.name} counts whole numbers; give single shots")
+    if high > largest or (low < 0 and not mean):
         raise MitsimError(
-            f"{path}: holds numbers of {8 * frame.dtype.itemsize} bits, but camera {sensor.name} counts to {largest}: "
+            f"{path}: has the number {low if low < 0 else high:g}, but camera {camera.name} counts 0 to {largest}: "
+            "they were scaled, or the camera is another; save them as they are, or give the right camera file"
+        )
+    if not mean and numbers.kind.kind != "f" and np.iinfo(numbers.kind).max < largest:
+        raise MitsimError(
+            f"{path}: holds numbers of {8 * numbers.kind.itemsize} bits, but camera {camera.name} counts to {largest}: "
             "they were made smaller; save them as they are, or give a camera file of these numbers"
         )
-    return frame.astype(np.uint32)
 
 
-def _beyond(path: Path, number: float, sensor: SensorModel) -> str:
-    return (
-        f"{path}: has the number {number:g}, but camera {sensor.name} counts 0 to {sensor.largest_dn}: they were "
-        "scaled, or the camera is another; save them as they are, or give the right camera file"
-    )
-
-
-def _ambient(known: RealCapture, sensor: SensorModel, fit: _Fit) -> tuple[npt.NDArray[np.float32], int]:
+def _ambient(
+    known: RealCapture, camera: Electronics, preparer: Preparer, fit: _Fit, shape: tuple[int, ...]
+) -> tuple[npt.NDArray[np.float32], int]:
     """The mean of all frames with the projector off, and how many there are."""
     if known.ambient is None:
         raise ArgumentError("ambient", "is not given")
-    total, count = np.zeros(()), 0
+    total, count = np.zeros(shape), 0
     for path in image_files(known.ambient, known.wanted):
         for frame in read_images(path, known.wanted):
-            part = part_of(path, digital_numbers(path, frame, sensor, mean=True), known.channel, fit.shape)
-            if count and part.shape != total.shape:
-                raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(total.shape)}")
+            numbers = _Numbers(path, float(frame.min()), float(frame.max()), True, frame.dtype)
+            check_numbers(path, numbers, camera, preparer.how.divide_by or 1, mean=True)
+            part = part_of(path, preparer.frame(path, frame, mean=True), preparer.how, fit.shape)
+            if part.shape != shape:
+                raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
             total, count = total + part, count + 1
     if known.ambient_shots is not None and count != 1:
         raise ArgumentError(
@@ -297,17 +421,25 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
     return patterns
 
 
-def _configuration(known: RealCapture, sensor: SensorModel, files: tuple[Path, ...]) -> dict[str, Any]:
+def _configuration(
+    known: RealCapture, camera: Electronics, how: Preparation, files: tuple[Path, ...]
+) -> dict[str, Any]:
     """All that decides the frames: whose files, and as what they are read."""
     more = () if known.ambient is None else image_files(known.ambient, known.wanted)
+    corrected = {
+        name: {path.name: checksum(path) for path in image_files(known.base / place, known.wanted)}
+        for name in ("dark", "flat", "flat_dark")
+        if (place := getattr(how, name)) is not None
+    }
     return {
         "imported": {path.name: checksum(path) for path in files},
         "ambient": {path.name: checksum(path) for path in more},
         "patterns": known.patterns,
-        "sensor": sensor.model_dump(mode="json", exclude={"full_well_e"}),
-        "exposure_s": known.exposure_s,
+        **camera.stated,
+        "exposure_s": camera.digital.exposure_s,
         "black_level_dn": known.black_level_dn,
-        "channel": known.channel,
+        "channel": how.channel,
+        "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
         "seed": known.seed,
     }
 

@@ -31,6 +31,8 @@ from mitsim.core.images import image_size, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.core.parallel import in_threads, single_threaded_blas
+from mitsim.core.prepare import PLAIN, factor_of
+from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.core.worker import workers
 from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.devices.patterns import stripe_signs
@@ -97,12 +99,38 @@ def calibrate_frames(
     if camera is not None:
         session, doubts = _with_camera(session, camera)
     _check_sizes(session)
+    session, doubt = _without_factor(session)
+    doubts += doubt
     if output is None:
         return _calibrate(session, job, doubts)
     with output_folder(output) as place:
         factors = _calibrate(session, job, doubts)
         factors.write(place)
     return factors
+
+
+def calibrate_planes(
+    session: SessionFrames, output: Path, job: Job | None = None, camera: Path | str | None = None
+) -> dict[str, Factors]:
+    """The camera's factors of every plane of a mosaic, from frames of all planes, by the plane's name.
+
+    Parameters
+    ----------
+    session
+        whose list has prepare.channel = "all".
+    output
+        coloured CAL folder that is written.
+    job, camera
+        as for :func:`calibrate_frames`, whose errors it raises.
+    """
+    job, colours = job or Job(), lines_of_planes(CALIBRATION, session.listed.prepare.wavelengths_nm)
+    with output_folder(output) as place:
+        found = {
+            name: calibrate_frames(session.of_plane(name), place / name, job.apart(f"{name} "), camera)
+            for name in colours.names
+        }
+        write_colours(place, colours)
+    return found
 
 
 def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
@@ -129,6 +157,7 @@ def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]])
     MitsimError for a frame with pixels at the full well or the ADC's end, where a model's fit would be misled.
     """
     _check_sizes(session)
+    session, _ = _without_factor(session)
     readings = _Readings(session)
     for side, index in chosen:
         rate, variance, _ = readings.response(side, index)
@@ -167,6 +196,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),
         "dark_frames": len(session.dark),
+        "divided_by": session.listed.prepare.divide_by or 1,
         "not_known": [*_not_known(session)],
         "seconds": job.clock.seconds(),
         "warnings": warnings,
@@ -210,6 +240,27 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
         yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
 
 
+def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
+    """The ``session`` with what makes frames of its numbers, divided by their common factor where they are beyond the
+    camera's range; and what is doubtful of it.
+
+    The first and last frames tell: others that are no multiples are refused as they are read.
+    """
+    prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
+    if prepare.divide_by is None:
+        ends = [read_image(session.folder / name, session.wanted) for name in (session.files[0], session.files[-1])]
+        found = factor_of(ends[1], factor_of(ends[0]))
+        high = max(float(values.max()) for values in ends)
+        if found > 1 and len(np.unique(ends[0])) >= PLAIN:
+            if end is None or high <= end:
+                doubt = f"frames: all numbers of {session.files[0]} are multiples of {found}, and are taken as they are"
+                remedy = f"state prepare.divide_by = {found} if they were shifted or scaled, else 1"
+                return session.with_preparer(), (f"{doubt}; {remedy}",)
+            prepare = prepare.model_copy(update={"divide_by": found})
+            session = replace(session, listed=session.listed.model_copy(update={"prepare": prepare}))
+    return session.with_preparer(), ()
+
+
 def _check_sizes(session: SessionFrames) -> None:
     """MitsimError for a frame that cannot be read, or is of another size than the first."""
     first, *others = session.files
@@ -229,7 +280,7 @@ def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
     """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
     columns) being the brighter of both uniform responses [electrons/s]."""
     first = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
-    values, digital = read_image(session.folder / first.file, session.wanted), session.listed.digital
+    values, digital = session.read(first.file), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
         raise MitsimError(
             f"frames {session.folder}: no number of {first.file}, a uniform frame, is above {values.max():g}, and its "
@@ -403,7 +454,7 @@ class _Readings:
         """Whether many pixels of a frame share its largest number."""
         for exposure in range(len(self.session.listed.exposure_ladder)):
             for frame in self.session.repeats_of(half, exposure):
-                values = read_image(self.session.folder / frame.file, self.session.wanted)
+                values = self.session.read(frame.file)
                 if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
                     return True
         return False
@@ -435,7 +486,7 @@ class _Readings:
         total: FloatArray | None = None
         before: FloatArray | None = None
         for place, frame in enumerate(frames):
-            values = read_image(self.session.folder / frame.file, self.session.wanted)
+            values = self.session.read(frame.file)
             end = own_end(values) if digital.saturation_dn is None else digital.saturation_dn
             if end is not None and ((values >= end) & used).any():
                 self.saturated.add(frame.file)

@@ -16,7 +16,8 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import RealCapture, export_run, import_file
+from mitsim.exchange.capture_list import RealCapture
+from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.exchange.real import import_frames
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made

@@ -189,8 +189,8 @@ def test_flatcam_needs_a_calibration(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("angle", [0.0, -0.4])
 def test_a_plane_of_a_real_flatcams_calibration(angle: float, tmp_path: Path) -> None:
-    """Its factors are of frames without means; frames that must be turned are told. (Planted: P1 and Q1 changed places;
-    factors that are not said to be centred.)"""
+    """Its factors are of frames without means; how far frames are turned is told, and kept. (Planted: P1 and Q1 changed
+    places; factors that are not said to be centred.)"""
     rng = np.random.default_rng(5)
     sides = {
         f"{stem}{name}": rng.normal(size=size)
@@ -203,7 +203,8 @@ def test_a_plane_of_a_real_flatcams_calibration(angle: float, tmp_path: Path) ->
     assert np.array_equal(factors.left, sides["P1gr"].astype(np.float32)) and factors.right.shape == (62, 18)
     assert factors.manifest.centre and factors.manifest.board_reflectance is None
     assert result["holds"] == ["calibration"] and result["output"] is None
-    assert [*factors.warnings] == result["warnings"] and bool(result["warnings"]) == bool(angle)
+    assert not result["warnings"] and factors.ok and bool(result["notes"]) == bool(angle)
+    assert factors.manifest.configuration == ({"turn_deg": angle} if angle else {})
     with pytest.raises(MitsimError, match="use r, gb, gr, b"):
         import_file(tmp_path / "calib.mat", None, tmp_path / "cal 2", "green")
     with pytest.raises(MitsimError, match="holds no run"):

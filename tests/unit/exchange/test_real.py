@@ -18,10 +18,11 @@ from PIL import Image
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
-from mitsim.core.imagelist import Raw, Wanted
+from mitsim.core.imagelist import Preparation, Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
-from mitsim.exchange.formats import RealCapture, export_run
+from mitsim.exchange.capture_list import RealCapture
+from mitsim.exchange.formats import export_run
 from mitsim.exchange.real import LEFT_OUT, import_frames
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
@@ -159,7 +160,7 @@ def test_a_plane_of_a_colour_sensor_is_cut_as_flatcams_loader_does(tmp_path: Pat
     mosaic = np.arange(84 * 110).reshape(84, 110)
     written(tmp_path / "frames", "png", np.stack([mosaic] * 6))
     for channel, corner in {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}.items():
-        import_frames(tmp_path / "frames", tmp_path / channel, known(bench, channel=channel))
+        import_frames(tmp_path / "frames", tmp_path / channel, known(bench, prepare=Preparation(channel=channel)))
         plane = mosaic[corner[0] :: 2, corner[1] :: 2]
         assert plane.shape == (42, 55)
         assert np.array_equal(ms.load_run(tmp_path / channel).dn[0], plane[1:41, 1:53])
@@ -190,7 +191,6 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     refused("black_level_dn: got -1", tmp_path, source, known(bench, black_level_dn=-1.0))
     (tmp_path / "empty").mkdir()
     refused("holds no file that ends in", tmp_path, tmp_path / "empty", known(bench))
-    refused("use r, gb, gr, b", tmp_path, source, known(bench, channel="green"))
     written(tmp_path / "small", "png", dn[:, :, 1:])
     refused("is 40x51, but the calibration's frames are 40x52", tmp_path, tmp_path / "small", known(bench))
     written(tmp_path / "fractions", "npy", dn + 0.5)
@@ -246,7 +246,7 @@ def test_pictures_as_large_as_flatcams_give_their_scene(tmp_path: Path) -> None:
     written(tmp_path / "planes", "png", np.kron(dn, [[0, 0], [1, 0]])[None])
     bench = Made(tmp_path / "run", tmp_path / "cal", scene)
     for folder, channel in (("whole", None), ("planes", "gr")):
-        about = known(bench, "uniform", channel=channel)
+        about = known(bench, "uniform", prepare=Preparation(channel=channel))
         result = import_frames(tmp_path / folder, tmp_path / f"run {folder}", about)
         assert result["shape"] == [500, 256]
         image = ms.reconstruct(ms.load_run(tmp_path / f"run {folder}"), ms.load_calibration(tmp_path / "cal")).image

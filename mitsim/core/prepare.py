@@ -1,0 +1,258 @@
+"""Numbers as a file holds them in; a frame out: without common factor, dark signal and uneven response, one plane of a
+mosaic, turned and cropped.
+
+What is saturated in a file stays so: such pixels, and those that turning makes of them, have the end of the scale that
+:attr:`Preparer.digital` states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import BGGR, Preparation, Wanted, image_files, planes_of
+from mitsim.core.images import Numbers, orient, read_images
+from mitsim.core.manifests import Digital
+
+LEAST_RESPONSE = 0.1
+"""Of a pixel to even light, over the mean one, below which it is not corrected: it is defective or dark, and what
+divides it would multiply its noise by ten."""
+PLAIN = 16
+"""Numbers that differ, from which a common factor is no chance: of so many whole numbers all are even once in 2^16
+times."""
+_EDGE = 1e-9
+"""Pixels beyond the last one that rounding of a sine and cosine leaves."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preparer:
+    """Makes frames of files' numbers.
+
+    Attributes
+    ----------
+    how
+        what is done.
+    digital
+        how digital numbers of the frames become electrons a second.
+    end
+        of the files' numbers, from which they are saturated; None: not known.
+    dark
+        (rows, columns) mean number without light; None: that which ``digital`` states.
+    response
+        (rows, columns) of each pixel over the mean one's; None: all are alike.
+    unlit
+        pixels whose response is below :data:`LEAST_RESPONSE`, and is not corrected.
+    """
+
+    how: Preparation
+    digital: Digital
+    end: float | None = None
+    dark: FloatArray | None = None
+    response: FloatArray | None = None
+    unlit: int = 0
+
+    @classmethod
+    def of(
+        cls, how: Preparation, digital: Digital, wanted: Wanted, base: Path = Path(), end: float | None = None
+    ) -> Preparer:
+        """With the dark and flat frames of ``how``.
+
+        Parameters
+        ----------
+        how
+            what is done; of one plane.
+        digital
+            how numbers become electrons a second, before any is corrected.
+        wanted
+            how files are read.
+        base
+            folder that paths begin in.
+        end
+            of the numbers; None: as ``digital`` says.
+
+        Raises
+        ------
+        MitsimError
+            for dark or flat frames that cannot be read, are of several sizes, or without light.
+        """
+        end = digital.saturation_dn if end is None else end
+        plain = cls(how, digital, end)
+        dark = None if how.dark is None else plain.mean(base / how.dark, wanted)
+        if how.flat is None:
+            return plain if dark is None else plain.with_correction(dark, None, 0)
+        under = dark if how.flat_dark is None else plain.mean(base / how.flat_dark, wanted)
+        flat = plain.mean(base / how.flat, wanted)
+        for name, other in (("dark", dark), ("flat_dark", under)):
+            if other is not None and other.shape != flat.shape:
+                raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
+        light = flat - (plain.level if under is None else under)
+        whole = plain.plane(light)
+        if not whole.mean() > 0:
+            raise MitsimError(f"{base / how.flat}: has no more light than its dark frames; give a lit one")
+        response = light / whole.mean()
+        unlit = plain.plane(response) < LEAST_RESPONSE
+        return plain.with_correction(dark, np.where(response < LEAST_RESPONSE, 1.0, response), int(unlit.sum()))
+
+    def with_correction(self, dark: FloatArray | None, response: FloatArray | None, unlit: int) -> Preparer:
+        """The same with dark and flat frames.
+
+        Parameters
+        ----------
+        dark, response, unlit
+            as the class has them.
+        """
+        digital = self.digital
+        if self.end is not None:
+            top = (self.end - (self.level if dark is None else dark)) / (1.0 if response is None else response)
+            digital = digital.model_copy(update={"saturation_dn": float(np.max(top)) + self.level})
+        return Preparer(self.how, digital, self.end, dark, response, unlit)
+
+    @property
+    def level(self) -> float:
+        """Digital number without light that is stated: corrected frames have it, too."""
+        stated = self.digital
+        return stated.black_level_dn + stated.dark_current_e_per_s * stated.exposure_s * stated.gain_dn_per_e
+
+    @property
+    def counts(self) -> bool:
+        """Whether frames hold the numbers of the files, and nothing between."""
+        return self.dark is None and self.response is None and not self.how.turn_deg
+
+    def plane(self, values: Numbers) -> Numbers:
+        """The part of ``values`` (rows, columns) that is of the channel."""
+        if self.how.channel is None:
+            return values
+        row, column = planes_of(self.how.mosaic or BGGR)[self.how.channel]
+        return values[row::2, column::2]
+
+    def mean(self, source: Path, wanted: Wanted) -> FloatArray:
+        """Mean of all frames in ``source``, a file or folder read as ``wanted``, as they are stored but for the common
+        factor. MitsimError where one cannot be read, or is of another size."""
+        total, count = np.zeros(()), 0
+        for path in image_files(source, wanted):
+            for values in read_images(path, wanted):
+                if count and values.shape != total.shape:
+                    raise MitsimError(f"{path}: is {_size(values)}, but others are {_size(total)}; give one size")
+                total, count = total + values / (self.how.divide_by or 1), count + 1
+        return np.asarray(total / count, dtype=np.float64)
+
+    def frame(self, path: Path, values: Numbers, mean: bool = False) -> Numbers:
+        """The frame of a file's ``values`` (rows, columns): of their type, or of single precision where they are
+        corrected or turned.
+
+        Parameters
+        ----------
+        path
+            of the file, for messages.
+        values
+            as they are stored.
+        mean
+            whether they are a mean of frames, which need not be multiples of the factor.
+
+        Raises
+        ------
+        MitsimError
+            for values that the factor does not divide, of another size than dark and flat frames, or smaller than the
+            part that is to be taken; and where turning would need pixels beyond the picture.
+        """
+        values = values / (self.how.divide_by or 1) if mean else self._divide(path, values)
+        if self.counts:
+            return np.ascontiguousarray(self._crop(path, self._orient(self.plane(values))))
+        full = None if self.end is None else values >= self.end
+        for name, other in (("dark", self.dark), ("flat", self.response)):
+            if other is not None and other.shape != values.shape:
+                raise MitsimError(f"{path}: is {_size(values)}, but {name} frames {_size(other)}; give one size")
+        light = values.astype(np.float64)
+        if self.dark is not None or self.response is not None:
+            light -= self.level if self.dark is None else self.dark
+            light /= 1.0 if self.response is None else self.response
+            light += self.level
+        light = self._place(path, light)
+        if full is not None and full.any():
+            light[self._place(path, full.astype(np.float64)) > 0] = self.digital.saturation_dn
+        return light.astype(np.float32)
+
+    def _divide(self, path: Path, values: Numbers) -> Numbers:
+        factor = self.how.divide_by or 1
+        if factor == 1:
+            return values
+        if (values % factor).any():
+            raise MitsimError(f"{path}: holds numbers that are no multiples of {factor}; correct divide_by")
+        return values // factor
+
+    def _orient(self, values: Numbers) -> Numbers:
+        return orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
+
+    def _place(self, path: Path, values: FloatArray) -> FloatArray:
+        """The plane of ``values``, oriented, turned and cropped."""
+        values = self._orient(self.plane(values))
+        if not self.how.turn_deg:
+            return self._crop(path, values)
+        from scipy.ndimage import affine_transform  # here: most frames are not turned
+
+        angle = math.radians(self.how.turn_deg)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        matrix = np.array([[cosine, sine], [-sine, cosine]])
+        pivot = (np.array(values.shape) - 1) / 2 if self.how.turn_about == "centre" else np.zeros(2)
+        offset = pivot - matrix @ pivot
+        self._check_turn(path, values.shape, matrix, offset)
+        turned = affine_transform(values, matrix, offset, order=1, mode="nearest")
+        return self._crop(path, turned)
+
+    def _check_turn(self, path: Path, shape: tuple[int, ...], matrix: FloatArray, offset: FloatArray) -> None:
+        """MitsimError where a turned picture's part would need pixels beyond it."""
+        last = np.array(shape) - 1
+        first, end = _part(path, shape, self.how)
+        corners = np.array([[row, column] for row in (first[0], end[0] - 1) for column in (first[1], end[1] - 1)])
+        seen = corners @ matrix.T + offset
+        if (seen >= -_EDGE).all() and (seen <= last + _EDGE).all():
+            return
+        whole = np.array([[row, column] for row in (0, last[0]) for column in (0, last[1])])
+        margin = np.ceil(np.abs(whole @ matrix.T + offset - whole).max(axis=0) - _EDGE).astype(int)
+        rows, columns = np.array(shape) - 2 * margin
+        inside = f", such as {margin[0]},{margin[1]},{rows},{columns}" if min(rows, columns) > 0 else ""
+        raise MitsimError(
+            f"{path}: turned by {self.how.turn_deg:g} degrees about its {self.how.turn_about}, a part of it lies "
+            f"beyond its {shape[0]}x{shape[1]} pixels; give a smaller crop{inside}"
+        )
+
+    def _crop(self, path: Path, values: Numbers) -> Numbers:
+        (row, column), (last_row, last_column) = _part(path, values.shape, self.how)
+        return values[row:last_row, column:last_column]
+
+
+def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First row and column of the part of a picture of a ``shape`` that is taken, and the ones behind its last."""
+    crop = how.crop
+    if crop is None:
+        return (0, 0), (shape[0], shape[1])
+    end = crop.row + (crop.rows or shape[0] - crop.row), crop.column + (crop.columns or shape[1] - crop.column)
+    if not (crop.row < end[0] <= shape[0] and crop.column < end[1] <= shape[1]):
+        kind = "its plane" if how.channel else "it"
+        raise MitsimError(
+            f"{path}: {kind} is {shape[0]}x{shape[1]}, and crop takes rows {crop.row} to {end[0] - 1} and columns "
+            f"{crop.column} to {end[1] - 1}; correct the crop"
+        )
+    return (crop.row, crop.column), end
+
+
+def factor_of(values: Numbers, known: int = 0) -> int:
+    """Largest whole number that divides all of the ``values`` and the ``known`` one; 0 of zeros alone."""
+    if values.dtype.kind not in "ui" and not np.array_equal(values, np.rint(values)):
+        return 1
+    found = known
+    for row in values:  # of noisy numbers the first row tells
+        found = int(np.gcd.reduce(np.append(row.astype(np.int64), found)))
+        if found == 1:
+            break
+    return found
+
+
+def _size(values: npt.NDArray[np.generic]) -> str:
+    return "x".join(map(str, values.shape))

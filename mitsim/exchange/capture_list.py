@@ -1,0 +1,248 @@
+"""What a person knows of a real camera's frames, in a list or on the command line: checked before any is opened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from mitsim.core.configuration import Configuration, locate, read_toml, validate
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.files import check_plain, read_json
+from mitsim.core.imagelist import ALL, Preparation, Raw, Wanted, image_files
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
+from mitsim.core.seeds import check_root
+from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
+from mitsim.devices.framelist import Identity
+from mitsim.devices.patterns import read_name
+from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
+
+_OTHERS = {
+    "full_well_e": "a camera's file; give it to --camera, and the list of a capture to --list",
+    "signed_capture": "the list of a calibration's frames; `mitsim calibrate --frames` reads it, in their folder",
+}
+"""What other files are, by a field that each of them has."""
+TURNED = "turn_deg"
+"""Of a calibration's configuration: angle by which its frames are turned, as `turn_deg` of a list."""
+
+
+class CaptureList(Configuration):
+    """What a real capture is of, and how its files become frames. Options of `mitsim import` take the place of what it
+    says."""
+
+    camera: Identity | None = None
+    """Identity that a calibration must share: a name, or anything as a run's manifest has it; none: by --camera or
+    --calibration."""
+    digital: Digital | None = None
+    """How digital numbers become electrons a second, as in a run's manifest; none: by --camera and --exposure."""
+    bits: int | None = Field(default=None, ge=1, le=32)
+    """Of a number of the camera, which counts whole ones; none: its numbers are real, or the camera file says it."""
+    patterns: str | None = None
+    """Name of the family, or patterns.json of `mitsim export --format png`, a path from the list's folder."""
+    n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
+    """Scene pixels a side, without a calibration."""
+    seed: int = Field(default=0, ge=0, lt=2**64)
+    """Of patterns of a `random` family."""
+    ambient: str | None = None
+    """Frame with the projector off, or a folder of such; a path from the list's folder."""
+    ambient_shots: int | None = Field(default=None, ge=1)
+    """Shots that a single such frame is the mean of."""
+    raw: Raw | None = None
+    """How files without a header are read; none: there are none."""
+    centre: bool | None = None
+    """Whether calibrations of these frames take row and column means off (FlatCam masks); none: they say it."""
+    prepare: Preparation = Preparation()
+    """Table: what is done to the files' numbers before they are frames."""
+    source: str | None = None
+    """Where all this is known from."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> CaptureList:
+        if self.digital is not None and self.camera is None:
+            raise ValueError("digital is of a camera; give camera, its name, too")
+        if self.bits is not None and self.digital is None:
+            raise ValueError("bits are of digital's numbers; give digital too, or leave both to --camera")
+        if self.ambient_shots is not None and self.ambient is None:
+            raise ValueError("ambient_shots are of an ambient frame; give ambient too")
+        return self
+
+
+def load_capture_list(name: Path | str) -> tuple[CaptureList, Path]:
+    """The list of a ``name``, shipped, or in a TOML or JSON file; and the folder that paths in it begin in.
+
+    MitsimError when there is none, or it breaks a rule.
+    """
+    path = locate(name, "calibration", ".toml")
+    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
+    if not isinstance(data, dict):
+        raise MitsimError(f"list {path}: holds a {type(data).__name__}; give a table of names and values")
+    for name_of_field, kind in _OTHERS.items():
+        if name_of_field in data:
+            raise MitsimError(f"list {path}: is {kind}")
+    return validate(CaptureList, data, f"list {path}"), path.parent
+
+
+@dataclass(frozen=True)
+class Electronics:
+    """A camera as its numbers tell it.
+
+    Attributes
+    ----------
+    name
+        for messages.
+    identity
+        that a calibration must share.
+    digital
+        how its numbers become electrons a second.
+    largest
+        number that it counts to; None: its numbers are real.
+    stated
+        what a manifest's configuration says of it.
+    """
+
+    name: str
+    identity: dict[str, Any]
+    digital: Digital
+    largest: int | None
+    stated: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RealCapture:
+    """What a person knows of a real capture.
+
+    Attributes
+    ----------
+    patterns
+        name of the family, or `patterns.json` of `mitsim export --format png`.
+    camera
+        electronics: name of a shipped file, or a TOML file; None: as ``listed`` says.
+    exposure_s
+        of every frame [s]; None: as ``listed`` says.
+    calibration
+        CAL folder of the same camera, which tells its identity and the projector's pixels; of all planes a coloured
+        one.
+    n
+        projector pixels a side, without a calibration.
+    black_level_dn
+        digital number of a (binned) pixel without charge, where it is another than the camera's.
+    ambient
+        frame, or folder of frames, with the projector off.
+    ambient_shots
+        that the single frame is the mean of.
+    raw
+        how files without a header are read.
+    seed
+        of patterns of a `random` family.
+    prepare
+        what is done to the files' numbers.
+    base
+        folder that paths of ``prepare`` begin in.
+    listed
+        list that says the rest.
+    """
+
+    patterns: str
+    camera: str | None
+    exposure_s: float | None
+    calibration: Path | None = None
+    n: int | None = None
+    black_level_dn: float | None = None
+    ambient: Path | None = None
+    ambient_shots: int | None = None
+    raw: Raw | None = None
+    seed: int = 0
+    prepare: Preparation = field(default_factory=Preparation)
+    base: Path = Path()
+    listed: CaptureList = field(default_factory=CaptureList)
+
+    @property
+    def wanted(self) -> Wanted:
+        """How its files are read."""
+        return Wanted.of(self.raw, self.prepare)
+
+    @property
+    def in_file(self) -> bool:
+        """Whether the patterns stand in a file."""
+        return Path(self.patterns).suffix == ".json"
+
+    @property
+    def colours(self) -> ColourManifest | None:
+        """All planes as lines of a coloured folder; None of a single plane, or a picture that is no mosaic."""
+        return lines_of_planes(RUN, self.prepare.wavelengths_nm) if self.prepare.channel == ALL else None
+
+    def electronics(self) -> tuple[Electronics, Preparation]:
+        """The camera, by its file or the list; and what is done to its numbers, with its mosaic.
+
+        MitsimError where neither says it, or a value cannot be.
+        """
+        prepare, listed = self.prepare, self.listed
+        if self.camera is not None:
+            if self.exposure_s is None:
+                raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
+            sensor = load_sensor(locate(self.camera, "calibration", ".toml"))
+            digital, name, largest = digital_of(sensor, check_exposure(self.exposure_s)), sensor.name, sensor.largest_dn
+            if prepare.mosaic is None and prepare.channel is not None and sensor.mosaic is not None:
+                prepare = prepare.model_copy(update={"mosaic": sensor.mosaic})
+            identity = {"name": name}
+            stated = {"sensor": sensor.model_dump(mode="json", exclude={"full_well_e"})}
+        elif listed.digital is not None and listed.camera is not None:
+            seconds = check_exposure(self.exposure_s or listed.digital.exposure_s)
+            identity = dict(listed.camera)
+            digital, name = (
+                listed.digital.model_copy(update={"exposure_s": seconds}),
+                str(identity.get("name", "named")),
+            )
+            largest = None if listed.bits is None else 2**listed.bits - 1
+            stated = {"sensor": {"name": name, "digital": listed.digital.model_dump(mode="json"), "bits": listed.bits}}
+        else:
+            raise ArgumentError("camera", "is not given, and frames do not say it; give it")
+        if self.black_level_dn is not None:
+            changed = {**digital.model_dump(), "black_level_dn": self.black_level_dn}
+            digital = validate(Digital, changed, "black_level")
+        return Electronics(name, identity, digital, largest, stated), prepare
+
+    def check(self, source: Path) -> None:
+        """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
+        check_root(self.seed)
+        if self.n is not None and self.n < 1:
+            raise ArgumentError("projector_pixels", f"{self.n}: give 1 or more, those a side")
+        if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
+            raise ArgumentError("ambient_shots", f"{self.ambient_shots}: give 1 or more, of an ambient frame")
+        self.electronics()
+        if self.calibration is not None:
+            self._check_calibration(self.calibration)
+        elif self.n is None:
+            raise ArgumentError(
+                "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
+            )
+        if self.in_file:
+            check_plain(self.patterns)
+        else:
+            read_name(self.patterns, self.n)
+        for name in ("dark", "flat", "flat_dark"):
+            if (path := getattr(self.prepare, name)) is not None:
+                image_files(self.base / path, self.wanted)
+        image_files(source, self.wanted)
+
+    def _check_calibration(self, folder: Path) -> None:
+        """MitsimError for a calibration that is none, of other lines, or that keeps means which the list takes off."""
+        colours = self.colours
+        if colours is not None:
+            read_colours(folder, CALIBRATION)
+            check_lines(colours, "channel all", folder)
+        for line in ("",) if colours is None else colours.names:
+            manifest, asked = read_manifest(folder / line, CalibrationManifest), self.listed.centre
+            if asked is not None and manifest.centre != asked:
+                raise MitsimError(
+                    f"calibration {folder / line}: its centre is {str(manifest.centre).lower()}, and the list's "
+                    f"{str(asked).lower()}: it takes other means off frames; calibrate as the list says, or correct it"
+                )
+            turned = manifest.configuration.get(TURNED, self.prepare.turn_deg)
+            if turned != self.prepare.turn_deg:
+                raise MitsimError(
+                    f"calibration {folder / line}: is of frames turned by {turned} degrees, not by "
+                    f"{self.prepare.turn_deg:g}; give --turn {turned}"
+                )
