@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, FailFast, model_validator
+from pydantic import FailFast, Field, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, read_toml, validate
+from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain, read_json
 from mitsim.core.manifests import RunManifest, read_manifest
@@ -22,11 +22,8 @@ MOST_CAPTURES = 4096
 MOST_TERMS = 4
 """Codes of a side: a normal matrix of that many times their numbers is inverted."""
 Colour = Literal["red", "green", "blue"]
-Orientation = Literal[
-    "upright", "mirrored", "upside down", "turned", "transposed", "transposed, mirrored", "transposed, upside down",
-    "transposed, turned",
-]  # fmt: skip
-"""How a picture is transposed, then turned upside down or mirrored, or both, to lie as the camera's code runs."""
+Orientation = Literal["upright", "mirrored", "upside down", "turned"]
+"""How a picture lies as the camera's code runs; turned is both others."""
 Scale = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
 
 
@@ -56,8 +53,6 @@ class KnownList(Configuration):
     terms: int | None = Field(default=None, ge=1, le=MOST_TERMS)
     """Codes of a side: 1, all directions are alike; more, the code changes smoothly over the scene; none: by frames that
     are held out."""
-    smoothness: Positive | None = None
-    """Weight of the codes' second differences; none: by frames that are held out."""
     board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance that counts as 1 in pictures and images; none: unknown."""
     known: Annotated[tuple[KnownCapture, ...], FailFast()] = Field(strict=False, min_length=1, max_length=MOST_CAPTURES)

@@ -1,18 +1,19 @@
 """Pictures that a camera saw and its frames of them in; the two factors, each side a code seen through shifts, out.
 
-A mask before a sensor casts the same shadow from every direction, shifted. Where it fills the view, or ends within it,
-a side's factor is one unknown code c on a grid of sensor pixels, seen from scene pixel i through a shift::
+A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on a
+grid of sensor pixels, seen from scene pixel i through a shift::
 
     Phi[u, i] = sum_k b_k(i) c_k(u + o + s i)
 
-with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a Bayer
-sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. One term is the camera whose directions are
-alike; more terms let the code change smoothly over the scene: each side free, but smooth.
+with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a
+Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. One term: all directions are alike.
+More terms: the code changes smoothly over the scene, as by falloff, a lens or a mask of some thickness.
 
-*Given one side, the other is linear.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes: least
-squares whose normal matrix is the same (w, w) block, added up along the diagonal. Left and right take turns until the
-residual stands still. Codes have the prior of a smooth curve, lambda |c''|^2; the residual's noise over what lambda
-makes of it is the covariance, of posterior errors, that is stated.
+*Given one side, the other is linear.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes:
+least squares, whose normal matrix N is one block, added up along the diagonal. Left and right take turns until what is
+left stands still. A code's numbers are taken for independent, of a variance 1 / alpha that frames themselves tell
+(MacKay 1992, Neural Computation 4, 415): alpha = gamma / |c|^2, gamma = tr N (N + alpha)^-1 being the numbers that
+frames tell. What they do not tell stays near zero, and (N + alpha)^-1 is the covariance of the rest.
 
 *Where to begin.* By the convolution theorem a frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the
 sensor's edges: Y over X is a product of two vectors, and how nearly it is one tells orientation and scale of the scene.
@@ -20,11 +21,12 @@ sensor's edges: Y over X is a product of two vectors, and how nearly it is one t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
@@ -33,22 +35,6 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.solver import centre_columns, centre_frame
-
-Orientation = tuple[bool, bool, bool]
-"""Whether a picture is transposed, then turned upside down, then mirrored, to lie as the camera's code runs."""
-ORIENTATIONS: tuple[Orientation, ...] = tuple(
-    (transposed, upside, mirrored)
-    for transposed in (False, True)
-    for upside in (False, True)
-    for mirrored in (False, True)
-)
-
-
-def turn(picture: FloatArray, orientation: Orientation) -> FloatArray:
-    """A ``picture`` (n, n') as it lies in an ``orientation``."""
-    transposed, upside, mirrored = orientation
-    turned = picture.T if transposed else picture
-    return np.ascontiguousarray(turned[:: -1 if upside else 1, :: -1 if mirrored else 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +46,7 @@ class Exposure:
     scene
         (n, n') picture, times its pattern.
     frame
-        (m, m') measurement [electrons/s].
+        (m, m') measurement [electrons/s], centred where the camera's factors are.
     group
         picture that it is of: frames of one picture are held out together.
     plane
@@ -75,6 +61,23 @@ class Exposure:
     plane: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
+    def turned(self, orientation: str) -> Exposure:
+        """The same with its scene as it lies in an ``orientation``."""
+        return replace(self, scene=TURNS[orientation](self.scene))
+
+
+TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "upright": lambda scene: scene,
+    "mirrored": lambda scene: scene[:, ::-1],
+    "upside down": lambda scene: scene[::-1],
+    "turned": lambda scene: scene[::-1, ::-1],
+    "transposed": lambda scene: scene.T,
+    "transposed, mirrored": lambda scene: scene.T[:, ::-1],
+    "transposed, upside down": lambda scene: scene.T[::-1],
+    "transposed, turned": lambda scene: scene.T[::-1, ::-1],
+}
+"""How a picture lies as the camera's code runs, by the orientations of a list."""
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -86,15 +89,12 @@ class Shape:
         s of rows and of columns [sensor pixels / scene pixel].
     terms
         number of codes a side.
-    smoothness
-        lambda of the codes' second differences, over the mean of the normal matrix' diagonal.
     centre
-        whether frames lose row and column means.
+        whether factors lose their columns' means, as frames do.
     """
 
     scales: tuple[float, float]
     terms: int = 1
-    smoothness: float = 1e-2
     centre: bool = False
 
 
@@ -102,8 +102,9 @@ class Shape:
 
 
 @dataclass(frozen=True, eq=False)
-class _Side:
-    """One side's geometry: ``sensor`` pixels, ``scene`` pixels, ``scale``, and largest ``offset``."""
+class Side:
+    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, largest ``offset`` of a frame, ``terms``, and whether
+    it loses the means of its columns."""
 
     sensor: int
     scene: int
@@ -126,7 +127,9 @@ class _Side:
     def weights(self) -> FloatArray:
         """(terms, n) b_k, of mean square 1."""
         place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
-        return np.stack([np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)])
+        return np.stack(
+            [np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)]
+        )
 
     def hats(self, offset: float) -> FloatArray:
         """(n, width) what each scene pixel takes of its window, by linear interpolation."""
@@ -172,12 +175,6 @@ class _Side:
             flat -= every.T @ (gram @ every) / self.sensor
         return flat, right.ravel()
 
-    @cached_property
-    def curvature(self) -> FloatArray:
-        """(terms length, terms length) sum of the squared second differences of the codes."""
-        second = np.diff(np.eye(self.length), 2, axis=0)
-        return np.kron(np.eye(self.terms), second.T @ second)
-
 
 # ---- Both sides ----
 
@@ -188,150 +185,189 @@ class Codes:
 
     Attributes
     ----------
-    shape
-        what was fixed.
-    left, right
-        (terms, length) codes of rows and of columns.
+    sides
+        geometry of rows and of columns.
+    codes
+        (terms, length) of either.
     gains
         of each plane.
     variances
         (exposures,) mean square of what is left of each frame.
     explained
-        part of all frames' energy that the fit explains, each frame in units of its noise.
+        mean over the frames of the part of their energy that the fit explains.
     errors
-        standard deviation of a number of the left and of the right factor, rms; gains 1.
+        standard deviation of a number of the left and of the right factor, rms, what no frame tells included; gains 1.
+    seen_errors
+        that of independent errors that change frames of these scenes as much as the factors' do.
     told
-        numbers of each side's codes that the frames tell, of all: trace of N (N + lambda E)^-1.
+        numbers of each side's codes that the frames tell.
     """
 
-    shape: Shape
-    left: FloatArray
-    right: FloatArray
+    sides: tuple[Side, Side]
+    codes: tuple[FloatArray, FloatArray]
     gains: dict[str, float]
     variances: FloatArray
     explained: float
-    errors: tuple[float, float] = (0.0, 0.0)
-    told: tuple[float, float] = (0.0, 0.0)
-    size: tuple[int, int, int, int] = (0, 0, 0, 0)
-    offsets: tuple[float, float] = (0.0, 0.0)
+    errors: tuple[float, float]
+    seen_errors: tuple[float, float]
+    told: tuple[float, float]
 
-    @property
-    def sides(self) -> tuple[_Side, _Side]:
-        """Geometry of both."""
-        return _sides(self.shape, self.size, self.offsets)
-
-    def factors(self, offset: tuple[float, float], plane: str = "") -> tuple[FloatArray, FloatArray]:
-        """Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at ``offset``."""
-        root = np.sqrt(abs(self.gains[plane]))
-        signs = np.sign(self.gains[plane]), 1.0
+    def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
+        """Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
+        gain = self.gains[plane]
         left, right = (
-            side.factor(codes, place) * root * sign
-            for side, codes, place, sign in zip(self.sides, (self.left, self.right), offset, signs, strict=True)
+            side.factor(codes, place) * np.sqrt(abs(gain))
+            for side, codes, place in zip(self.sides, self.codes, offset, strict=True)
         )
-        return left, right
+        return np.sign(gain) * left, right
+
+    def explains(self, exposures: Sequence[Exposure]) -> float:
+        """Mean part of the energy of frames that the codes, fitted to others, explain."""
+        parts = []
+        for each in exposures:
+            left, right = self.factors(each.offset, each.plane)
+            misfit = each.frame - left @ each.scene @ right.T
+            parts.append(1 - float(np.sum(np.square(misfit)) / np.sum(np.square(each.frame))))
+        return float(np.mean(parts))
 
 
-def _sides(shape: Shape, size: tuple[int, int, int, int], offsets: tuple[float, float]) -> tuple[_Side, _Side]:
-    left, right = (
-        _Side(sensor, scene, scale, offset, shape.terms, shape.centre)
-        for sensor, scene, scale, offset in zip(size[:2], size[2:], shape.scales, offsets, strict=True)
-    )
-    return left, right
-
-
-_TURNS, _STILL = 12, 1e-4
-"""Times that the sides take turns at most, and gain of the explained part at which they have ended."""
+_TURNS, _STILL = 20, 1e-5
+"""Times that the sides take turns at most, and gain of the explained part at which they have ended: frames of no more
+than a million numbers tell no smaller one."""
+_VAGUE = 1e-3
+"""First guess of alpha, over the mean of N's diagonal; a few turns find the right one from there."""
 
 
 @single_threaded_blas()
-def fit_codes(exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS) -> Codes:
+def fit_codes(
+    exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
+) -> Codes:
     """Codes of both sides.
 
     Parameters
     ----------
     exposures
-        scenes turned as the code runs, frames centred where the ``shape`` says so.
+        scenes turned as the code runs.
     shape
         what is fixed.
     start
-        (length,) code of columns to begin with, in pixels of the sensor; None: that of the spectra.
+        (any,) code of columns to begin with; None: that of the spectra.
     turns
         that sides take at most.
+
+    Raises
+    ------
+    MitsimError
+        for frames or scenes without light.
     """
-    size = (*exposures[0].frame.shape, *exposures[0].scene.shape)
-    offsets = max(each.offset[0] for each in exposures), max(each.offset[1] for each in exposures)
-    sides = _sides(shape, size, offsets)
-    codes = [np.zeros((shape.terms, side.length)) for side in sides]
+    sides = _sides(exposures, shape)
     first = spectral_start(exposures, shape.scales)[1] if start is None else start
+    codes = [np.zeros((shape.terms, side.length)) for side in sides]
     codes[1][0] = np.interp(np.arange(sides[1].length), np.arange(len(first)), first)
     gains = dict.fromkeys((each.plane for each in exposures), 1.0)
     energies = np.array([np.mean(np.square(each.frame)) for each in exposures])
     if not (energies > 0).all():
-        raise MitsimError(f"frame {int(np.argmin(energies))} of the known pictures is zero everywhere")
-    variances, explained, before = energies.copy(), 0.0, -1.0
-    inverses: list[tuple[FloatArray, FloatArray]] = []
+        raise MitsimError("known pictures: a frame is even, and tells nothing of the camera; leave it out")
+    variances, explained = energies.copy(), -1.0
+    known: list[_Known] = [_Known.vague(side) for side in sides]
     for _ in range(turns):
-        inverses = []
         for axis in (0, 1):
-            codes[axis], inverse = _solve_side(exposures, sides, axis, codes[1 - axis], gains, variances, shape)
-            inverses.append(inverse)
+            codes[axis], known[axis] = _solve_side(
+                exposures, sides, axis, codes[1 - axis], gains, variances, known[axis]
+            )
         gains, variances = _levels(exposures, sides, codes, gains)
-        explained = 1 - float(np.mean(variances / energies))
+        before, explained = explained, 1 - float(np.mean(variances / energies))
         if explained - before < _STILL:
             break
-        before = explained
-    balance = np.sqrt(np.linalg.norm(codes[1]) / np.linalg.norm(codes[0]))
-    codes = [codes[0] * balance, codes[1] / balance]
-    spread = [_spread(side, inverse[0]) for side, inverse in zip(sides, inverses, strict=True)]
+    balance = float(np.sqrt(np.linalg.norm(codes[1]) / np.linalg.norm(codes[0])))
+    scales = balance, 1 / balance
+    spread = [_spread(side, each.covariance) for side, each in zip(sides, known, strict=True)]
     return Codes(
-        shape,
-        codes[0],
-        codes[1],
+        sides,
+        (codes[0] * balance, codes[1] / balance),
         gains,
         variances,
         explained,
-        (spread[0] * balance, spread[1] / balance),
-        (float(inverses[0][1]), float(inverses[1][1])),
-        size,
-        offsets,
+        (spread[0] * scales[0], spread[1] * scales[1]),
+        (known[0].seen * scales[0], known[1].seen * scales[1]),
+        (known[0].told, known[1].told),
     )
+
+
+def _sides(exposures: Sequence[Exposure], shape: Shape) -> tuple[Side, Side]:
+    left, right = (
+        Side(sensor, scene, scale, max(each.offset[axis] for each in exposures), shape.terms, shape.centre)
+        for axis, (sensor, scene, scale) in enumerate(
+            zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
+        )
+    )
+    return left, right
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What frames tell of a side's codes: ``alphas`` of the terms, 0 where they are not known yet, ``covariance`` of
+    all numbers, how many are ``told``, and error of a factor's number ``seen`` in frames of these scenes."""
+
+    alphas: FloatArray
+    covariance: FloatArray
+    told: float = 0.0
+    seen: float = 0.0
+
+    @classmethod
+    def vague(cls, side: Side) -> _Known:
+        """Nothing yet."""
+        return cls(np.zeros(side.terms), np.zeros((0, 0)))
 
 
 def _solve_side(
     exposures: Sequence[Exposure],
-    sides: tuple[_Side, _Side],
+    sides: tuple[Side, Side],
     axis: int,
     other: FloatArray,
     gains: dict[str, float],
     variances: FloatArray,
-    shape: Shape,
-) -> tuple[FloatArray, tuple[FloatArray, float]]:
-    """Codes of the side ``axis`` given the ``other``'s; their covariance, and how many of their numbers frames tell."""
+    before: _Known,
+) -> tuple[FloatArray, _Known]:
+    """Codes of the side ``axis`` given the ``other``'s, and what is known of them."""
     own, across = sides[axis], sides[1 - axis]
     phis = {place: across.factor(other, place) for place in {each.offset[1 - axis] for each in exposures}}
-    sums: dict[float, tuple[FloatArray, FloatArray]] = {}
+    sums: dict[float, list[FloatArray]] = {}
     for each, variance in zip(exposures, variances, strict=True):
         scene, frame = (each.scene, each.frame) if axis == 0 else (each.scene.T, each.frame.T)
         light = gains[each.plane] * (scene @ phis[each.offset[1 - axis]].T)
-        gram, product = light @ light.T / variance, frame @ light.T / variance
-        one = sums.get(each.offset[axis])
-        sums[each.offset[axis]] = (gram, product) if one is None else (one[0] + gram, one[1] + product)
-    matrix, right = (sum(parts) for parts in zip(*(own.normal(place, *one) for place, one in sums.items()), strict=True))
-    scale = float(np.trace(matrix)) / len(matrix)
-    if not scale > 0:
-        raise MitsimError("known pictures: are black, or even where frames are centred, and tell nothing of the camera")
-    penalised = matrix + scale * (shape.smoothness * own.curvature + _RIDGE * np.eye(len(matrix)))
-    factored = cho_factor(penalised)
-    inverse = cho_solve(factored, np.eye(len(matrix)))
-    return cho_solve(factored, right).reshape(shape.terms, -1), (inverse, float(np.sum(inverse * matrix)))
+        added = [light @ light.T / variance, frame @ light.T / variance]
+        place = each.offset[axis]
+        sums[place] = [a + b for a, b in zip(sums[place], added, strict=True)] if place in sums else added
+    matrix: FloatArray = np.zeros((own.terms * own.length,) * 2)
+    right: FloatArray = np.zeros(len(matrix))
+    for place, (gram, product) in sums.items():
+        parts = own.normal(place, gram, product)
+        matrix += parts[0]
+        right += parts[1]
+    level = float(np.trace(matrix)) / len(matrix)
+    if not level > 0:
+        raise MitsimError("known pictures: have no light, or an even one, and tell nothing of the camera; give others")
+    alphas = np.where(before.alphas > 0, before.alphas, _VAGUE * level)
+    factored = cho_factor(matrix + np.diag(np.repeat(alphas, own.length)))
+    found = cho_solve(factored, right).reshape(own.terms, -1)
+    covariance = cho_solve(factored, np.eye(len(matrix)))
+    unknown = alphas * np.diag(covariance).reshape(own.terms, -1).sum(axis=1)
+    told = np.maximum(own.length - unknown, 0.0)
+    # Codes that explain nothing would make alpha infinite, and the matrix singular to rounding.
+    energies = np.maximum(np.square(found).sum(axis=1), told / (_LARGEST * level))
+    alphas = np.clip(told / np.maximum(energies, 1e-300), _SMALLEST * level, _LARGEST * level)
+    lit = sum(float(np.trace(gram)) for gram, _ in sums.values())
+    return found, _Known(alphas, covariance, float(told.sum()), float(np.sqrt(told.sum() / (own.sensor * lit))))
 
 
-_RIDGE = 1e-7
-"""Of the normal matrix' mean diagonal: what no frame tells is zero, and the matrix is regular in double precision."""
+_SMALLEST, _LARGEST = 1e-9, 1e6
+"""Of alpha over the mean of N's diagonal: below, double precision does not tell N + alpha from N; beyond, codes are as
+good as zero."""
 
 
 def _levels(
-    exposures: Sequence[Exposure], sides: tuple[_Side, _Side], codes: list[FloatArray], gains: dict[str, float]
+    exposures: Sequence[Exposure], sides: tuple[Side, Side], codes: list[FloatArray], gains: dict[str, float]
 ) -> tuple[dict[str, float], FloatArray]:
     """Gains of the planes, by least squares, and mean squares of what is left of each frame."""
     phis = [
@@ -344,11 +380,14 @@ def _levels(
         above[each.plane] += float(np.vdot(model, each.frame))
         below[each.plane] += float(np.vdot(model, model))
     gains = {name: above[name] / below[name] for name in gains}
-    left = [np.mean(np.square(each.frame - gains[each.plane] * model)) for each, model in zip(exposures, models, strict=True)]
+    left = [
+        np.mean(np.square(each.frame - gains[each.plane] * model))
+        for each, model in zip(exposures, models, strict=True)
+    ]
     return gains, np.asarray(left)
 
 
-def _spread(side: _Side, covariance: FloatArray) -> float:
+def _spread(side: Side, covariance: FloatArray) -> float:
     """Standard deviation of a number of the factor, rms, by the ``covariance`` of the codes."""
     hats = side.hats(0.0)
     k, w = side.terms, side.width
@@ -363,41 +402,238 @@ def _spread(side: _Side, covariance: FloatArray) -> float:
 
 # ---- The start: orientation, scale and codes by spectra ----
 
-_FREQUENCIES = 64
-"""Of either sign, lowest first, whose spectra are compared."""
+_FREQUENCIES = 32
+"""Of either sign, lowest first, whose spectra are compared: most light of a picture is there."""
+_COMPARED = 4
+"""Frames of those given whose spectra are compared."""
+_STEP = 1.1
+"""Of the scales that are looked at: what shifts the finest of these waves by half its length, where a shadow moves by a
+sixth of the sensor over the scene."""
+_WIDEST, _NARROWEST = 3.0, 0.03
+"""Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
+for: beyond, hardly two directions see the same part of a mask; below, a scene is a few pixels."""
+_TRIED = 3
+"""Orientations, those of the best spectra, that codes are fitted with, each at its best scale."""
+_FIRST_TURNS = 3
+"""Turns of the sides that tell how well they do."""
 
 
-def _waves(count: int, step: float, scale: float) -> FloatArray:
-    """(frequencies, count) exp(-2 pi i f x) at places ``scale`` x."""
-    frequencies = np.concatenate([np.arange(1, _FREQUENCIES + 1), -np.arange(1, _FREQUENCIES + 1)]) * step
-    return np.exp(-2j * np.pi * np.multiply.outer(frequencies, scale * np.arange(count)))
-
-
-def spectral_start(
-    exposures: Sequence[Exposure], scales: tuple[float, float]
-) -> tuple[float, FloatArray]:
+def spectral_start(exposures: Sequence[Exposure], scales: tuple[float, float]) -> tuple[float, FloatArray]:
     """How nearly a product of two vectors the frames' spectra over the scenes' are, 0 to 1, and the code of columns
     that follows (length,).
 
     Parameters
     ----------
     exposures
-        scenes turned as they may lie, frames centred.
+        scenes turned as they may lie.
     scales
         that may be right [sensor pixels / scene pixel].
     """
-    (rows, columns), scene = exposures[0].frame.shape, exposures[0].scene.shape
-    lengths = [sensor + scale * count for sensor, scale, count in zip((rows, columns), scales, scene, strict=True)]
-    above = below = 0.0
-    for each in exposures:
-        seen = _waves(rows, 1 / lengths[0], 1.0) @ each.frame @ _waves(columns, 1 / lengths[1], 1.0).T
-        lit = (
-            np.conj(_waves(scene[0], 1 / lengths[0], scales[0]))
-            @ each.scene
-            @ np.conj(_waves(scene[1], 1 / lengths[1], scales[1])).T
+    some = exposures[:: -(-len(exposures) // _COMPARED)]
+    return _Spectra.of(some).compare([each.scene for each in some], scales)
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectra:
+    """Spectra of some ``frames`` (waves, waves), at multiples of 1 / ``periods``."""
+
+    frames: list[npt.NDArray[np.complex128]]
+    periods: tuple[float, float]
+
+    @classmethod
+    def of(cls, exposures: Sequence[Exposure]) -> _Spectra:
+        """Those of all ``exposures``. Periods leave room for a shadow that moves by half the sensor."""
+        rows, columns = exposures[0].frame.shape
+        periods = 1.5 * rows, 1.5 * columns
+        waves = [_waves(count, period) for count, period in zip((rows, columns), periods, strict=True)]
+        return cls([waves[0] @ each.frame @ waves[1].T for each in exposures], periods)
+
+    def compare(self, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> tuple[float, FloatArray]:
+        """As :func:`spectral_start`."""
+        above, below = np.zeros_like(self.frames[0]), np.zeros(self.frames[0].shape)
+        left, right = (
+            np.conj(_waves(count, period / scale))
+            for count, period, scale in zip(scenes[0].shape, self.periods, scales, strict=True)
         )
-        above, below = above + seen * np.conj(lit), below + np.square(np.abs(lit))
-    ratio = above / np.sqrt(below**2 + below.mean() * below) 
-    _, values, right = np.linalg.svd(ratio)
-    code = right[0] @ np.conj(_waves(int(np.ceil(lengths[1])) + 2, 1 / lengths[1], 1.0))
-    return float(values[0] ** 2 / np.sum(np.square(values))), np.real(code)
+        for frame, scene in zip(self.frames, scenes, strict=True):
+            lit = left @ scene @ right.T
+            above += frame * np.conj(lit)
+            below += np.square(np.abs(lit))
+        # Between a quotient of spectra, which is noise where scenes have no light, and a product, which is no code's.
+        ratio = above / np.sqrt(below * (below + below.mean()) + np.finfo(np.float64).tiny)
+        _, values, code_waves = np.linalg.svd(ratio)
+        code = np.real(code_waves[0] @ np.conj(_waves(int(2 * self.periods[1]), self.periods[1])))
+        return float(values[0] ** 2 / max(np.sum(np.square(values)), np.finfo(np.float64).tiny)), code
+
+
+def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
+    """(waves, count) exp(-2 pi i f x / ``period``) at whole x; f = 0 is left out."""
+    order = np.arange(1, _FREQUENCIES + 1)
+    return np.asarray(
+        np.exp(-2j * np.pi / period * np.multiply.outer(np.concatenate([order, -order]), np.arange(count)))
+    )
+
+
+@dataclass(frozen=True)
+class Pose:
+    """How scenes lie before the camera.
+
+    Attributes
+    ----------
+    orientation
+        one of :data:`TURNS`.
+    scales
+        of rows and of columns [sensor pixels / scene pixel].
+    margin
+        by how much more of the frames' energy this explains than the best of another orientation; None: not compared.
+    """
+
+    orientation: str
+    scales: tuple[float, float]
+    margin: float | None = None
+
+
+@single_threaded_blas()
+def find_pose(
+    exposures: Sequence[Exposure],
+    centre: bool,
+    orientation: str | None = None,
+    scales: tuple[float, float] | None = None,
+) -> Pose:
+    """How scenes lie, by spectra and then by codes that are fitted.
+
+    Parameters
+    ----------
+    exposures
+        scenes as they are given.
+    centre
+        whether factors are centred.
+    orientation, scales
+        where they are known.
+    """
+    some = exposures[:: -(-len(exposures) // _COMPARED)]
+    spectra = _Spectra.of([replace(each, frame=centre_frame(each.frame)) for each in some])
+    scenes = {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
+    ratio = some[0].frame.shape[0] / some[0].scene.shape[0]
+    count = int(np.ceil(np.log(_WIDEST / _NARROWEST) / np.log(_STEP)))
+    places = [(ratio * _NARROWEST * _STEP**power,) * 2 for power in range(count + 1)] if scales is None else [scales]
+    scores = {name: np.array([spectra.compare(own, place)[0] for place in places]) for name, own in scenes.items()}
+    # Of a scale near 0 a frame is the product of two vectors whichever way the scene lies; the right way is one alone.
+    usual = np.median(list(scores.values()), axis=0)
+    found = [
+        (score - common, name, place)
+        for name, row in scores.items()
+        for score, common, place in zip(row, usual, places, strict=True)
+        if orientation in (None, name)
+    ]
+    candidates = {name: max(each for each in found if each[1] == name) for name in {name for _, name, _ in found}}
+    tried = []
+    for _, name, place in sorted(candidates.values(), reverse=True)[:_TRIED]:
+        turned = [each.turned(name) for each in some]
+        if scales is None:
+            place = _refine(lambda at, turned=turned: -spectra.compare([e.scene for e in turned], at)[0], place, _STEP)
+        fitted = fit_codes(turned, Shape(place, 1, centre), turns=_FIRST_TURNS)
+        tried.append((fitted.explained, name, place))
+    best = max(tried)
+    others = [explained for explained, name, _ in tried if name != best[1]]
+    pose = Pose(best[1], best[2], best[0] - max(others) if others else None)
+    if scales is not None:
+        return pose
+    turned = [each.turned(pose.orientation) for each in exposures]
+
+    def misfit(at: tuple[float, float]) -> float:
+        return -fit_codes(turned, Shape(at, 1, centre), turns=_FIRST_TURNS).explained
+
+    return replace(pose, scales=_refine(misfit, pose.scales, _FINE))
+
+
+_FINE = 1.015
+"""Part of a scale by which codes that are fitted may change it: a quarter of the spectra's step."""
+
+
+def _refine(
+    misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
+) -> tuple[float, float]:
+    """Scales of the least ``misfit``, each within a factor ``reach`` of the ``start``: rows, then columns."""
+    options = {"xatol": np.log(reach) * _TOLERANCE}
+    bounds = -np.log(reach), np.log(reach)
+    row = minimize_scalar(
+        lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
+    )
+    rows = start[0] * float(np.exp(row.x))
+    column = minimize_scalar(
+        lambda x: misfit((rows, start[1] * np.exp(x))), bounds=bounds, method="bounded", options=options
+    )
+    return rows, start[1] * float(np.exp(column.x))
+
+
+_TOLERANCE = 0.05
+"""Of a search for a scale, of its reach: 7e-4 of the scale, a tenth of a pixel of a shadow's way of 150."""
+
+
+# ---- How many codes: by frames that are held out ----
+
+_GAIN = 1e-3
+"""Of the energy of frames that were held out, by which more codes must explain more of it."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How many codes a side has, and how well they explain frames that were not fitted.
+
+    Attributes
+    ----------
+    terms
+        that were chosen.
+    held_out
+        mean part of the energy of held-out frames that each number of terms explained, from one on; empty where no
+        frame could be held out.
+    """
+
+    terms: int
+    held_out: tuple[float, ...] = ()
+
+
+def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choice:
+    """The number of codes, of at most ``most``.
+
+    Pictures are held out in two halves, of a single one its frames: their noise at least is not that of the others.
+
+    Parameters
+    ----------
+    exposures
+        scenes turned as the code runs.
+    shape
+        what is fixed; of one term.
+    most
+        terms that are tried.
+    """
+    groups = sorted({each.group for each in exposures})
+    if len(groups) > 1:
+        halves = [{group: index % 2 for index, group in enumerate(groups)}[each.group] for each in exposures]
+    else:
+        halves = [index % 2 for index in range(len(exposures))]
+    folds = [[each for each, half in zip(exposures, halves, strict=True) if half == own] for own in (0, 1)]
+    if not all(folds) or any({e.plane for e in folds[0]} != {e.plane for e in folds[1]} for _ in groups[1:]):
+        return Choice(shape.terms)
+    found: list[float] = []
+    for terms in range(1, most + 1):
+        tried = replace(shape, terms=terms)
+        parts = [_held_out(folds[own], folds[1 - own], tried) for own in (0, 1)]
+        found.append(float(np.mean(parts)))
+        if len(found) > 1 and found[-1] < found[-2] + _GAIN:
+            break
+    best = 1
+    while best < len(found) and found[best] > found[best - 1] + _GAIN:
+        best += 1
+    return Choice(best, tuple(found))
+
+
+def _held_out(kept: Sequence[Exposure], left_out: Sequence[Exposure], shape: Shape) -> float:
+    """Part of the energy of frames ``left_out`` that codes of those ``kept`` explain. Planes of the former that the
+    latter have none of have the gain that explains most."""
+    codes = fit_codes(kept, shape)
+    gains = codes.gains
+    for plane in {each.plane for each in left_out} - {*gains}:
+        gains = gains | {plane: float(np.mean([*codes.gains.values()]))}
+    return replace(codes, gains=gains).explains(left_out)
