@@ -299,7 +299,7 @@ def _calibrate_known(listed: Path, output: Path, limited: Limited) -> int:
         payload["planes"] = results
     rows, columns = first["scale"]
     lines = [
-        f"{first['frames']} frames of {first['pictures']} known pictures in {first['seconds']['total']:.1f} s: {output}",
+        f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {output}",
         f"pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
         "columns of pixels",
         *(

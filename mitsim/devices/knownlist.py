@@ -51,8 +51,8 @@ class KnownList(Configuration):
     scale: Annotated[tuple[Scale, Scale], Field(strict=False)] | None = None
     """Sensor pixels that a scene pixel shifts the mask's shadow by, of rows and columns; none: they are found."""
     terms: int | None = Field(default=None, ge=1, le=MOST_TERMS)
-    """Codes of a side: 1, all directions are alike; more, the code changes smoothly over the scene; none: by frames that
-    are held out."""
+    """Codes of a side: 1, all directions are alike; more, the code changes smoothly over the scene; none: by frames
+    that are held out."""
     board_reflectance: float | None = Field(default=None, gt=0, le=1)
     """Reflectance that counts as 1 in pictures and images; none: unknown."""
     known: Annotated[tuple[KnownCapture, ...], FailFast()] = Field(strict=False, min_length=1, max_length=MOST_CAPTURES)
@@ -100,8 +100,8 @@ class KnownCaptures:
 def load_known(path: Path | str) -> KnownCaptures:
     """The list in the file ``path``, TOML or JSON.
 
-    MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of several cameras,
-    or of other lines than the first.
+    MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of several
+    cameras, or of other lines than the first.
     """
     path = Path(path)
     if path.is_dir():
@@ -148,7 +148,7 @@ def _check_alike(found: KnownCaptures, capture: KnownCapture, manifests: dict[st
         ours = found.manifests[name]
         if manifest.camera != ours.camera:
             raise MitsimError(
-                f"list {found.path}: {capture.run} is of another camera than {first}; calibrate each by its own captures"
+                f"list {found.path}: {capture.run} is of another camera than {first}; calibrate each by its own"
             )
         sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
         if sides != own:

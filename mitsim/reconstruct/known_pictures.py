@@ -1,7 +1,7 @@
 """Captures of known pictures and their list in; the camera's factors, with their error and how the pictures lie, out.
 
-No stripes and no board: anything whose picture is known, prints, screens, images by another calibration. All planes of a
-colour sensor see one mask: their codes are fitted together.
+No stripes and no board: anything whose picture is known, prints, screens, images by another calibration. All planes of
+a colour sensor see one mask: their codes are fitted together.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
         read = _Read.of(captures)
     job.progress("pose", 0.2)
     with job.clock.stage("pose"):
-        pose = find_pose(read.exposures, listed.centre, listed.orientation, listed.scale)
+        pose = find_pose(read.exposures, listed.orientation, listed.scale)
     turned = [each.turned(pose.orientation) for each in read.exposures]
     shape = Shape(pose.scales, 1, listed.centre)
     job.progress("choice", 0.5)

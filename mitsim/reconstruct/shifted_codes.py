@@ -52,7 +52,7 @@ class Exposure:
     plane
         name of the sensor's plane; planes have gains of their own.
     offset
-        of the plane's pixels, down and to the right [pixels].
+        of the plane's pixels, down and to the right, 0 to below 1 [pixels].
     """
 
     scene: FloatArray
@@ -103,20 +103,19 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, largest ``offset`` of a frame, ``terms``, and whether
+    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, ``terms``, and whether
     it loses the means of its columns."""
 
     sensor: int
     scene: int
     scale: float
-    offset: float
     terms: int
     centre: bool
 
     @property
     def width(self) -> int:
         """Of the window of the code that one sensor pixel sees."""
-        return int(np.floor(self.offset + self.scale * (self.scene - 1))) + 2
+        return int(np.floor(self.scale * (self.scene - 1))) + 3
 
     @property
     def length(self) -> int:
@@ -221,6 +220,14 @@ class Codes:
         )
         return np.sign(gain) * left, right
 
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood of the frames less that of as many numbers as they tell (Schwarz 1978): codes that are long
+        because the scale is large explain more, whatever the frames are of."""
+        size = self.sides[0].sensor * self.sides[1].sensor
+        likelihood = -0.5 * size * float(np.log(self.variances).sum())
+        return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
+
     def explains(self, exposures: Sequence[Exposure]) -> float:
         """Mean part of the energy of frames that the codes, fitted to others, explain."""
         parts = []
@@ -296,10 +303,8 @@ def fit_codes(
 
 def _sides(exposures: Sequence[Exposure], shape: Shape) -> tuple[Side, Side]:
     left, right = (
-        Side(sensor, scene, scale, max(each.offset[axis] for each in exposures), shape.terms, shape.centre)
-        for axis, (sensor, scene, scale) in enumerate(
-            zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
-        )
+        Side(sensor, scene, scale, shape.terms, shape.centre)
+        for sensor, scene, scale in zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
     )
     return left, right
 
@@ -402,19 +407,19 @@ def _spread(side: Side, covariance: FloatArray) -> float:
 
 # ---- The start: orientation, scale and codes by spectra ----
 
-_FREQUENCIES = 32
+_FREQUENCIES = 20
 """Of either sign, lowest first, whose spectra are compared: most light of a picture is there."""
-_COMPARED = 4
+_COMPARED = 2
 """Frames of those given whose spectra are compared."""
 _STEP = 1.1
 """Of the scales that are looked at: what shifts the finest of these waves by half its length, where a shadow moves by a
 sixth of the sensor over the scene."""
-_WIDEST, _NARROWEST = 3.0, 0.03
+_WIDEST, _NARROWEST = 1.0, 0.03
 """Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
-for: beyond, hardly two directions see the same part of a mask; below, a scene is a few pixels."""
+for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
 _TRIED = 3
 """Orientations, those of the best spectra, that codes are fitted with, each at its best scale."""
-_FIRST_TURNS = 3
+_FIRST_TURNS = 2
 """Turns of the sides that tell how well they do."""
 
 
@@ -496,23 +501,21 @@ class Pose:
 @single_threaded_blas()
 def find_pose(
     exposures: Sequence[Exposure],
-    centre: bool,
     orientation: str | None = None,
     scales: tuple[float, float] | None = None,
 ) -> Pose:
-    """How scenes lie, by spectra and then by codes that are fitted.
+    """How scenes lie, by spectra and then by codes that are fitted, both of centred frames: even light tells nothing.
 
     Parameters
     ----------
     exposures
         scenes as they are given.
-    centre
-        whether factors are centred.
     orientation, scales
         where they are known.
     """
+    exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
     some = exposures[:: -(-len(exposures) // _COMPARED)]
-    spectra = _Spectra.of([replace(each, frame=centre_frame(each.frame)) for each in some])
+    spectra = _Spectra.of(some)
     scenes = {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
     ratio = some[0].frame.shape[0] / some[0].scene.shape[0]
     count = int(np.ceil(np.log(_WIDEST / _NARROWEST) / np.log(_STEP)))
@@ -532,22 +535,24 @@ def find_pose(
         turned = [each.turned(name) for each in some]
         if scales is None:
             place = _refine(lambda at, turned=turned: -spectra.compare([e.scene for e in turned], at)[0], place, _STEP)
-        fitted = fit_codes(turned, Shape(place, 1, centre), turns=_FIRST_TURNS)
-        tried.append((fitted.explained, name, place))
+        fitted = fit_codes(turned, Shape(place, 1, True), turns=_FIRST_TURNS)
+        tried.append((fitted.evidence, fitted.explained, name, place))
     best = max(tried)
-    others = [explained for explained, name, _ in tried if name != best[1]]
-    pose = Pose(best[1], best[2], best[0] - max(others) if others else None)
+    others = [explained for _, explained, name, _ in tried if name != best[2]]
+    pose = Pose(best[2], best[3], best[1] - max(others) if others else None)
     if scales is not None:
         return pose
     turned = [each.turned(pose.orientation) for each in exposures]
 
+    start = fit_codes(turned, Shape(pose.scales, 1, True), turns=_FIRST_TURNS).codes[1][0]
+
     def misfit(at: tuple[float, float]) -> float:
-        return -fit_codes(turned, Shape(at, 1, centre), turns=_FIRST_TURNS).explained
+        return -fit_codes(turned, Shape(at, 1, True), start, _FIRST_TURNS).evidence
 
     return replace(pose, scales=_refine(misfit, pose.scales, _FINE))
 
 
-_FINE = 1.015
+_FINE = 1.03
 """Part of a scale by which codes that are fitted may change it: a quarter of the spectra's step."""
 
 
@@ -573,8 +578,9 @@ _TOLERANCE = 0.05
 
 # ---- How many codes: by frames that are held out ----
 
-_GAIN = 1e-3
-"""Of the energy of frames that were held out, by which more codes must explain more of it."""
+_GAIN = 0.02
+"""Of what was left of frames that were held out, that more codes must explain: less is within what two halves of the
+frames differ by."""
 
 
 @dataclass(frozen=True)
@@ -621,12 +627,9 @@ def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choi
         tried = replace(shape, terms=terms)
         parts = [_held_out(folds[own], folds[1 - own], tried) for own in (0, 1)]
         found.append(float(np.mean(parts)))
-        if len(found) > 1 and found[-1] < found[-2] + _GAIN:
-            break
-    best = 1
-    while best < len(found) and found[best] > found[best - 1] + _GAIN:
-        best += 1
-    return Choice(best, tuple(found))
+        if len(found) > 1 and 1 - found[-1] > (1 - _GAIN) * (1 - found[-2]):
+            return Choice(terms - 1, tuple(found))
+    return Choice(most, tuple(found))
 
 
 def _held_out(kept: Sequence[Exposure], left_out: Sequence[Exposure], shape: Shape) -> float:
