@@ -48,8 +48,6 @@ _REFLECTANCE = "reflectance"
 """Channel of an image, or of a truth, in OpenEXR."""
 _MOST_TRIED = 3
 """Codes of a side that are tried where the list does not say how many."""
-_CERTAIN = 0.01
-"""Of the frames' energy that the right orientation explains beyond any other, below which pictures do not tell it."""
 _USEFUL = 0.1
 """Of the frames' energy beyond their noise that is left unexplained, rms, above which factors are flagged: an image has
 an error of as much."""
@@ -362,7 +360,7 @@ def _status(choice: Choice, codes: Codes, unexplained: float, error: float, rank
 
 
 def _warnings(captures: KnownCaptures, read: _Read, pose: Pose) -> Iterator[str]:
-    if pose.margin is not None and pose.margin < _CERTAIN:
+    if not pose.certain and pose.margin is not None:
         yield (
             f"orientation: {pose.orientation!r} explains no more than {pose.margin:.1%} of the frames beyond another; "
             "give pictures that are not symmetric, or state orientation in the list"

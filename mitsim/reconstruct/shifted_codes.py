@@ -417,10 +417,11 @@ sixth of the sensor over the scene."""
 _WIDEST, _NARROWEST = 1.0, 0.03
 """Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
 for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
-_TRIED = 3
-"""Orientations, those of the best spectra, that codes are fitted with, each at its best scale."""
-_FIRST_TURNS = 2
-"""Turns of the sides that tell how well they do."""
+_FIRST_TURNS, _SCALE_TURNS = 2, 5
+"""Turns of the sides that tell which orientation is right, and which scale: a code that was fitted at another one has
+to be forgotten."""
+_CERTAIN = 1.2
+"""Times what the right orientation leaves of the frames that another must leave, or pictures do not tell it."""
 
 
 def spectral_start(exposures: Sequence[Exposure], scales: tuple[float, float]) -> tuple[float, FloatArray]:
@@ -463,10 +464,9 @@ class _Spectra:
         for frame, scene in zip(self.frames, scenes, strict=True):
             lit = left @ scene @ right.T
             above += frame * np.conj(lit)
-            below += np.square(np.abs(lit))
-        # Between a quotient of spectra, which is noise where scenes have no light, and a product, which is no code's.
-        ratio = above / np.sqrt(below * (below + below.mean()) + np.finfo(np.float64).tiny)
-        _, values, code_waves = np.linalg.svd(ratio)
+            below += np.abs(frame * lit)
+        # Phases alone: of amplitudes a few strong waves would decide, which any code has.
+        _, values, code_waves = np.linalg.svd(above / np.maximum(below, np.finfo(np.float64).tiny))
         code = np.real(code_waves[0] @ np.conj(_waves(int(2 * self.periods[1]), self.periods[1])))
         return float(values[0] ** 2 / max(np.sum(np.square(values)), np.finfo(np.float64).tiny)), code
 
@@ -491,11 +491,14 @@ class Pose:
         of rows and of columns [sensor pixels / scene pixel].
     margin
         by how much more of the frames' energy this explains than the best of another orientation; None: not compared.
+    certain
+        whether that is clear.
     """
 
     orientation: str
     scales: tuple[float, float]
     margin: float | None = None
+    certain: bool = True
 
 
 @single_threaded_blas()
@@ -531,7 +534,7 @@ def find_pose(
     ]
     candidates = {name: max(each for each in found if each[1] == name) for name in {name for _, name, _ in found}}
     tried = []
-    for _, name, place in sorted(candidates.values(), reverse=True)[:_TRIED]:
+    for _, name, place in candidates.values():
         turned = [each.turned(name) for each in some]
         if scales is None:
             place = _refine(lambda at, turned=turned: -spectra.compare([e.scene for e in turned], at)[0], place, _STEP)
@@ -539,7 +542,9 @@ def find_pose(
         tried.append((fitted.evidence, fitted.explained, name, place))
     best = max(tried)
     others = [explained for _, explained, name, _ in tried if name != best[2]]
-    pose = Pose(best[2], best[3], best[1] - max(others) if others else None)
+    pose = Pose(best[2], best[3])
+    if others:
+        pose = replace(pose, margin=best[1] - max(others), certain=1 - max(others) > _CERTAIN * (1 - best[1]))
     if scales is not None:
         return pose
     turned = [each.turned(pose.orientation) for each in exposures]
@@ -547,13 +552,18 @@ def find_pose(
     start = fit_codes(turned, Shape(pose.scales, 1, True), turns=_FIRST_TURNS).codes[1][0]
 
     def misfit(at: tuple[float, float]) -> float:
-        return -fit_codes(turned, Shape(at, 1, True), start, _FIRST_TURNS).evidence
+        return -fit_codes(turned, Shape(at, 1, True), start, _SCALE_TURNS).evidence
 
-    return replace(pose, scales=_refine(misfit, pose.scales, _FINE))
+    for _ in range(_STEPS):
+        before, pose = pose.scales, replace(pose, scales=_refine(misfit, pose.scales, _FINE))
+        if np.all(np.abs(np.log(pose.scales) - np.log(before)) < np.log(_FINE) / 2):
+            break
+    return pose
 
 
-_FINE = 1.03
-"""Part of a scale by which codes that are fitted may change it: a quarter of the spectra's step."""
+_FINE, _STEPS = 1.03, 3
+"""Part of a scale by which codes that are fitted may change it at once, a third of the spectra's step; how often, at
+most."""
 
 
 def _refine(
