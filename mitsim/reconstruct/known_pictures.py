@@ -252,9 +252,9 @@ def _factors(
         [root * error / norm for error, norm in zip(errors, norms, strict=True)]
         for errors in (codes.errors, codes.seen_errors)
     )
-    unexplained, chi_square = _misfit(read, pose, codes)
+    explained, unexplained, chi_square = _misfit(read, pose, codes)
     rank = [rank_above_noise(side, error) for side, error in zip((left, right), whole, strict=True)]
-    status = _status(choice, codes, unexplained, float(np.hypot(*seen)), rank)
+    status = _status(choice, codes, (explained, unexplained), float(np.hypot(*seen)), rank)
     warnings = (*_warnings(captures, read, pose), *(() if status.ok else (str(status),)))
     lengths = [side.length * side.terms for side in codes.sides]
     result: dict[str, Any] = {
@@ -266,9 +266,9 @@ def _factors(
         "scale": list(pose.scales),
         "terms": choice.terms,
         "held_out": list(choice.held_out),
-        "explained": codes.explained,
+        "explained": explained,
         "chi_square": chi_square,
-        "separability_residual": float(np.sqrt(max(1 - codes.explained, 0.0))),
+        "separability_residual": float(np.sqrt(max(1 - explained, 0.0))),
         "unexplained_residual": unexplained,
         "noise_free_residual": None,
         "phi_error": None,
@@ -308,26 +308,30 @@ _OF_IMPORTS = ("turn_deg",)
 """Of a run's configuration, what an import of other frames is compared with."""
 
 
-def _misfit(read: _Read, pose: Pose, codes: Codes) -> tuple[float, float]:
-    """Part of all frames, rms, that neither codes nor noise explain, and the mean of misfit over noise.
+def _misfit(read: _Read, pose: Pose, codes: Codes) -> tuple[float, float, float]:
+    """Part of the energy of all frames that codes explain; part, rms, that neither they nor noise do; and the mean of
+    misfit over noise. All of centred frames: whatever picture is named, even light is explained.
 
     Noise is what the sensor states; where it does not, what second differences of the misfit tell along rows and
     columns at once, in which there is hardly any scene.
     """
-    excess = energy = 0.0
+    excess = energy = total = 0.0
     ratios = []
     for each, stated in zip(read.exposures, read.noises, strict=True):
         left, right = codes.factors(each.offset, each.plane)
-        misfit = each.frame - left @ each.turned(pose.orientation).scene @ right.T
+        misfit = centre_frame(each.frame - left @ each.turned(pose.orientation).scene @ right.T)
         noise = stated if np.isfinite(stated) else float(np.mean(np.square(np.diff(np.diff(misfit, 2, 0), 2, 1)))) / 36
         left_over = float(np.mean(np.square(misfit)))
         excess += left_over - noise
-        energy += float(np.mean(np.square(each.frame)))
+        total += left_over
+        energy += float(np.mean(np.square(centre_frame(each.frame))))
         ratios.append(left_over / noise if noise > 0 else 1.0)
-    return float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
+    return 1 - total / energy, float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
 
 
-def _status(choice: Choice, codes: Codes, unexplained: float, error: float, rank: list[int]) -> Status:
+def _status(choice: Choice, codes: Codes, parts: tuple[float, float], error: float, rank: list[int]) -> Status:
+    """By ``parts`` of the frames that are explained and unexplained, and the ``error`` of such frames."""
+    explained, unexplained = parts
     sides = [side.scene for side in codes.sides]
     figures = (
         f"Frames tell {codes.told[0]:.0f} and {codes.told[1]:.0f} numbers of the codes, rank {rank[0]} of {sides[0]} "
@@ -352,8 +356,8 @@ def _status(choice: Choice, codes: Codes, unexplained: float, error: float, rank
     code = "one code" if choice.terms == 1 else f"{choice.terms} codes that change over the scene"
     return Status(
         Verdict.CALIBRATED,
-        f"Calibrated by known pictures: {code} a side explain{'s' if choice.terms == 1 else ''} {codes.explained:.1%} "
-        "of the frames' energy",
+        f"Calibrated by known pictures: {code} a side explain{'s' if choice.terms == 1 else ''} {explained:.1%} "
+        "of what frames have beside even light",
         "",
         figures,
     )

@@ -417,9 +417,8 @@ sixth of the sensor over the scene."""
 _WIDEST, _NARROWEST = 1.0, 0.03
 """Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
 for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
-_FIRST_TURNS, _SCALE_TURNS = 2, 5
-"""Turns of the sides that tell which orientation is right, and which scale: a code that was fitted at another one has
-to be forgotten."""
+_FIRST_TURNS, _SCALE_TURNS = 2, 3
+"""Turns of the sides that tell which orientation is right, and which scale."""
 _CERTAIN = 1.2
 """Times what the right orientation leaves of the frames that another must leave, or pictures do not tell it."""
 
@@ -549,10 +548,8 @@ def find_pose(
         return pose
     turned = [each.turned(pose.orientation) for each in exposures]
 
-    start = fit_codes(turned, Shape(pose.scales, 1, True), turns=_FIRST_TURNS).codes[1][0]
-
     def misfit(at: tuple[float, float]) -> float:
-        return -fit_codes(turned, Shape(at, 1, True), start, _SCALE_TURNS).evidence
+        return -fit_codes(turned, Shape(at, 1, True), turns=_SCALE_TURNS).evidence
 
     for _ in range(_STEPS):
         before, pose = pose.scales, replace(pose, scales=_refine(misfit, pose.scales, _FINE))
@@ -561,7 +558,7 @@ def find_pose(
     return pose
 
 
-_FINE, _STEPS = 1.03, 3
+_FINE, _STEPS = 1.03, 10
 """Part of a scale by which codes that are fitted may change it at once, a third of the spectra's step; how often, at
 most."""
 
