@@ -64,9 +64,9 @@ class KnownCamera:
 
     def write_run(
         self, folder: Path, scene: FloatArray, patterns: str = "uniform", offset: tuple[float, float] = (0.0, 0.0),
-        noise: bool = True, **digital: Any,
+        turn: Any = lambda light: light, **digital: Any,
     ) -> Path:  # fmt: skip
-        """The RUN folder of a ``scene`` as it lies before the camera, under ``patterns``."""
+        """The RUN folder of a ``scene`` under ``patterns``, lit so and then turned as it lies before the camera."""
         folder.mkdir(parents=True)
         family, (left, right) = parse_patterns(patterns, N), self.factors(offset)
         names = [f"frame_{index}.exr" for index in range(len(family.shots))]
@@ -75,9 +75,8 @@ class KnownCamera:
             "read_noise_e": 5.0, "step_dn": 1.0, "saturation_dn": 1e6, **digital,
         }  # fmt: skip
         for name, shot in zip(names, family.shots, strict=True):
-            electrons = self.exposure_s * left @ (scene * family.light(shot)) @ right.T
-            if noise:
-                electrons = self.rng.poisson(electrons) + 5 * self.rng.standard_normal(electrons.shape)
+            electrons = self.exposure_s * left @ turn(scene * family.light(shot)) @ right.T
+            electrons = self.rng.poisson(electrons) + 5 * self.rng.standard_normal(electrons.shape)
             dn = np.rint(np.maximum(electrons * stated["gain_dn_per_e"] + 100, 0))
             write_frame(folder / name, {"DN": np.minimum(dn, stated["saturation_dn"]).astype(np.float32)}, {})
         manifest = RunManifest(
@@ -101,7 +100,7 @@ class KnownCamera:
         patterns = more.pop("patterns", "uniform")
         for number in range(pictures):
             picture = self.picture()
-            self.write_run(folder / f"run_{number}", turn(picture), patterns)
+            self.write_run(folder / f"run_{number}", picture, patterns, turn=turn)
             Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(folder / f"picture_{number}.png")
             runs.append({"run": f"run_{number}", "picture": f"picture_{number}.png"})
         return write_known(folder / "known.json", runs, **more)

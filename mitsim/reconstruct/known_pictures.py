@@ -25,7 +25,13 @@ from mitsim.core.manifests import MANIFEST, CalibrationManifest, FactorNoise
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import CALIBRATION, write_colours
 from mitsim.devices.knownlist import MOST_TERMS, KnownCapture, KnownCaptures, load_known
-from mitsim.reconstruct.estimate_factors import rank_above_noise, squared_condition
+from mitsim.reconstruct.estimate_factors import (
+    LARGEST_ERROR,
+    SEPARABLE_RESIDUAL,
+    UNKNOWN_NOISE,
+    rank_above_noise,
+    squared_condition,
+)
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.shifted_codes import (
     Choice,
@@ -48,11 +54,6 @@ _REFLECTANCE = "reflectance"
 """Channel of an image, or of a truth, in OpenEXR."""
 _MOST_TRIED = 3
 """Codes of a side that are tried where the list does not say how many."""
-_USEFUL = 0.1
-"""Of the frames' energy beyond their noise that is left unexplained, rms, above which factors are flagged: an image has
-an error of as much."""
-_LARGE_ERROR = 0.1
-"""Relative error of factors, as frames of such pictures see it, above which they are mostly noise."""
 
 
 @check_arguments
@@ -254,7 +255,9 @@ def _factors(
     )
     explained, unexplained, chi_square = _misfit(read, pose, codes)
     rank = [rank_above_noise(side, error) for side, error in zip((left, right), whole, strict=True)]
-    status = _status(choice, codes, (explained, unexplained), float(np.hypot(*seen)), rank)
+    status = _status(
+        choice, codes, (explained, unexplained), bool(np.isfinite(read.noises).all()), float(np.hypot(*seen)), rank
+    )
     warnings = (*_warnings(captures, read, pose), *(() if status.ok else (str(status),)))
     lengths = [side.length * side.terms for side in codes.sides]
     result: dict[str, Any] = {
@@ -329,23 +332,26 @@ def _misfit(read: _Read, pose: Pose, codes: Codes) -> tuple[float, float, float]
     return 1 - total / energy, float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
 
 
-def _status(choice: Choice, codes: Codes, parts: tuple[float, float], error: float, rank: list[int]) -> Status:
-    """By ``parts`` of the frames that are explained and unexplained, and the ``error`` of such frames."""
+def _status(
+    choice: Choice, codes: Codes, parts: tuple[float, float], stated: bool, error: float, rank: list[int]
+) -> Status:
+    """By ``parts`` of the frames that are explained and unexplained, whether their noise is ``stated``, the ``error``
+    of such frames and the factors' ``rank``."""
     explained, unexplained = parts
     sides = [side.scene for side in codes.sides]
     figures = (
         f"Frames tell {codes.told[0]:.0f} and {codes.told[1]:.0f} numbers of the codes, rank {rank[0]} of {sides[0]} "
         f"and {rank[1]} of {sides[1]}; in frames of such pictures the factors have an error of {error:.1e}."
     )
-    if error > _LARGE_ERROR:
+    if error > LARGEST_ERROR:
         return Status(
             Verdict.MOSTLY_NOISE,
             f"Factors are mostly noise: in frames of such pictures they have an error of {error:.0%}, allowed are "
-            f"{_LARGE_ERROR:.0%}",
+            f"{LARGEST_ERROR:.0%}",
             "capture more pictures, or longer",
             figures,
         )
-    if unexplained > _USEFUL:
+    if unexplained > (SEPARABLE_RESIDUAL if stated else UNKNOWN_NOISE):
         return Status(
             Verdict.NOT_SEPARABLE,
             f"Frames hold more than codes seen through shifts explain: {unexplained:.1%} of them is left over",

@@ -65,9 +65,9 @@ def test_pictures_may_lie_any_way_and_images_lie_as_they_do(tmp_path: Path, name
     assert factors.manifest.result["orientation"] == name
     assert factors.manifest.result["orientation_margin"] > 0.004
     scene = camera.picture()
-    run = camera.write_run(tmp_path / "other", TURNS[name](scene), "dots:2")
+    run = camera.write_run(tmp_path / "other", scene, "dots:2", turn=TURNS[name])
     image = reconstruct(load_run(run), load_calibration(tmp_path / "cal")).image
-    assert np.corrcoef(image.ravel(), scene.ravel())[0, 1] > 0.98
+    assert np.corrcoef(image.ravel(), scene.ravel())[0, 1] > 0.8
 
 
 def test_transposed_pictures_are_refused_by_what_to_do(tmp_path: Path) -> None:
