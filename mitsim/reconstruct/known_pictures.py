@@ -355,8 +355,9 @@ def _status(
         return Status(
             Verdict.NOT_SEPARABLE,
             f"Frames hold more than codes seen through shifts explain: {unexplained:.1%} of them is left over",
-            "check that each run is of its picture, that pictures are as light as what was shown (gamma), and that the "
-            "frames stand straight",
+            ("" if stated else "state digital.read_noise_e, as noise is guessed from neighbouring pixels; ")
+            + "check that each run is of its picture, that pictures are as light as what was shown (gamma), and that "
+            "the frames stand straight",
             figures,
         )
     code = "one code" if choice.terms == 1 else f"{choice.terms} codes that change over the scene"
