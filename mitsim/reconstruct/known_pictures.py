@@ -103,7 +103,7 @@ def _calibrate(captures: KnownCaptures, job: Job) -> dict[str, Factors]:
     job.progress("pose", 0.2)
     with job.clock.stage("pose"):
         pose = find_pose(read.exposures, listed.orientation, listed.scale)
-    turned = [each.turned(pose.orientation) for each in read.exposures]
+    turned = [each.turn_scene(pose.orientation) for each in read.exposures]
     shape = Shape(pose.scales, 1, listed.centre)
     job.progress("choice", 0.5)
     with job.clock.stage("choice"):
@@ -322,7 +322,7 @@ def _misfit(read: _Read, pose: Pose, codes: Codes) -> tuple[float, float, float]
     ratios = []
     for each, stated in zip(read.exposures, read.noises, strict=True):
         left, right = codes.factors(each.offset, each.plane)
-        misfit = centre_frame(each.frame - left @ each.turned(pose.orientation).scene @ right.T)
+        misfit = centre_frame(each.frame - left @ each.turn_scene(pose.orientation).scene @ right.T)
         noise = stated if np.isfinite(stated) else float(np.mean(np.square(np.diff(np.diff(misfit, 2, 0), 2, 1)))) / 36
         left_over = float(np.mean(np.square(misfit)))
         excess += left_over - noise

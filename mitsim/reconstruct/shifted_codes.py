@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -61,7 +61,7 @@ class Exposure:
     plane: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
-    def turned(self, orientation: str) -> Exposure:
+    def turn_scene(self, orientation: str) -> Exposure:
         """The same with its scene as it lies in an ``orientation``."""
         return replace(self, scene=TURNS[orientation](self.scene))
 
@@ -131,7 +131,7 @@ class Side:
         )
 
     def hats(self, offset: float) -> FloatArray:
-        """(n, width) what each scene pixel takes of its window, by linear interpolation."""
+        """(n, width) what each scene pixel takes of its window, by linear interpolation, at an ``offset``."""
         place = offset + self.scale * np.arange(self.scene)
         first = np.floor(place).astype(int)
         found = np.zeros((self.scene, self.width))
@@ -141,7 +141,7 @@ class Side:
         return found
 
     def factor(self, codes: FloatArray, offset: float) -> FloatArray:
-        """Phi (m, n) of ``codes`` (terms, length)."""
+        """Phi (m, n) of ``codes`` (terms, length), for pixels at an ``offset``."""
         hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
         for code, weight in zip(codes, self.weights, strict=True):
             phi += (sliding_window_view(code, self.width) @ hats.T) * weight
@@ -229,7 +229,7 @@ class Codes:
         return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
 
     def explains(self, exposures: Sequence[Exposure]) -> float:
-        """Mean part of the energy of frames that the codes, fitted to others, explain."""
+        """Mean part of the energy of ``exposures`` that the codes, fitted to others, explain."""
         parts = []
         for each in exposures:
             left, right = self.factors(each.offset, each.plane)
@@ -534,9 +534,9 @@ def find_pose(
     candidates = {name: max(each for each in found if each[1] == name) for name in {name for _, name, _ in found}}
     tried = []
     for _, name, place in candidates.values():
-        turned = [each.turned(name) for each in some]
+        turned = [each.turn_scene(name) for each in some]
         if scales is None:
-            place = _refine(lambda at, turned=turned: -spectra.compare([e.scene for e in turned], at)[0], place, _STEP)
+            place = _refine(partial(_unlike, spectra, [each.scene for each in turned]), place, _STEP)
         fitted = fit_codes(turned, Shape(place, 1, True), turns=_FIRST_TURNS)
         tried.append((fitted.evidence, fitted.explained, name, place))
     best = max(tried)
@@ -546,7 +546,7 @@ def find_pose(
         pose = replace(pose, margin=best[1] - max(others), certain=1 - max(others) > _CERTAIN * (1 - best[1]))
     if scales is not None:
         return pose
-    turned = [each.turned(pose.orientation) for each in exposures]
+    turned = [each.turn_scene(pose.orientation) for each in exposures]
 
     def misfit(at: tuple[float, float]) -> float:
         return -fit_codes(turned, Shape(at, 1, True), turns=_SCALE_TURNS).evidence
@@ -556,6 +556,10 @@ def find_pose(
         if np.all(np.abs(np.log(pose.scales) - np.log(before)) < np.log(_FINE) / 2):
             break
     return pose
+
+
+def _unlike(spectra: _Spectra, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> float:
+    return -spectra.compare(scenes, scales)[0]
 
 
 _FINE, _STEPS = 1.03, 10
