@@ -32,6 +32,7 @@ from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.framelist import DarkFile, FrameList, StripeFile
+from mitsim.devices.knownlist import KnownCapture, KnownList
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
@@ -46,7 +47,7 @@ MODELS = (
     *(SessionRecipe, BoardShape, Drift),
     *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile, Raw, Preparation, Crop),
-    CaptureList,
+    *(CaptureList, KnownList, KnownCapture),
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
     PlanFile,

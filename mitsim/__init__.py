@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.captured_session import calibrate_frames as calibrate_frames
     from mitsim.reconstruct.factors import Factors as Factors
     from mitsim.reconstruct.factors import load_calibration as load_calibration
+    from mitsim.reconstruct.known_pictures import calibrate_known as calibrate_known
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
@@ -65,6 +66,7 @@ _HOMES = {
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
+        "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.factors": "Factors load_calibration",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.quality": "reconstruct_colours",

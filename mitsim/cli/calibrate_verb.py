@@ -1,6 +1,7 @@
 """`mitsim calibrate`: words of a command line in; a session's or a plan's words, or a refusal, out.
 
-Four ways to factors: a simulated session, the frames of a real one, a fitted model, and a plan, which makes none.
+Five ways to factors: a simulated session, the frames of a real one, captures of known pictures, a fitted model, and a
+plan, which makes none.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
+_OF_KNOWN = {"known", "output", "as_json", "quiet"}
+"""Those that go with --known."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,7 @@ class Session:
         None, "calibration folder to make; of --plan, recipe to write", "-o", "--output", metavar="CAL"
     )
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
+    known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
     recipe: Path | None = option(None, "session recipe, TOML", metavar="FILE.toml")
@@ -115,8 +119,12 @@ def calibrate(
     devices: Coloured,
     limited: Limited,
 ) -> int:
-    """Render a Hadamard session on a white board, or read the frames of a real one, and estimate the camera's
-    factors."""
+    """Render a Hadamard session on a white board, or read the frames of a real one or of known pictures, and estimate
+    the camera's factors."""
+    if session.known is not None:
+        folder = Planned().folder(session.output)
+        _check_alone(context, f"--known {session.known}: runs and their list decide", _OF_KNOWN)
+        return _calibrate_known(session.known, folder, limited)
     if modelled.model is not None and not planned.planning:
         modelling, folder = modelled.modelling(session.accuracy), planned.folder(session.output)
         return _fit(context, scene, modelling, folder, session, devices, limited)
@@ -125,15 +133,21 @@ def calibrate(
             raise MitsimError(f"{option_name(name)} {value}: is for --model without --plan; leave it out")
     if session.frames is not None:
         folder = Planned().folder(session.output)
-        if others := sorted({name for name in context.params if is_given(context, name)} - _OF_FRAMES):
-            given = option_name(others[0])
-            raise MitsimError(f"--frames {session.frames}: frames and their list decide; leave out {given}")
+        _check_alone(context, f"--frames {session.frames}: frames and their list decide", _OF_FRAMES)
         return _calibrate_frames(session.frames, folder, devices.camera, limited)
     if scene is None:
-        raise MitsimError("calibrate: give a scene, or --frames DIR with the frames of a real session")
+        raise MitsimError(
+            "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
+        )
     if planned.planning:
         return _plan(scene, session, planned, devices, limited)
     return _calibrate(scene, session, planned, devices, limited)
+
+
+def _check_alone(context: typer.Context, reason: str, taken: set[str]) -> None:
+    """MitsimError, for a ``reason``, where options are given that are not ``taken``."""
+    if others := sorted({name for name in context.params if is_given(context, name)} - taken):
+        raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
 
 
 # ---- a simulated session ---------------------------------------------------------------------------------------------
@@ -263,6 +277,45 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
         *(f"not known: {text}" for text in payload["not_known"]),
     ]
     return finish(limited.as_json, payload, lines, factors.warnings)
+
+
+# ---- captures of known pictures --------------------------------------------------------------------------------------
+
+
+def _calibrate_known(listed: Path, output: Path, limited: Limited) -> int:
+    from mitsim.core.files import check_output
+    from mitsim.core.job import memory_from_here, memory_since
+    from mitsim.devices.knownlist import load_known
+
+    captures = load_known(listed)  # refused before the fit is imported
+    check_output(output)
+    from mitsim.reconstruct.known_pictures import calibrate_known
+
+    held = memory_from_here()
+    with limited.job() as job:
+        found = calibrate_known(captures, output, job)
+    results = {
+        name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
+        for name, each in found.items()
+    }
+    warnings = list(dict.fromkeys(text for each in results.values() for text in each["warnings"]))
+    first = next(iter(results.values()))
+    payload = {**first, "memory_bytes": memory_since(held), "warnings": warnings, "output": str(output)}
+    if captures.lines is not None:
+        payload["planes"] = results
+    rows, columns = first["scale"]
+    lines = [
+        f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {output}",
+        f"pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
+        "columns of pixels",
+        *(
+            f"{name and name + ': '}{each['terms']} code{'s' if each['terms'] > 1 else ''} a side explain "
+            f"{each['explained']:.1%} of the frames, left over beyond noise {each['unexplained_residual']:.2%}, "
+            f"factor error {each['predicted_frame_error']:.1e} in frames of such pictures"
+            for name, each in results.items()
+        ),
+    ]
+    return finish(limited.as_json, payload, lines, warnings)
 
 
 # ---- `mitsim calibrate --plan` ---------------------------------------------------------------------------------------

@@ -516,6 +516,11 @@ def squared_condition(phi: FloatArray) -> float:
     return _Singular.of(phi).squared_condition
 
 
+def rank_above_noise(phi: FloatArray, error: float) -> int:
+    """Directions of scene pixels that a factor ``phi`` (m, n) of a relative ``error`` sees above noise and rounding."""
+    return _Singular.of(phi).rank(phi, error)
+
+
 # ---- The uniform response as a product of two vectors ----
 
 

@@ -1,0 +1,653 @@
+"""Pictures that a camera saw and its frames of them in; the two factors, each side a code seen through shifts, out.
+
+A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on a
+grid of sensor pixels, seen from scene pixel i through a shift::
+
+    Phi[u, i] = sum_k b_k(i) c_k(u + o + s i)
+
+with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a
+Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. One term: all directions are alike.
+More terms: the code changes smoothly over the scene, as by falloff, a lens or a mask of some thickness.
+
+*Given one side, the other is linear.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes:
+least squares, whose normal matrix N is one block, added up along the diagonal. Left and right take turns until what is
+left stands still. A code's numbers are taken for independent, of a variance 1 / alpha that frames themselves tell
+(MacKay 1992, Neural Computation 4, 415): alpha = gamma / |c|^2, gamma = tr N (N + alpha)^-1 being the numbers that
+frames tell. What they do not tell stays near zero, and (N + alpha)^-1 is the covariance of the rest.
+
+*Where to begin.* By the convolution theorem a frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the
+sensor's edges: Y over X is a product of two vectors, and how nearly it is one tells orientation and scale of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize_scalar
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.reconstruct.solver import centre_columns, centre_frame
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """A frame and the light that it is of.
+
+    Attributes
+    ----------
+    scene
+        (n, n') picture, times its pattern.
+    frame
+        (m, m') measurement [electrons/s], centred where the camera's factors are.
+    group
+        picture that it is of: frames of one picture are held out together.
+    plane
+        name of the sensor's plane; planes have gains of their own.
+    offset
+        of the plane's pixels, down and to the right, 0 to below 1 [pixels].
+    """
+
+    scene: FloatArray
+    frame: FloatArray
+    group: int = 0
+    plane: str = ""
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    def turn_scene(self, orientation: str) -> Exposure:
+        """The same with its scene as it lies in an ``orientation``."""
+        return replace(self, scene=TURNS[orientation](self.scene))
+
+
+TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "upright": lambda scene: scene,
+    "mirrored": lambda scene: scene[:, ::-1],
+    "upside down": lambda scene: scene[::-1],
+    "turned": lambda scene: scene[::-1, ::-1],
+    "transposed": lambda scene: scene.T,
+    "transposed, mirrored": lambda scene: scene.T[:, ::-1],
+    "transposed, upside down": lambda scene: scene.T[::-1],
+    "transposed, turned": lambda scene: scene.T[::-1, ::-1],
+}
+"""How a picture lies as the camera's code runs, by the orientations of a list."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What is fixed while codes are fitted.
+
+    Attributes
+    ----------
+    scales
+        s of rows and of columns [sensor pixels / scene pixel].
+    terms
+        number of codes a side.
+    centre
+        whether factors lose their columns' means, as frames do.
+    """
+
+    scales: tuple[float, float]
+    terms: int = 1
+    centre: bool = False
+
+
+# ---- One side ----
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, ``terms``, and whether
+    it loses the means of its columns."""
+
+    sensor: int
+    scene: int
+    scale: float
+    terms: int
+    centre: bool
+
+    @property
+    def width(self) -> int:
+        """Of the window of the code that one sensor pixel sees."""
+        return int(np.floor(self.scale * (self.scene - 1))) + 3
+
+    @property
+    def length(self) -> int:
+        """Of the code."""
+        return self.sensor + self.width - 1
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """(terms, n) b_k, of mean square 1."""
+        place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
+        return np.stack(
+            [np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)]
+        )
+
+    def hats(self, offset: float) -> FloatArray:
+        """(n, width) what each scene pixel takes of its window, by linear interpolation, at an ``offset``."""
+        place = offset + self.scale * np.arange(self.scene)
+        first = np.floor(place).astype(int)
+        found = np.zeros((self.scene, self.width))
+        rows = np.arange(self.scene)
+        found[rows, first] = 1 - (place - first)
+        found[rows, first + 1] += place - first
+        return found
+
+    def factor(self, codes: FloatArray, offset: float) -> FloatArray:
+        """Phi (m, n) of ``codes`` (terms, length), for pixels at an ``offset``."""
+        hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
+        for code, weight in zip(codes, self.weights, strict=True):
+            phi += (sliding_window_view(code, self.width) @ hats.T) * weight
+        return centre_columns(phi) if self.centre else phi
+
+    def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix (terms length, terms length) and right-hand side of the codes.
+
+        Parameters
+        ----------
+        offset
+            of the frames.
+        gram, product
+            (n, n) sum of Z Z^T, and (m, n) sum of Y Z^T, both over the noise's variance.
+        """
+        hats, w, k = self.hats(offset), self.width, self.terms
+        spread = (self.weights[:, :, None] * hats[None]).transpose(1, 0, 2).reshape(self.scene, k * w)
+        block = (spread.T @ gram @ spread).reshape(k, w, k, w)
+        side = (product @ spread).reshape(self.sensor, k, w)
+        matrix, right = np.zeros((k, self.length, k, self.length)), np.zeros((k, self.length))
+        total = np.zeros((self.scene, k, self.length))
+        for row in range(self.sensor):
+            window = slice(row, row + w)
+            matrix[:, window, :, window] += block
+            right[:, window] += side[row]
+            total[:, :, window] += spread.reshape(self.scene, k, w)
+        flat = matrix.reshape(k * self.length, -1)
+        if self.centre:
+            every = total.reshape(self.scene, -1)
+            flat -= every.T @ (gram @ every) / self.sensor
+        return flat, right.ravel()
+
+
+# ---- Both sides ----
+
+
+@dataclass(frozen=True, eq=False)
+class Codes:
+    """Codes that were fitted.
+
+    Attributes
+    ----------
+    sides
+        geometry of rows and of columns.
+    codes
+        (terms, length) of either.
+    gains
+        of each plane.
+    variances
+        (exposures,) mean square of what is left of each frame.
+    explained
+        mean over the frames of the part of their energy that the fit explains.
+    errors
+        standard deviation of a number of the left and of the right factor, rms, what no frame tells included; gains 1.
+    seen_errors
+        that of independent errors that change frames of these scenes as much as the factors' do.
+    told
+        numbers of each side's codes that the frames tell.
+    """
+
+    sides: tuple[Side, Side]
+    codes: tuple[FloatArray, FloatArray]
+    gains: dict[str, float]
+    variances: FloatArray
+    explained: float
+    errors: tuple[float, float]
+    seen_errors: tuple[float, float]
+    told: tuple[float, float]
+
+    def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
+        """Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
+        gain = self.gains[plane]
+        left, right = (
+            side.factor(codes, place) * np.sqrt(abs(gain))
+            for side, codes, place in zip(self.sides, self.codes, offset, strict=True)
+        )
+        return np.sign(gain) * left, right
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood of the frames less that of as many numbers as they tell (Schwarz 1978): codes that are long
+        because the scale is large explain more, whatever the frames are of."""
+        size = self.sides[0].sensor * self.sides[1].sensor
+        likelihood = -0.5 * size * float(np.log(self.variances).sum())
+        return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
+
+    def explains(self, exposures: Sequence[Exposure]) -> float:
+        """Mean part of the energy of ``exposures`` that the codes, fitted to others, explain."""
+        parts = []
+        for each in exposures:
+            left, right = self.factors(each.offset, each.plane)
+            misfit = each.frame - left @ each.scene @ right.T
+            parts.append(1 - float(np.sum(np.square(misfit)) / np.sum(np.square(each.frame))))
+        return float(np.mean(parts))
+
+
+_TURNS, _STILL = 20, 1e-5
+"""Times that the sides take turns at most, and gain of the explained part at which they have ended: frames of no more
+than a million numbers tell no smaller one."""
+_VAGUE = 1e-3
+"""First guess of alpha, over the mean of N's diagonal; a few turns find the right one from there."""
+
+
+@single_threaded_blas()
+def fit_codes(
+    exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
+) -> Codes:
+    """Codes of both sides.
+
+    Parameters
+    ----------
+    exposures
+        scenes turned as the code runs.
+    shape
+        what is fixed.
+    start
+        (any,) code of columns to begin with; None: that of the spectra.
+    turns
+        that sides take at most.
+
+    Raises
+    ------
+    MitsimError
+        for frames or scenes without light.
+    """
+    sides = _sides(exposures, shape)
+    first = spectral_start(exposures, shape.scales)[1] if start is None else start
+    codes = [np.zeros((shape.terms, side.length)) for side in sides]
+    codes[1][0] = np.interp(np.arange(sides[1].length), np.arange(len(first)), first)
+    gains = dict.fromkeys((each.plane for each in exposures), 1.0)
+    energies = np.array([np.mean(np.square(each.frame)) for each in exposures])
+    if not (energies > 0).all():
+        raise MitsimError("known pictures: a frame is even, and tells nothing of the camera; leave it out")
+    variances, explained = energies.copy(), -1.0
+    known: list[_Known] = [_Known.vague(side) for side in sides]
+    for _ in range(turns):
+        for axis in (0, 1):
+            codes[axis], known[axis] = _solve_side(
+                exposures, sides, axis, codes[1 - axis], gains, variances, known[axis]
+            )
+        gains, variances = _levels(exposures, sides, codes, gains)
+        before, explained = explained, 1 - float(np.mean(variances / energies))
+        if explained - before < _STILL:
+            break
+    balance = float(np.sqrt(np.linalg.norm(codes[1]) / np.linalg.norm(codes[0])))
+    scales = balance, 1 / balance
+    spread = [_spread(side, each.covariance) for side, each in zip(sides, known, strict=True)]
+    return Codes(
+        sides,
+        (codes[0] * balance, codes[1] / balance),
+        gains,
+        variances,
+        explained,
+        (spread[0] * scales[0], spread[1] * scales[1]),
+        (known[0].seen * scales[0], known[1].seen * scales[1]),
+        (known[0].told, known[1].told),
+    )
+
+
+def _sides(exposures: Sequence[Exposure], shape: Shape) -> tuple[Side, Side]:
+    left, right = (
+        Side(sensor, scene, scale, shape.terms, shape.centre)
+        for sensor, scene, scale in zip(exposures[0].frame.shape, exposures[0].scene.shape, shape.scales, strict=True)
+    )
+    return left, right
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What frames tell of a side's codes: ``alphas`` of the terms, 0 where they are not known yet, ``covariance`` of
+    all numbers, how many are ``told``, and error of a factor's number ``seen`` in frames of these scenes."""
+
+    alphas: FloatArray
+    covariance: FloatArray
+    told: float = 0.0
+    seen: float = 0.0
+
+    @classmethod
+    def vague(cls, side: Side) -> _Known:
+        """Nothing yet."""
+        return cls(np.zeros(side.terms), np.zeros((0, 0)))
+
+
+def _solve_side(
+    exposures: Sequence[Exposure],
+    sides: tuple[Side, Side],
+    axis: int,
+    other: FloatArray,
+    gains: dict[str, float],
+    variances: FloatArray,
+    before: _Known,
+) -> tuple[FloatArray, _Known]:
+    """Codes of the side ``axis`` given the ``other``'s, and what is known of them."""
+    own, across = sides[axis], sides[1 - axis]
+    phis = {place: across.factor(other, place) for place in {each.offset[1 - axis] for each in exposures}}
+    sums: dict[float, list[FloatArray]] = {}
+    for each, variance in zip(exposures, variances, strict=True):
+        scene, frame = (each.scene, each.frame) if axis == 0 else (each.scene.T, each.frame.T)
+        light = gains[each.plane] * (scene @ phis[each.offset[1 - axis]].T)
+        added = [light @ light.T / variance, frame @ light.T / variance]
+        place = each.offset[axis]
+        sums[place] = [a + b for a, b in zip(sums[place], added, strict=True)] if place in sums else added
+    matrix: FloatArray = np.zeros((own.terms * own.length,) * 2)
+    right: FloatArray = np.zeros(len(matrix))
+    for place, (gram, product) in sums.items():
+        parts = own.normal(place, gram, product)
+        matrix += parts[0]
+        right += parts[1]
+    level = float(np.trace(matrix)) / len(matrix)
+    if not level > 0:
+        raise MitsimError("known pictures: have no light, or an even one, and tell nothing of the camera; give others")
+    alphas = np.where(before.alphas > 0, before.alphas, _VAGUE * level)
+    factored = cho_factor(matrix + np.diag(np.repeat(alphas, own.length)))
+    found = cho_solve(factored, right).reshape(own.terms, -1)
+    covariance = cho_solve(factored, np.eye(len(matrix)))
+    unknown = alphas * np.diag(covariance).reshape(own.terms, -1).sum(axis=1)
+    told = np.maximum(own.length - unknown, 0.0)
+    # Codes that explain nothing would make alpha infinite, and the matrix singular to rounding.
+    energies = np.maximum(np.square(found).sum(axis=1), told / (_LARGEST * level))
+    alphas = np.clip(told / np.maximum(energies, 1e-300), _SMALLEST * level, _LARGEST * level)
+    lit = sum(float(np.trace(gram)) for gram, _ in sums.values())
+    return found, _Known(alphas, covariance, float(told.sum()), float(np.sqrt(told.sum() / (own.sensor * lit))))
+
+
+_SMALLEST, _LARGEST = 1e-9, 1e6
+"""Of alpha over the mean of N's diagonal: below, double precision does not tell N + alpha from N; beyond, codes are as
+good as zero."""
+
+
+def _levels(
+    exposures: Sequence[Exposure], sides: tuple[Side, Side], codes: list[FloatArray], gains: dict[str, float]
+) -> tuple[dict[str, float], FloatArray]:
+    """Gains of the planes, by least squares, and mean squares of what is left of each frame."""
+    phis = [
+        {place: side.factor(code, place) for place in {each.offset[axis] for each in exposures}}
+        for axis, (side, code) in enumerate(zip(sides, codes, strict=True))
+    ]
+    models = [phis[0][each.offset[0]] @ each.scene @ phis[1][each.offset[1]].T for each in exposures]
+    above, below = dict.fromkeys(gains, 0.0), dict.fromkeys(gains, 0.0)
+    for each, model in zip(exposures, models, strict=True):
+        above[each.plane] += float(np.vdot(model, each.frame))
+        below[each.plane] += float(np.vdot(model, model))
+    gains = {name: above[name] / below[name] for name in gains}
+    left = [
+        np.mean(np.square(each.frame - gains[each.plane] * model))
+        for each, model in zip(exposures, models, strict=True)
+    ]
+    return gains, np.asarray(left)
+
+
+def _spread(side: Side, covariance: FloatArray) -> float:
+    """Standard deviation of a number of the factor, rms, by the ``covariance`` of the codes."""
+    hats = side.hats(0.0)
+    k, w = side.terms, side.width
+    spread = (side.weights[:, :, None] * hats[None]).transpose(1, 0, 2)  # (n, terms, w)
+    block = np.zeros((k, w, k, w))
+    whole = covariance.reshape(k, side.length, k, side.length)
+    for row in range(side.sensor):
+        block += whole[:, row : row + w, :, row : row + w]
+    total = float(np.einsum("iaw,awbv,ibv->", spread, block, spread, optimize=True))
+    return float(np.sqrt(max(total, 0.0) / (side.sensor * side.scene)))
+
+
+# ---- The start: orientation, scale and codes by spectra ----
+
+_FREQUENCIES = 20
+"""Of either sign, lowest first, whose spectra are compared: most light of a picture is there."""
+_COMPARED = 2
+"""Frames of those given whose spectra are compared."""
+_STEP = 1.1
+"""Of the scales that are looked at: what shifts the finest of these waves by half its length, where a shadow moves by a
+sixth of the sensor over the scene."""
+_WIDEST, _NARROWEST = 1.0, 0.03
+"""Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
+for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
+_FIRST_TURNS, _SCALE_TURNS = 2, 3
+"""Turns of the sides that tell which orientation is right, and which scale."""
+_CERTAIN = 1.2
+"""Times what the right orientation leaves of the frames that another must leave, or pictures do not tell it."""
+
+
+def spectral_start(exposures: Sequence[Exposure], scales: tuple[float, float]) -> tuple[float, FloatArray]:
+    """How nearly a product of two vectors the frames' spectra over the scenes' are, 0 to 1, and the code of columns
+    that follows (length,).
+
+    Parameters
+    ----------
+    exposures
+        scenes turned as they may lie.
+    scales
+        that may be right [sensor pixels / scene pixel].
+    """
+    some = exposures[:: -(-len(exposures) // _COMPARED)]
+    return _Spectra.of(some).compare([each.scene for each in some], scales)
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectra:
+    """Spectra of some ``frames`` (waves, waves), at multiples of 1 / ``periods``."""
+
+    frames: list[npt.NDArray[np.complex128]]
+    periods: tuple[float, float]
+
+    @classmethod
+    def of(cls, exposures: Sequence[Exposure]) -> _Spectra:
+        """Those of all ``exposures``. Periods leave room for a shadow that moves by half the sensor."""
+        rows, columns = exposures[0].frame.shape
+        periods = 1.5 * rows, 1.5 * columns
+        waves = [_waves(count, period) for count, period in zip((rows, columns), periods, strict=True)]
+        return cls([waves[0] @ each.frame @ waves[1].T for each in exposures], periods)
+
+    def compare(self, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> tuple[float, FloatArray]:
+        """As :func:`spectral_start`."""
+        above, below = np.zeros_like(self.frames[0]), np.zeros(self.frames[0].shape)
+        left, right = (
+            np.conj(_waves(count, period / scale))
+            for count, period, scale in zip(scenes[0].shape, self.periods, scales, strict=True)
+        )
+        for frame, scene in zip(self.frames, scenes, strict=True):
+            lit = left @ scene @ right.T
+            above += frame * np.conj(lit)
+            below += np.abs(frame * lit)
+        # Phases alone: of amplitudes a few strong waves would decide, which any code has.
+        _, values, code_waves = np.linalg.svd(above / np.maximum(below, np.finfo(np.float64).tiny))
+        code = np.real(code_waves[0] @ np.conj(_waves(int(2 * self.periods[1]), self.periods[1])))
+        return float(values[0] ** 2 / max(np.sum(np.square(values)), np.finfo(np.float64).tiny)), code
+
+
+def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
+    """(waves, count) exp(-2 pi i f x / ``period``) at whole x; f = 0 is left out."""
+    order = np.arange(1, _FREQUENCIES + 1)
+    return np.asarray(
+        np.exp(-2j * np.pi / period * np.multiply.outer(np.concatenate([order, -order]), np.arange(count)))
+    )
+
+
+@dataclass(frozen=True)
+class Pose:
+    """How scenes lie before the camera.
+
+    Attributes
+    ----------
+    orientation
+        one of :data:`TURNS`.
+    scales
+        of rows and of columns [sensor pixels / scene pixel].
+    margin
+        by how much more of the frames' energy this explains than the best of another orientation; None: not compared.
+    certain
+        whether that is clear.
+    """
+
+    orientation: str
+    scales: tuple[float, float]
+    margin: float | None = None
+    certain: bool = True
+
+
+@single_threaded_blas()
+def find_pose(
+    exposures: Sequence[Exposure],
+    orientation: str | None = None,
+    scales: tuple[float, float] | None = None,
+) -> Pose:
+    """How scenes lie, by spectra and then by codes that are fitted, both of centred frames: even light tells nothing.
+
+    Parameters
+    ----------
+    exposures
+        scenes as they are given.
+    orientation, scales
+        where they are known.
+    """
+    exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
+    some = exposures[:: -(-len(exposures) // _COMPARED)]
+    spectra = _Spectra.of(some)
+    scenes = {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
+    ratio = some[0].frame.shape[0] / some[0].scene.shape[0]
+    count = int(np.ceil(np.log(_WIDEST / _NARROWEST) / np.log(_STEP)))
+    places = [(ratio * _NARROWEST * _STEP**power,) * 2 for power in range(count + 1)] if scales is None else [scales]
+    scores = {name: np.array([spectra.compare(own, place)[0] for place in places]) for name, own in scenes.items()}
+    # Of a scale near 0 a frame is the product of two vectors whichever way the scene lies; the right way is one alone.
+    usual = np.median(list(scores.values()), axis=0)
+    found = [
+        (score - common, name, place)
+        for name, row in scores.items()
+        for score, common, place in zip(row, usual, places, strict=True)
+        if orientation in (None, name)
+    ]
+    candidates = {name: max(each for each in found if each[1] == name) for name in {name for _, name, _ in found}}
+    tried = []
+    for _, name, place in candidates.values():
+        turned = [each.turn_scene(name) for each in some]
+        if scales is None:
+            place = _refine(partial(_unlike, spectra, [each.scene for each in turned]), place, _STEP)
+        fitted = fit_codes(turned, Shape(place, 1, True), turns=_FIRST_TURNS)
+        tried.append((fitted.evidence, fitted.explained, name, place))
+    best = max(tried)
+    others = [explained for _, explained, name, _ in tried if name != best[2]]
+    pose = Pose(best[2], best[3])
+    if others:
+        pose = replace(pose, margin=best[1] - max(others), certain=1 - max(others) > _CERTAIN * (1 - best[1]))
+    if scales is not None:
+        return pose
+    turned = [each.turn_scene(pose.orientation) for each in exposures]
+
+    def misfit(at: tuple[float, float]) -> float:
+        return -fit_codes(turned, Shape(at, 1, True), turns=_SCALE_TURNS).evidence
+
+    for _ in range(_STEPS):
+        before, pose = pose.scales, replace(pose, scales=_refine(misfit, pose.scales, _FINE))
+        if np.all(np.abs(np.log(pose.scales) - np.log(before)) < np.log(_FINE) / 2):
+            break
+    return pose
+
+
+def _unlike(spectra: _Spectra, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> float:
+    return -spectra.compare(scenes, scales)[0]
+
+
+_FINE, _STEPS = 1.03, 10
+"""Part of a scale by which codes that are fitted may change it at once, a third of the spectra's step; how often, at
+most."""
+
+
+def _refine(
+    misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
+) -> tuple[float, float]:
+    """Scales of the least ``misfit``, each within a factor ``reach`` of the ``start``: rows, then columns."""
+    options = {"xatol": np.log(reach) * _TOLERANCE}
+    bounds = -np.log(reach), np.log(reach)
+    row = minimize_scalar(
+        lambda x: misfit((start[0] * np.exp(x), start[1])), bounds=bounds, method="bounded", options=options
+    )
+    rows = start[0] * float(np.exp(row.x))
+    column = minimize_scalar(
+        lambda x: misfit((rows, start[1] * np.exp(x))), bounds=bounds, method="bounded", options=options
+    )
+    return rows, start[1] * float(np.exp(column.x))
+
+
+_TOLERANCE = 0.05
+"""Of a search for a scale, of its reach: 7e-4 of the scale, a tenth of a pixel of a shadow's way of 150."""
+
+
+# ---- How many codes: by frames that are held out ----
+
+_GAIN = 0.02
+"""Of what was left of frames that were held out, that more codes must explain: less is within what two halves of the
+frames differ by."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How many codes a side has, and how well they explain frames that were not fitted.
+
+    Attributes
+    ----------
+    terms
+        that were chosen.
+    held_out
+        mean part of the energy of held-out frames that each number of terms explained, from one on; empty where no
+        frame could be held out.
+    """
+
+    terms: int
+    held_out: tuple[float, ...] = ()
+
+
+def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choice:
+    """The number of codes, of at most ``most``.
+
+    Pictures are held out in two halves, of a single one its frames: their noise at least is not that of the others.
+
+    Parameters
+    ----------
+    exposures
+        scenes turned as the code runs.
+    shape
+        what is fixed; of one term.
+    most
+        terms that are tried.
+    """
+    groups = sorted({each.group for each in exposures})
+    if len(groups) > 1:
+        halves = [{group: index % 2 for index, group in enumerate(groups)}[each.group] for each in exposures]
+    else:
+        halves = [index % 2 for index in range(len(exposures))]
+    folds = [[each for each, half in zip(exposures, halves, strict=True) if half == own] for own in (0, 1)]
+    if not all(folds) or any({e.plane for e in folds[0]} != {e.plane for e in folds[1]} for _ in groups[1:]):
+        return Choice(shape.terms)
+    found: list[float] = []
+    for terms in range(1, most + 1):
+        tried = replace(shape, terms=terms)
+        parts = [_held_out(folds[own], folds[1 - own], tried) for own in (0, 1)]
+        found.append(float(np.mean(parts)))
+        if len(found) > 1 and 1 - found[-1] > (1 - _GAIN) * (1 - found[-2]):
+            return Choice(terms - 1, tuple(found))
+    return Choice(most, tuple(found))
+
+
+def _held_out(kept: Sequence[Exposure], left_out: Sequence[Exposure], shape: Shape) -> float:
+    """Part of the energy of frames ``left_out`` that codes of those ``kept`` explain. Planes of the former that the
+    latter have none of have the gain that explains most."""
+    codes = fit_codes(kept, shape)
+    gains = codes.gains
+    for plane in {each.plane for each in left_out} - {*gains}:
+        gains = gains | {plane: float(np.mean([*codes.gains.values()]))}
+    return replace(codes, gains=gains).explains(left_out)

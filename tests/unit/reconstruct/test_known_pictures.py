@@ -1,0 +1,207 @@
+"""Factors by captures of known pictures: codes that were planted come back, within the error that is stated, however
+the pictures lie; lists and pictures that do not fit are refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsim import calibrate_known, load_calibration, load_run, reconstruct
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.exr import write_frame
+from mitsim.core.spectral_manifests import CALIBRATION, read_colours
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.shifted_codes import TURNS
+from mitsim.reconstruct.solution import Verdict
+from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
+
+
+def one(listed: Path, output: Path | None = None) -> Factors:
+    (factors,) = calibrate_known(listed, output).values()
+    return factors
+
+
+def error_of(factors: Factors, camera: KnownCamera) -> float:
+    return float(np.hypot(*factor_error((factors.left, factors.right), camera.factors())))
+
+
+@pytest.mark.parametrize(("pictures", "light"), [(3, 3e4), (6, 3e3)])
+def test_planted_codes_come_back_within_the_stated_error(tmp_path: Path, pictures: int, light: float) -> None:
+    """Some 60 effective numbers a side: the error's own spread is 10 %. Scales that are fitted too add to it."""
+    camera = KnownCamera(1, light)
+    factors = one(camera.write_session(tmp_path, pictures, terms=1))
+    result = factors.manifest.result
+    assert factors.ok
+    assert result["orientation"] == "upright"
+    assert result["scale"] == pytest.approx(SCALES, rel=3e-3)
+    assert 0.6 < error_of(factors, camera) / result["predicted_phi_error"] < 1.5
+    assert result["chi_square"] == pytest.approx(1, abs=0.05)
+    assert min(result["rank"]) >= 10
+
+
+def test_more_pictures_and_more_light_make_the_error_smaller(tmp_path: Path) -> None:
+    """Noise of independent frames: half the error of four times the pictures or of four times the light, but for the
+    numbers that few pictures do not tell at all."""
+    errors = {}
+    for pictures, light in ((2, 1e4), (8, 1e4), (8, 4e4)):
+        camera = KnownCamera(3, light)
+        listed = camera.write_session(tmp_path / f"{pictures}_{light:g}", pictures, terms=1, orientation="upright")
+        errors[pictures, light] = error_of(one(listed), camera)
+    few, many, bright = errors.values()
+    assert many < 0.7 * few
+    assert bright < 0.7 * many
+
+
+@pytest.mark.parametrize("name", [name for name in TURNS if "transposed" not in name])
+def test_pictures_may_lie_any_way_and_images_lie_as_they_do(tmp_path: Path, name: str) -> None:
+    camera = KnownCamera(2)
+    factors = one(camera.write_session(tmp_path, 3, TURNS[name]), tmp_path / "cal")
+    assert factors.manifest.result["orientation"] == name
+    assert factors.manifest.result["orientation_margin"] > 0.004
+    scene = camera.picture()
+    run = camera.write_run(tmp_path / "other", scene, "dots:2", turn=TURNS[name])
+    image = reconstruct(load_run(run), load_calibration(tmp_path / "cal")).image
+    assert np.corrcoef(image.ravel(), scene.ravel())[0, 1] > 0.8
+
+
+def test_transposed_pictures_are_refused_by_what_to_do(tmp_path: Path) -> None:
+    listed = KnownCamera(2).write_session(tmp_path, 3, TURNS["transposed, mirrored"])
+    with pytest.raises(MitsimError, match=r"lie transposed.* before the camera.*save the pictures transposed"):
+        one(listed, tmp_path / "cal")
+    assert not (tmp_path / "cal").exists()
+
+
+def test_patterns_tell_more_than_even_light(tmp_path: Path) -> None:
+    """One picture under nine patterns is nine pictures."""
+    camera = KnownCamera(4)
+    even = one(camera.write_session(tmp_path / "even", 1, orientation="upright", terms=1))
+    dots = one(camera.write_session(tmp_path / "dots", 1, patterns="dots:3", orientation="upright", terms=1))
+    assert sum(dots.manifest.result["told"]) > sum(even.manifest.result["told"])
+    assert dots.manifest.result["frames"] == 9
+
+
+@pytest.mark.parametrize(("falloff", "terms"), [(0.0, 1), (0.3, 2)])
+def test_held_out_frames_tell_how_many_codes_there_are(tmp_path: Path, falloff: float, terms: int) -> None:
+    """A code that loses 30 % from the middle to an edge, and gains as much to the other, is two: c(x) and i c(x)."""
+    camera = KnownCamera(5, falloff=falloff)
+    factors = one(camera.write_session(tmp_path, 6, orientation="upright"))
+    assert factors.manifest.result["terms"] == terms
+    assert error_of(factors, camera) < 0.1
+
+
+def test_all_planes_of_a_sensor_make_one_coloured_calibration(tmp_path: Path) -> None:
+    camera, runs = KnownCamera(6), []
+    for number in range(2):
+        picture = np.stack([camera.picture() for _ in "rgb"], axis=2)
+        camera.write_planes(tmp_path / f"run_{number}", picture)
+        Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(tmp_path / f"{number}.png")
+        runs.append({"run": f"run_{number}", "picture": f"{number}.png"})
+    listed = write_known(tmp_path / "known.json", runs, terms=1)
+    found = calibrate_known(listed, tmp_path / "cal")
+    assert set(read_colours(tmp_path / "cal", CALIBRATION).names) == set(PLANES) == set(found)
+    for name, offset in PLANES.items():
+        loaded = load_calibration(tmp_path / "cal" / name)
+        error = factor_error((loaded.left, loaded.right), camera.factors(offset))
+        assert np.hypot(*error) < 1.5 * loaded.manifest.result["predicted_phi_error"], name
+    straight = factor_error((found["r"].left, found["r"].right), camera.factors())
+    assert np.hypot(*straight) > 0.1, "half a pixel aside is another factor"
+
+
+# ---- What is flagged ----
+
+
+def test_runs_of_other_pictures_are_flagged(tmp_path: Path) -> None:
+    listed = KnownCamera(7).write_session(tmp_path, 4, orientation="upright")
+    for number in range(4):
+        (tmp_path / f"picture_{number}.png").rename(tmp_path / f"old_{number}.png")
+    for number in range(4):
+        (tmp_path / f"old_{number}.png").rename(tmp_path / f"picture_{(number + 1) % 4}.png")
+    factors = one(listed)
+    assert factors.status.verdict in (Verdict.NOT_SEPARABLE, Verdict.MOSTLY_NOISE)
+    assert str(factors.status) in factors.warnings
+
+
+def test_symmetric_pictures_do_not_tell_how_they_lie(tmp_path: Path) -> None:
+    camera = KnownCamera(8)
+    half = camera.picture()
+    picture = (half + half[:, ::-1]) / 2
+    camera.write_run(tmp_path / "run", picture)
+    np.save(tmp_path / "picture.npy", picture)
+    listed = write_known(tmp_path / "known.json", [{"run": "run", "picture": "picture.npy"}])
+    assert any(text.startswith("orientation: ") for text in one(listed).warnings)
+
+
+def test_saturated_frames_are_named(tmp_path: Path) -> None:
+    camera = KnownCamera(9)
+    listed = camera.write_session(tmp_path, 2, orientation="upright", terms=1)
+    picture = np.asarray(Image.open(tmp_path / "picture_0.png")) / 255
+    camera.write_run(tmp_path / "bright", picture, saturation_dn=9000.0)
+    fields = json.loads(listed.read_text())
+    write_known(listed, [{"run": "bright", "picture": "picture_0.png"}, *fields["known"]], terms=1)
+    factors = one(listed)
+    assert any("saturation: 1 runs have readings" in text and "bright" in text for text in factors.warnings)
+
+
+# ---- What is refused ----
+
+
+def with_grey(folder: Path, values: FloatArray) -> None:
+    np.save(folder / "picture.npy", values)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda fields: fields.update(known=[]), "known"),
+        (lambda fields: fields.update(gama=2), "gama"),
+        (lambda fields: fields.update(terms=9), "terms"),
+        (lambda fields: fields["known"].append(fields["known"][0]), "is there twice"),
+        (lambda fields: fields["known"].append({"run": "none", "picture": "picture_0.png"}), "no such folder"),
+        (lambda fields: fields["known"].append({"run": "small", "picture": "none.png"}), "none.png"),
+        (lambda fields: fields["known"][0].update(picture="tiny.npy"), "is 4 x 4 pixels"),
+        (lambda fields: fields["known"][0].update(picture="colour.png"), "is in colour"),
+        (lambda fields: fields["known"][0].update(colour="red"), "is grey"),
+        (lambda fields: (fields["known"][0].update(picture="negative.npy"), fields.update(gamma=2.2)), "below 0"),
+        (lambda fields: fields["known"][0].update(run="other"), "of another camera"),
+        (lambda fields: fields["known"][0].update(picture="black.npy"), "no light"),
+    ],
+)
+def test_lists_that_do_not_fit_are_refused(tmp_path: Path, change: Callable[[dict], None], message: str) -> None:
+    camera = KnownCamera(10)
+    listed = camera.write_session(tmp_path, 2, orientation="upright", terms=1)
+    camera.write_run(tmp_path / "other", camera.picture())
+    manifest = json.loads((tmp_path / "other" / "manifest.json").read_text())
+    (tmp_path / "other" / "manifest.json").write_text(json.dumps({**manifest, "camera": {"name": "another"}}))
+    camera.write_run(tmp_path / "small", camera.picture())
+    for name, values in (("tiny", np.ones((4, 4))), ("negative", -np.ones((20, 20))), ("black", np.zeros((20, 20)))):
+        np.save(tmp_path / f"{name}.npy", values)
+    Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(tmp_path / "colour.png")
+    fields = json.loads(listed.read_text())
+    change(fields)
+    if message == "of another camera":
+        fields["known"].reverse()
+    if message == "no light":
+        fields["known"] = fields["known"][:1]
+    listed.write_text(json.dumps(fields))
+    with pytest.raises(MitsimError, match=message):
+        one(listed, tmp_path / "cal")
+    assert not (tmp_path / "cal").exists()
+
+
+def test_a_truth_is_a_picture(tmp_path: Path) -> None:
+    """As `mitsim capture` writes it: a channel of reflectance beside its standard error."""
+    camera = KnownCamera(11)
+    picture = camera.picture()
+    camera.write_run(tmp_path / "run", picture)
+    channels = {"reflectance": picture.astype(np.float32), "standard_error": np.zeros((20, 20), np.float32)}
+    write_frame(tmp_path / "truth.exr", channels, {})
+    listed = write_known(
+        tmp_path / "known.json", [{"run": "run", "picture": "truth.exr"}], orientation="upright", scale=SCALES
+    )
+    assert error_of(one(listed), camera) < 1
