@@ -29,7 +29,7 @@ from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.misfit import Misfit, faulty_frames, find_misfit
-from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
+from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, Bounds, ImageCost, ImageRequest, predict_cost
 from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS
 from mitsim.reconstruct.subpixel import print_energy
@@ -57,8 +57,8 @@ class Reconstruction(Solution):
     misfit
         what of the measurements fits no image; None where there are no more data than unknowns.
     uncertainties
-        standard uncertainty of the image by source; None for ``tv`` and with a depth for each pixel, which are not
-        linear in the frames.
+        standard uncertainty of the image by source; None for ``nonnegative``, ``tv`` and with a depth for each pixel,
+        which are not linear in the frames.
     seconds
         by stage.
     inputs
@@ -252,6 +252,7 @@ def reconstruct(
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
     depth_range: tuple[float, float] | None = None,
+    bounds: Bounds | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -266,7 +267,7 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`) or ``tv`` (least total variation).
+        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's within bounds) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -277,14 +278,17 @@ def reconstruct(
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated depth.
+    bounds
+        least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
+        ``tv``.
 
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
+        another lambda, method, focus, margin, range or bounds, or a calibration that does not state its parallax.
     """
-    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range, bounds))
 
 
 @single_threaded_blas()
@@ -316,7 +320,7 @@ def reconstruct_request(
     clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
-        data = accumulate(shots, factors, method)
+        data = accumulate(shots, factors, method, request.bounds)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
@@ -414,7 +418,7 @@ def _without_defects(
 
     def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
         rest = defects.left_out(data)
-        without = accumulate(rest, data.factors, data.method)
+        without = accumulate(rest, data.factors, data.method, data.bounds)
         return rest, without, without.solution(lam)
 
     found, now, without = None, misfit, data
