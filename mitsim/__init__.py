@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.captured_session import calibrate_frames as calibrate_frames
     from mitsim.reconstruct.factors import Factors as Factors
     from mitsim.reconstruct.factors import load_calibration as load_calibration
+    from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
@@ -66,6 +67,7 @@ _HOMES = {
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
         "reconstruct.factors": "Factors load_calibration",
+        "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.quality": "reconstruct_colours",
     }.items()

@@ -49,7 +49,7 @@ class Reconstruction(Solution):
     Attributes
     ----------
     rank
-        of the whole model, the product of ``rank_sides``.
+        of the whole model, the product of ``rank_sides``; None, as all of these, where the model is not factorised.
     condition
         the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
     rank_sides, condition_sides
@@ -58,7 +58,7 @@ class Reconstruction(Solution):
         what of the measurements fits no image; None where there are no more data than unknowns.
     uncertainties
         standard uncertainty of the image by source; None for ``nonnegative``, ``tv`` and with a depth for each pixel,
-        which are not linear in the frames.
+        which are not linear in the frames, and by a point spread function.
     seconds
         by stage.
     inputs
@@ -69,10 +69,10 @@ class Reconstruction(Solution):
         seconds by stage and memory, before it was begun; None where nobody could tell.
     """
 
-    rank: int
-    condition: float
-    rank_sides: tuple[int, int]
-    condition_sides: tuple[float, float]
+    rank: int | None
+    condition: float | None
+    rank_sides: tuple[int, int] | None
+    condition_sides: tuple[float, float] | None
     misfit: Misfit | None
     uncertainties: Uncertainty | None
     seconds: dict[str, float]
@@ -86,9 +86,9 @@ class Reconstruction(Solution):
         return _by_pixel(self.focus)
 
     @property
-    def condition_whole(self) -> float:
+    def condition_whole(self) -> float | None:
         """Condition of the whole model; inf when rank deficient."""
-        return self.condition_sides[0] * self.condition_sides[1]
+        return None if self.condition_sides is None else self.condition_sides[0] * self.condition_sides[1]
 
     @property
     def uncertainty(self) -> FloatArray | None:
@@ -110,6 +110,7 @@ class Reconstruction(Solution):
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "iterations": self.iterations,
             "objective": self.objective,
             "relative_gap": self.relative_gap,
             "focus_mm": self.focus.mm if isinstance(self.focus, Depth) else None,

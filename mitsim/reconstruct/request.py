@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
 """Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+MOST_REDUCED = 1024
+"""Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE = "image.exr"
@@ -95,6 +97,22 @@ class ImageRequest:
     def looks_for_depth(self) -> bool:
         """Whether depths are found from the frames."""
         return self.focus in ("auto", "map")
+
+    def check_point_spread(self, reduce: int) -> None:
+        """ArgumentError for what no image by a point spread function is made by, or where not ``reduce`` x ``reduce``
+        pixels, a whole number of them, can become one."""
+        if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
+            raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
+        for name, neutral in (("focus", None), ("margin", 0)):
+            value = getattr(self, name)
+            if value != neutral:
+                raise ArgumentError(name, f"{value}: comes with a calibration, not with a point spread function")
+        if self.method not in (TIKHONOV, NONNEGATIVE, TV):
+            raise ArgumentError(
+                "method",
+                f"{self.method}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
+                f"{TV}",
+            )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
         """What decides an image: this, and fingerprints of its ``shots`` and ``factors``."""
