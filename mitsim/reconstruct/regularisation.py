@@ -214,23 +214,13 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     noise = coefficient_noise(problem)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
-    lam, exponents = least_risk(problem, noise), _EXPONENTS
+    exponents = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
+    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, exponents)
     if is_misfit(problem) or not explained:
         # Beyond the largest sigma^2 all goes to black.
         candidates = problem.scale * 10.0 ** exponents[exponents <= 0]
         lam = _steadiest(problem, [lam, *candidates[candidates > lam].tolist()])
     return lam
-
-
-_EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
-"""Powers of ten of lambda over the largest sigma^2 that are looked at: from what rounding hides to where all is
-lost."""
-
-
-def least_risk(problem: DiagonalProblem, noise: float | FloatArray) -> float:
-    """Lambda that minimises :func:`risk_score` of a ``problem``, in the unit of sigma^2, of data with that ``noise``
-    variance; 0 when no regularisation at all scores best."""
-    return _least(lambda lam: risk_score(problem, lam, noise), problem.scale, _EXPONENTS)
 
 
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
