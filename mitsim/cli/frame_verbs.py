@@ -85,19 +85,6 @@ class Solving:
 
 
 @dataclass(frozen=True)
-class OfPointSpread:
-    """A camera that is known by its point spread function."""
-
-    psf: Path | None = option(
-        None,
-        "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
-        "--psf",
-        metavar="FILE",
-    )
-    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
-
-
-@dataclass(frozen=True)
 class ColouredImage:
     """How an image in colour is made."""
 
@@ -114,10 +101,22 @@ class ColouredImage:
     )
 
 
+@dataclass(frozen=True)
+class OfPointSpread(ColouredImage):
+    """Cameras that are known by a point spread function, and those in colour."""
+
+    psf: Path | None = option(
+        None,
+        "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
+        "--psf",
+        metavar="FILE",
+    )
+    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
+
+
 @verb
 def reconstruct(
     *,
-    context: typer.Context,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
     calibration: Annotated[
         Path | None, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL", show_default="required")
@@ -126,8 +125,7 @@ def reconstruct(
         Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
     ] = None,
     solving: Solving,
-    point: OfPointSpread,
-    colours: ColouredImage,
+    camera: OfPointSpread,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     common: Common,
 ) -> int:
@@ -138,10 +136,14 @@ def reconstruct(
 
     options = solving.read()
     output = output or run / "reconstruction"
-    if point.psf is not None:
-        refuse_unused(context, ("calibration", "chart", "mosaic"), "with --psf")
-        return _reconstruct_psf(run, point, output, {**options, "overwrite": overwrite}, common)
-    refuse_unused(context, ("reduce",), "without --psf")
+    colours = {"chart": camera.chart, "mosaic": camera.mosaic}
+    if camera.psf is not None:
+        for name, value in {"calibration": calibration, **colours}.items():
+            if value is not None:
+                raise MitsimError(f"--{name} {value}: has no effect with --psf; leave it out")
+        return _reconstruct_psf(run, camera, output, {**options, "overwrite": overwrite}, common)
+    if camera.reduce != 1:
+        raise MitsimError(f"--reduce {camera.reduce}: has no effect without --psf; leave it out")
     if calibration is None:
         raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
     if not is_mosaic(run):
@@ -149,11 +151,11 @@ def reconstruct(
     if is_coloured(run):
         options["overwrite"] = overwrite
         if is_mosaic(run):
-            options = _mosaic_options(options, colours.mosaic or JOINT)
-        elif colours.mosaic is not None:
-            raise MitsimError(f"--mosaic {colours.mosaic}: {run} has a run for each line; leave out --mosaic")
-        return _reconstruct_colours(run, calibration, output, colours.chart, options, common)
-    for name, value in vars(colours).items():
+            options = _mosaic_options(options, camera.mosaic or JOINT)
+        elif camera.mosaic is not None:
+            raise MitsimError(f"--mosaic {camera.mosaic}: {run} has a run for each line; leave out --mosaic")
+        return _reconstruct_colours(run, calibration, output, camera.chart, options, common)
+    for name, value in colours.items():
         if value is not None:
             raise MitsimError(f"--{name} {value}: {run} is not coloured; leave out --{name}")
     # Refused before the solver is imported, which takes half a second.

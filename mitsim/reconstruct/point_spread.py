@@ -145,7 +145,7 @@ class ShiftedLight:
             total += part if light is None else light * part
         return total
 
-    def halved(self) -> ShiftedLight | None:
+    def half_size(self) -> ShiftedLight | None:
         """The same at half the size; None under patterns, and where that is too small."""
         smaller = min(*self.psf.shape, *self.sensor) // 2 >= _LEAST_SIDE
         if self.patterns is not None or not smaller:
@@ -153,9 +153,9 @@ class ShiftedLight:
         rows, columns = self.sensor
         return replace(self, psf=4 * halve(self.psf), sensor=(rows // 2, columns // 2))
 
-    def doubled(self, smaller: Array) -> Array:
-        """(n, n') image of that of :meth:`halved`, taken linearly between its pixels; pixel p of that is at 2 p + 1 for
-        light of an even number of pixels, at 2 p + 2 for an odd one."""
+    def double(self, smaller: Array) -> Array:
+        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of that is
+        at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
         image = np.zeros(self.scene, self.precision)
         place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
         for axis in (0, 1):
@@ -319,7 +319,7 @@ class _State:
             total += self.prior.weight * float(bent)
         return total
 
-    def moved(self, direction: Array, seen: Array, length: float) -> _State:
+    def move(self, direction: Array, seen: Array, length: float) -> _State:
         """The state a ``length`` along a ``direction``, which the sensor sees as ``seen``, within the bounds."""
         image = self.image + self.precise(length) * direction
         if not self.prior.bounded:
@@ -448,12 +448,12 @@ def minimise(
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
     """Where steps begin: at the image of half the size, or at none."""
     low, high = prior.bounds
-    smaller = light.halved()
+    smaller = light.half_size()
     if smaller:
         # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
         half = replace(prior, weight=prior.weight / 2)
         found = _descend(_start(smaller, np.stack([halve(each) for each in frames]), half), _COARSE_STEPS, 0.0)[0]
-        image = light.doubled(found.image)
+        image = light.double(found.image)
     else:
         image = np.zeros(light.scene, light.precision)
     image = np.clip(image, low, high)
@@ -497,10 +497,10 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
         earlier = pull
         seen = state.light.image_of(direction)
         step = -_dot(pull, direction) / state.curvature(direction, seen)
-        least, following = _FEWEST * step, state.moved(direction, seen, step)
+        least, following = _FEWEST * step, state.move(direction, seen, step)
         while following.smoothed > state.smoothed and step > least:
             step /= 2
-            following = state.moved(direction, seen, step)
+            following = state.move(direction, seen, step)
         stuck = step <= least
         if not stuck:
             state = following

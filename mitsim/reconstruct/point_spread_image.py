@@ -105,7 +105,15 @@ def reconstruct_psf_request(
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    """What decides an image: fingerprints of ``shots`` and of the ``psf`` (k, k'), ``reduce`` and the ``request``."""
+    """What decides an image.
+
+    Parameters
+    ----------
+    shots, psf
+        whose fingerprints count, (k, k') of the second.
+    reduce, request
+        as for :func:`reconstruct_psf_request`.
+    """
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {"run": shots.fingerprint, "psf": digest, "reduce": reduce, "lambda": request.lam, "method": request.method}
     return asked if request.bounds is None else {**asked, "bounds": plain_bounds(request.bounds)}

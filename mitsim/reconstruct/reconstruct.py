@@ -29,7 +29,7 @@ from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.misfit import Misfit, faulty_frames, find_misfit
-from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, Bounds, ImageCost, ImageRequest, predict_cost
+from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
 from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS
 from mitsim.reconstruct.subpixel import print_energy
@@ -253,7 +253,6 @@ def reconstruct(
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
     depth_range: tuple[float, float] | None = None,
-    bounds: Bounds | None = None,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -268,7 +267,8 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's within bounds) or ``tv`` (least total variation).
+        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
+        bounds: :func:`reconstruct_request`) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -279,17 +279,13 @@ def reconstruct(
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated depth.
-    bounds
-        least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
-        ``tv``.
-
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        another lambda, method, focus, margin, range or bounds, or a calibration that does not state its parallax.
+        another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range, bounds))
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
 
 
 @single_threaded_blas()

@@ -141,7 +141,7 @@ def solve_tv(
     if isinstance(weight, str) or not (np.isfinite(weight) and weight >= 0):
         raise MitsimError(f"TV weight is {weight!r}; give a finite number of at least 0, or auto")
     prior = Prior(weight=float(weight), bounds=bounds or Prior.bounds)
-    return _solve(prepared, problem, prior, float(weight), iterations, tolerance)
+    return _solve(prepared, problem, prior, iterations, tolerance)
 
 
 def solve_nonnegative(
@@ -174,21 +174,19 @@ def solve_nonnegative(
     if lam == "auto":
         lam = automatic_lambda(problem)
     ridge = check_lambda(lam)
-    return _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), ridge, iterations, tolerance)
+    return _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
 
 
-def _solve(
-    prepared: Prepared, problem: DiagonalProblem, prior: Prior, lam: float, iterations: int, tolerance: float
-) -> Solution:
+def _solve(prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float) -> Solution:
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     if not prior.weight and not prior.bounded:
         square = np.square(problem.sigma) + prior.ridge
         measured = problem.sigma > 0
         least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
-        return _solution(prepared, problem, prior, prepared.image(least), lam, 0, 0.0, True)
+        return _solution(prepared, problem, prior, prepared.image(least), 0, 0.0, True)
     image, spent, gap = _minimise(prepared, problem, prior, iterations, tolerance)
-    return _solution(prepared, problem, prior, image, lam, spent, gap, gap <= tolerance)
+    return _solution(prepared, problem, prior, image, spent, gap, gap <= tolerance)
 
 
 def _minimise(
@@ -344,7 +342,6 @@ def _solution(
     problem: DiagonalProblem,
     prior: Prior,
     image: FloatArray,
-    lam: float,
     iterations: int,
     gap: float,
     converged: bool,
@@ -375,7 +372,7 @@ def _solution(
         status = Status(Verdict.SOLVED, sentence, "", figures)
     return Solution(
         image=image,
-        lam=lam,
+        lam=prior.weight or prior.ridge,
         iterations=iterations,
         objective=outside / 2 + _objective(prepared, problem, image, prior),
         relative_gap=gap,

@@ -127,14 +127,14 @@ def test_half_the_size_sees_half_the_frame() -> None:
     for side in (70, 71):
         rows, columns = np.mgrid[:side, :side] / side - 0.5
         light = ShiftedLight(np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100, (80, 82))
-        half = light.halved()
-        assert half is not None and half.sensor == (40, 41) and half.halved() is None
+        half = light.half_size()
+        assert half is not None and half.sensor == (40, 41) and half.half_size() is None
         rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
         scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
-        seen, expected = halve(light.image_of(light.doubled(scene))[0]), half.image_of(scene)[0]
+        seen, expected = halve(light.image_of(light.double(scene))[0]), half.image_of(scene)[0]
         inside = np.s_[5:-5, 5:-5]
         assert np.abs(seen - expected)[inside].max() < 4e-3 * np.ptp(expected)
-    assert LIGHTS[2].halved() is None
+    assert LIGHTS[2].half_size() is None
     np.testing.assert_array_equal(reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
 
 
