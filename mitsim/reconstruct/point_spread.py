@@ -154,8 +154,8 @@ class ShiftedLight:
         return replace(self, psf=4 * halve(self.psf), sensor=(rows // 2, columns // 2))
 
     def double(self, smaller: Array) -> Array:
-        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of that is
-        at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
+        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
+        is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
         image = np.zeros(self.scene, self.precision)
         place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
         for axis in (0, 1):
@@ -342,7 +342,7 @@ class _State:
             held = length * length / np.maximum(length, self.smooth)
             variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
         pressed, left = self._parts(self.gradient)
-        best = pressed + self._bound(math.sqrt(_dot(left, left)))
+        best = pressed + self._most_lowered(math.sqrt(_dot(left, left)))
         if best <= enough or best > _NEAR * enough:
             return max(variation, 0.0) + best
         # Conjugate gradients on A^T A d = -g in the pixels that no bound holds.
@@ -359,7 +359,7 @@ class _State:
             seen = seen + self.precise(power / max(_dot(ahead, ahead), _NOTHING)) * ahead
             slope = self.gradient + self.light.correlate(seen)
             pressed, left = self._parts(slope)
-            best = min(best, pressed + _dot(seen, seen) / 2 + self._bound(math.sqrt(_dot(left, left))))
+            best = min(best, pressed + _dot(seen, seen) / 2 + self._most_lowered(math.sqrt(_dot(left, left))))
         return max(variation, 0.0) + best
 
     def _parts(self, slope: Array) -> tuple[float, Array]:
@@ -385,7 +385,7 @@ class _State:
             total += 0.0 if room is None else abs(_dot(room, part))
         return total, left
 
-    def _bound(self, slope: float) -> float:
+    def _most_lowered(self, slope: float) -> float:
         """Most that a gradient of that norm can lower P within R."""
         ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
         if slope <= ridge * reach:
