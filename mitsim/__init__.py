@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors as Factors
     from mitsim.reconstruct.factors import load_calibration as load_calibration
     from mitsim.reconstruct.known_pictures import calibrate_known as calibrate_known
+    from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
@@ -68,6 +69,7 @@ _HOMES = {
         "reconstruct.captured_session": "calibrate_frames",
         "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.factors": "Factors load_calibration",
+        "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.quality": "reconstruct_colours",
     }.items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -32,6 +32,9 @@ from mitsim.core.spectral_manifests import (
     read_mosaic,
 )
 from mitsim.reconstruct.request import MARKOV, METHODS, TIKHONOV
+
+if TYPE_CHECKING:
+    from mitsim.report.quality import Judged
 
 # ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
 
@@ -60,6 +63,11 @@ class Solving:
         "if not given",
         metavar="A:B",
     )
+    bounds: str | None = option(
+        None,
+        "least and largest number of the image, by nonnegative (0: if not given) and tv; either may be left out",
+        metavar="LOW:HIGH",
+    )
     margin: int = option(
         0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
     )
@@ -72,6 +80,7 @@ class Solving:
             "focus": None if self.focus is None else number_of("focus", self.focus, ("auto", "map")),
             "depth_range": None if self.depth_range is None else _two_depths(self.depth_range),
             "margin": self.margin,
+            "bounds": None if self.bounds is None else _two_bounds(self.bounds),
         }
 
 
@@ -92,16 +101,31 @@ class ColouredImage:
     )
 
 
+@dataclass(frozen=True)
+class OfPointSpread(ColouredImage):
+    """Cameras that are known by a point spread function, and those in colour."""
+
+    psf: Path | None = option(
+        None,
+        "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
+        "--psf",
+        metavar="FILE",
+    )
+    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
+
+
 @verb
 def reconstruct(
     *,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    calibration: Annotated[Path, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL", show_default="required")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
     ] = None,
     solving: Solving,
-    colours: ColouredImage,
+    camera: OfPointSpread,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     common: Common,
 ) -> int:
@@ -112,16 +136,26 @@ def reconstruct(
 
     options = solving.read()
     output = output or run / "reconstruction"
+    colours = {"chart": camera.chart, "mosaic": camera.mosaic}
+    if camera.psf is not None:
+        for name, value in {"calibration": calibration, **colours}.items():
+            if value is not None:
+                raise MitsimError(f"--{name} {value}: has no effect with --psf; leave it out")
+        return _reconstruct_psf(run, camera, output, {**options, "overwrite": overwrite}, common)
+    if camera.reduce != 1:
+        raise MitsimError(f"--reduce {camera.reduce}: has no effect without --psf; leave it out")
+    if calibration is None:
+        raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
     if not is_mosaic(run):
         ImageRequest(**options)
     if is_coloured(run):
         options["overwrite"] = overwrite
         if is_mosaic(run):
-            options = _mosaic_options(options, colours.mosaic or JOINT)
-        elif colours.mosaic is not None:
-            raise MitsimError(f"--mosaic {colours.mosaic}: {run} has a run for each line; leave out --mosaic")
-        return _reconstruct_colours(run, calibration, output, colours.chart, options, common)
-    for name, value in vars(colours).items():
+            options = _mosaic_options(options, camera.mosaic or JOINT)
+        elif camera.mosaic is not None:
+            raise MitsimError(f"--mosaic {camera.mosaic}: {run} has a run for each line; leave out --mosaic")
+        return _reconstruct_colours(run, calibration, output, camera.chart, options, common)
+    for name, value in colours.items():
         if value is not None:
             raise MitsimError(f"--{name} {value}: {run} is not coloured; leave out --{name}")
     # Refused before the solver is imported, which takes half a second.
@@ -137,15 +171,45 @@ def reconstruct(
     with common.job() as job:
         result = reconstruct_folder(run, calibration, output, **options, overwrite=overwrite, job=job)
     payload = {**result.summary(), "memory_bytes": memory_since(held)}
+    return _finish_image(result, payload, common)
+
+
+def _finish_image(result: Judged, payload: dict[str, Any], common: Common) -> int:
+    """Print a ``result``, whose JSON is the ``payload``; the exit status."""
+    rank = "" if payload["rank"] is None else f"rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
     lines = [
         payload["status"],
         *([] if result.quality is None else [str(result.quality)]),
-        f"lambda {payload['lambda']:.3g}, rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
-        f"residual {payload['residual']:.1e}: {payload['output']}",
+        f"lambda {payload['lambda']:.3g}, {rank}residual {payload['residual']:.1e}: {payload['output']}",
         *([] if result.reconstruction.focus is None else [str(result.reconstruction.focus)]),
         *result.reconstruction.trust,
     ]
     return finish(common.as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+
+
+def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dict[str, Any], common: Common) -> int:
+    """The image of a ``run`` by a point spread function, solved with ``options``."""
+    from mitsim.core.files import check_output
+    from mitsim.core.manifests import RunManifest, read_manifest
+    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest
+
+    # Refused before the solver is imported.
+    if is_coloured(run):
+        raise MitsimError(f"--psf {point.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
+    ImageRequest(**{name: value for name, value in options.items() if name != "overwrite"}).check_point_spread(
+        point.reduce
+    )
+    if point.psf is None or not point.psf.is_file():
+        raise MitsimError(f"--psf {point.psf}: is no file; give a picture of the light of a scene point")
+    read_manifest(run, RunManifest)
+    check_output(output, overwrite=(output / IMAGE_FILE).is_file())
+    from mitsim.core.job import memory_from_here, memory_since
+    from mitsim.report.quality import reconstruct_psf
+
+    held = memory_from_here()
+    with common.job() as job:
+        result = reconstruct_psf(run, point.psf, output, point.reduce, job=job, **options)
+    return _finish_image(result, {**result.summary(), "memory_bytes": memory_since(held)}, common)
 
 
 def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
@@ -157,7 +221,13 @@ def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
 
     check_way(way)
     check_joint(options["lam"])
-    for name, neutral in (("focus", None), ("method", "tikhonov"), ("margin", 0), ("depth_range", None)):
+    for name, neutral in (
+        ("focus", None),
+        ("method", "tikhonov"),
+        ("margin", 0),
+        ("depth_range", None),
+        ("bounds", None),
+    ):
         if options[name] != neutral:
             raise MitsimError(
                 f"{option_name(name)} {options[name]}: runs behind colour filters are solved by tikhonov at the "
@@ -194,6 +264,17 @@ def _reconstruct_colours(
         found = reconstruct_colours(run, calibration, output, place, job=job, **options)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
     return finish(common.as_json, payload, [*found.sentences, found.output], found.warnings)
+
+
+def _two_bounds(text: str) -> tuple[float, float]:
+    """The two numbers of LOW:HIGH; -inf and inf for ends that are left out."""
+    low, colon, high = text.partition(":")
+    try:
+        if colon:
+            return float(low or -math.inf), float(high or math.inf)
+    except ValueError:
+        pass
+    raise ArgumentError("bounds", f"{text!r}: give the least and the largest number, such as 0:1 or 0:")
 
 
 def _two_depths(text: str) -> tuple[float, float]:

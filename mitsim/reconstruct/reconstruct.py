@@ -49,7 +49,7 @@ class Reconstruction(Solution):
     Attributes
     ----------
     rank
-        of the whole model, the product of ``rank_sides``.
+        of the whole model, the product of ``rank_sides``; None, as all of these, where the model is not factorised.
     condition
         the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
     rank_sides, condition_sides
@@ -57,8 +57,8 @@ class Reconstruction(Solution):
     misfit
         what of the measurements fits no image; None where there are no more data than unknowns.
     uncertainties
-        standard uncertainty of the image by source; None for ``tv`` and with a depth for each pixel, which are not
-        linear in the frames.
+        standard uncertainty of the image by source; None for ``nonnegative``, ``tv`` and with a depth for each pixel,
+        which are not linear in the frames, and by a point spread function.
     seconds
         by stage.
     inputs
@@ -69,10 +69,10 @@ class Reconstruction(Solution):
         seconds by stage and memory, before it was begun; None where nobody could tell.
     """
 
-    rank: int
-    condition: float
-    rank_sides: tuple[int, int]
-    condition_sides: tuple[float, float]
+    rank: int | None
+    condition: float | None
+    rank_sides: tuple[int, int] | None
+    condition_sides: tuple[float, float] | None
     misfit: Misfit | None
     uncertainties: Uncertainty | None
     seconds: dict[str, float]
@@ -86,9 +86,9 @@ class Reconstruction(Solution):
         return _by_pixel(self.focus)
 
     @property
-    def condition_whole(self) -> float:
+    def condition_whole(self) -> float | None:
         """Condition of the whole model; inf when rank deficient."""
-        return self.condition_sides[0] * self.condition_sides[1]
+        return None if self.condition_sides is None else self.condition_sides[0] * self.condition_sides[1]
 
     @property
     def uncertainty(self) -> FloatArray | None:
@@ -110,6 +110,7 @@ class Reconstruction(Solution):
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
             "residual": self.residual,
+            "iterations": self.iterations,
             "objective": self.objective,
             "relative_gap": self.relative_gap,
             "focus_mm": self.focus.mm if isinstance(self.focus, Depth) else None,
@@ -266,7 +267,8 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`) or ``tv`` (least total variation).
+        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
+        bounds: :func:`reconstruct_request`) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -277,7 +279,6 @@ def reconstruct(
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated depth.
-
     Raises
     ------
     MitsimError
@@ -316,7 +317,7 @@ def reconstruct_request(
     clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
-        data = accumulate(shots, factors, method)
+        data = accumulate(shots, factors, method, request.bounds)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
@@ -414,7 +415,7 @@ def _without_defects(
 
     def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
         rest = defects.left_out(data)
-        without = accumulate(rest, data.factors, data.method)
+        without = accumulate(rest, data.factors, data.method, data.bounds)
         return rest, without, without.solution(lam)
 
     found, now, without = None, misfit, data

@@ -13,8 +13,12 @@ if TYPE_CHECKING:
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
 
-TIKHONOV, MARKOV, TV = METHODS = ("tikhonov", "markov", "tv")
+TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
 """Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+MOST_REDUCED = 1024
+"""Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
+Bounds = tuple[float, float]
+"""Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE = "image.exr"
 """By which a folder is known to hold an image."""
 
@@ -38,6 +42,9 @@ class ImageRequest:
     depth_range
         nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
         calibrated one.
+    bounds
+        least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
+        ``tv``.
     """
 
     lam: float | Literal["auto"] = "auto"
@@ -45,6 +52,7 @@ class ImageRequest:
     focus: float | Literal["auto", "map"] | None = None
     margin: int = 0
     depth_range: tuple[float, float] | None = None
+    bounds: Bounds | None = None
 
     def __post_init__(self) -> None:
         lam: float | str = self.lam
@@ -58,6 +66,8 @@ class ImageRequest:
             raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
         if self.depth_range is not None:
             self._check_range(self.depth_range)
+        if self.bounds is not None:
+            self._check_bounds(self.bounds)
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
         if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
@@ -75,10 +85,34 @@ class ImageRequest:
         if not self.looks_for_depth:
             raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
 
+    def _check_bounds(self, ends: Any) -> None:
+        two = isinstance(ends, (tuple, list)) and len(ends) == 2
+        real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
+        if not (real and ends[0] < ends[1] and ends[0] < math.inf and ends[1] > -math.inf):
+            raise ArgumentError("bounds", f"{ends}: give two numbers, the smaller one first")
+        if self.method not in (NONNEGATIVE, TV):
+            raise ArgumentError("bounds", f"{ends}: come with method {NONNEGATIVE} or {TV}; {self.method} has none")
+
     @property
     def looks_for_depth(self) -> bool:
         """Whether depths are found from the frames."""
         return self.focus in ("auto", "map")
+
+    def check_point_spread(self, reduce: int) -> None:
+        """ArgumentError for what no image by a point spread function is made by, or where not ``reduce`` x ``reduce``
+        pixels, a whole number of them, can become one."""
+        if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
+            raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
+        for name, neutral in (("focus", None), ("margin", 0)):
+            value = getattr(self, name)
+            if value != neutral:
+                raise ArgumentError(name, f"{value}: comes with a calibration, not with a point spread function")
+        if self.method not in (TIKHONOV, NONNEGATIVE, TV):
+            raise ArgumentError(
+                "method",
+                f"{self.method}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
+                f"{TV}",
+            )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
         """What decides an image: this, and fingerprints of its ``shots`` and ``factors``."""
@@ -90,7 +124,13 @@ class ImageRequest:
         }
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
+        asked |= {} if self.bounds is None else {"bounds": plain_bounds(self.bounds)}
         return {**asked, "margin": self.margin} if self.margin else asked
+
+
+def plain_bounds(bounds: Bounds) -> list[float | None]:
+    """``bounds`` as JSON holds them: None for an end that is infinite."""
+    return [end if math.isfinite(end) else None for end in bounds]
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:

@@ -3,24 +3,27 @@
 A further one is a class with ``init`` and ``compute`` (:class:`Solver`), a line in :data:`SOLVERS`, and its name in
 :data:`mitsim.reconstruct.request.METHODS`, which is read before numpy is imported.
 
-*Total variation.* Minimises P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X), isotropic TV, by
-ADMM (Boyd et al. 2011, section 3.1.1) on X = Z, D = grad Z: the X step is the Tikhonov solve around Z, diagonal in the
-basis of the prepared factors; the D step shrinks gradients; the Z step is a Poisson equation, diagonal in cosines, so
-that it costs the same whatever the weight.
+*Total variation and bounds.* Minimises P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X) + ridge /
+2 ||X||^2, isotropic TV, over all X whose numbers are within bounds, by ADMM (Boyd et al. 2011, section 3.1.1) on X = Z,
+D = grad Z, B = Z: the X step is the Tikhonov solve around Z, diagonal in the basis of the prepared factors; the D step
+shrinks gradients; the B step clips; the Z step is a Poisson equation, diagonal in cosines, so that it costs the same
+whatever the weight. The image is Z, clipped.
 
-How far an image is above the minimum is told by duality. With |Q| <= weight everywhere, Q . grad X <= weight TV(X), so
-P is nowhere below the quadratic that has Q . grad X in place of it. Among all images that are no farther from X than r,
-that quadratic is at its least not below its value at X less 1/2 sum c^2 / (sigma^2 + mu) + mu r^2 / 2, for any mu >= 0,
-c being the coefficients of its gradient at X. Hence P(X) exceeds the minimum by no more than
+How far an image is above the minimum is told by duality. With |Q| <= weight everywhere, Q . grad X <= weight TV(X); and
+with N that pushes against bounds alone, N . X is nowhere within them above its value at the bounds. So P is there
+nowhere below the quadratic that has Q . grad X and N . (X - bound) for these. Among all images that are no farther
+from X than r, that quadratic is at its least not below its value at X less 1/2 sum c^2 / (sigma^2 + ridge + mu) + mu
+r^2 / 2, for any mu >= 0, c being the coefficients of its gradient at X. Hence P(X) exceeds the minimum by no more than
 
-    gap = weight TV(X) - Q . grad X + 1/2 sum c^2 / (sigma^2 + mu) + mu r^2 / 2
+    gap = weight TV(X) - Q . grad X + N . (bound - X) + 1/2 sum c^2 / (sigma^2 + ridge + mu) + mu r^2 / 2
 
-with the Q that the D step gives, the best mu, and r = ||X||. (mu is for directions that frames hardly measure: at mu =
-0 these would divide by sigma^2.)
+with the Q and N that the D and B steps give, the best mu, and r = ||X||. (mu is for directions that frames hardly
+measure: at mu = 0 these would divide by sigma^2.)
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -31,14 +34,14 @@ from scipy.fft import dctn, idctn
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.convolution import ConvolutionalCamera, solve_iteratively
+from mitsim.reconstruct.convolution import ConvolutionalCamera, check_lambda, solve_iteratively
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
-from mitsim.reconstruct.request import MARKOV, TIKHONOV, TV
+from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV, Bounds
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
 
-# ---- Total variation -------------------------------------------------------------------------------------------------
+# ---- Total variation and bounds --------------------------------------------------------------------------------------
 
 
 _BALANCE, _STEP = 3.0, 2.0
@@ -67,12 +70,51 @@ def automatic_weight(problem: DiagonalProblem) -> float:
     return AUTO_WEIGHT * float(np.sqrt(noise_variance(problem) * np.mean(np.square(problem.sigma))))
 
 
+@dataclass(frozen=True)
+class Prior:
+    """What is known of an image X before it is seen: weight TV(X) + ridge / 2 ||X||^2 is added to half the squared
+    misfit, and all numbers of X are within ``bounds``.
+
+    Attributes
+    ----------
+    weight
+        of the total variation [data^2 / image].
+    ridge
+        lambda [(data / image)^2].
+    bounds
+        least and largest number of an image.
+    """
+
+    weight: float = 0.0
+    ridge: float = 0.0
+    bounds: Bounds = (-math.inf, math.inf)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether not every number is allowed."""
+        return math.isfinite(self.bounds[0]) or math.isfinite(self.bounds[1])
+
+    def slack(self, image: FloatArray, pressed: FloatArray) -> float:
+        """How far <``pressed``, X> may exceed <``pressed``, ``image``> within the bounds: 0 where ``pressed`` pushes
+        against the bound that a pixel is at; inf where it pushes against none."""
+        low, high = self.bounds
+        down, up = np.minimum(pressed, 0.0), np.maximum(pressed, 0.0)
+        total = 0.0
+        for part, bound in ((down, low), (up, high)):
+            if math.isfinite(bound):
+                total += float(np.sum(part * (bound - image)))
+            elif part.any():
+                return math.inf
+        return total
+
+
 def solve_tv(
     prepared: Prepared,
     frames: Accumulator,
     weight: float | str = "auto",
     iterations: int = 5000,
     tolerance: float = 1e-4,
+    bounds: Bounds | None = None,
 ) -> Solution:
     """Total-variation solution of the added frames.
 
@@ -81,9 +123,12 @@ def solve_tv(
     prepared, frames
         the factorised model, and all its frames.
     weight
-        >= 0 [data^2 / image], or ``"auto"``: :func:`automatic_weight`; 0 is least squares in closed form.
+        >= 0 [data^2 / image], or ``"auto"``: :func:`automatic_weight`; 0 is least squares, without bounds in closed
+        form.
     iterations, tolerance
         it stops when the relative gap is at most ``tolerance``, or after so many steps.
+    bounds
+        least and largest number of the image; None: any.
 
     Raises
     ------
@@ -95,51 +140,108 @@ def solve_tv(
         weight = automatic_weight(problem)
     if isinstance(weight, str) or not (np.isfinite(weight) and weight >= 0):
         raise MitsimError(f"TV weight is {weight!r}; give a finite number of at least 0, or auto")
+    prior = Prior(weight=float(weight), bounds=bounds or Prior.bounds)
+    return _solve(prepared, problem, prior, iterations, tolerance)
+
+
+def solve_nonnegative(
+    prepared: Prepared,
+    frames: Accumulator,
+    lam: float | str = "auto",
+    iterations: int = 5000,
+    tolerance: float = 1e-4,
+    bounds: Bounds | None = None,
+) -> Solution:
+    """Tikhonov's solution of the added frames among images within bounds.
+
+    Parameters
+    ----------
+    prepared, frames
+        the factorised model, and all its frames.
+    lam
+        lambda >= 0, or ``"auto"``: Tikhonov's (:func:`mitsim.reconstruct.regularisation.automatic_lambda`).
+    iterations, tolerance
+        as :func:`solve_tv`; the objective is half of Tikhonov's.
+    bounds
+        least and largest number of the image; None: 0 and inf.
+
+    Raises
+    ------
+    MitsimError
+        for missing frames, another lambda, or no iterations.
+    """
+    problem = prepared.problem(frames)
+    if lam == "auto":
+        lam = automatic_lambda(problem)
+    ridge = check_lambda(lam)
+    return _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
+
+
+def _solve(prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float) -> Solution:
     if iterations < 1:
-        raise MitsimError(f"TV iterations are {iterations}; give at least 1")
-    if not weight:
+        raise MitsimError(f"iterations are {iterations}; give at least 1")
+    if not prior.weight and not prior.bounded:
+        square = np.square(problem.sigma) + prior.ridge
         measured = problem.sigma > 0
-        least = np.divide(problem.projected, problem.sigma, out=np.zeros_like(problem.sigma), where=measured)
-        return _solution(prepared, problem, prepared.image(least), 0.0, 0, 0.0, True)
-    image, spent, gap = _minimise(prepared, problem, float(weight), iterations, tolerance)
-    return _solution(prepared, problem, image, float(weight), spent, gap, gap <= tolerance)
+        least = np.divide(problem.sigma * problem.projected, square, out=np.zeros_like(square), where=measured)
+        return _solution(prepared, problem, prior, prepared.image(least), 0, 0.0, True)
+    image, spent, gap = _minimise(prepared, problem, prior, iterations, tolerance)
+    return _solution(prepared, problem, prior, image, spent, gap, gap <= tolerance)
 
 
 def _minimise(
-    prepared: Prepared, problem: DiagonalProblem, weight: float, iterations: int, tolerance: float
+    prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float
 ) -> tuple[FloatArray, int, float]:
     """The image (n, n') whose relative gap is at most ``tolerance``, or that after ``iterations`` steps; the steps; its
     relative gap."""
-    squared, data = np.square(problem.sigma), problem.sigma * problem.projected
+    weight, ridge = prior.weight, prior.ridge
+    squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
     rho = _penalty(problem)
     smooth = prepared.image(data / (squared + rho))
     slopes = _gradient(smooth)
     rho_slopes = weight / max(float(_length(slopes).mean()), _NOTHING)
-    dual, dual_slopes = np.zeros_like(smooth), np.zeros_like(slopes)
+    # Without bounds nothing is held to them.
+    inside, rho_inside = np.clip(smooth, *prior.bounds), rho if prior.bounded else 0.0
+    dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
     rows, columns = (2 - 2 * np.cos(np.pi * np.arange(size) / size) for size in smooth.shape)
     laplacian = rows[:, None] + columns
     spent, relative = 0, float("inf")
     while spent < iterations and relative > tolerance:
         spent += 1
         target = smooth - dual
-        seen = prepared.coefficients(target)
+        seen, kept = prepared.coefficients(target), rho / (ridge + rho)
         # Directions outside the basis (under-determined sides) are not measured: they keep the target.
-        updated = target + prepared.image((data + rho * seen) / (squared + rho) - seen)
-        target = slopes - dual_slopes
-        length = _length(target)
-        shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
-        bounded = rho_slopes * (target - shrunk)
-        before = smooth
-        relaxed = _RELAXED * updated + (1 - _RELAXED) * smooth
-        relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
-        source = rho * (relaxed + dual) + rho_slopes * _gradient_adjoint(relaxed_slopes + dual_slopes)
-        smooth = idctn(dctn(source, norm="ortho") / (rho + rho_slopes * laplacian), norm="ortho")
+        updated = kept * target + prepared.image((data + rho * seen) / (squared + rho) - kept * seen)
+        before, before_inside = smooth, inside
+        source = rho * (_RELAXED * updated + (1 - _RELAXED) * smooth + dual)
+        total: FloatArray | float = rho
+        bounded, pressed = dual_slopes, dual_inside
+        if weight:
+            target = slopes - dual_slopes
+            length = _length(target)
+            shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
+            bounded = rho_slopes * (target - shrunk)
+            relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
+            source += rho_slopes * _gradient_adjoint(relaxed_slopes + dual_slopes)
+            total = total + rho_slopes * laplacian
+        if prior.bounded:
+            target = smooth - dual_inside
+            inside = np.clip(target, *prior.bounds)
+            pressed = rho_inside * (target - inside)
+            relaxed_inside = _RELAXED * inside + (1 - _RELAXED) * smooth
+            source += rho_inside * (relaxed_inside + dual_inside)
+            total = total + rho_inside
+        smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
         slopes = _gradient(smooth)
-        dual += relaxed - smooth
-        dual_slopes += relaxed_slopes - slopes
+        dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
+        if weight:
+            dual_slopes += relaxed_slopes - slopes
+        if prior.bounded:
+            dual_inside += relaxed_inside - smooth
         if spent % _JUDGED_EACH == 0 or spent == iterations:
-            objective = _objective(prepared, problem, smooth, weight)
-            parts = _gap(prepared, problem, smooth, weight, bounded)
+            image = np.clip(smooth, *prior.bounds)
+            objective = _objective(prepared, problem, image, prior)
+            parts = _gap(prepared, problem, image, prior, bounded, pressed)
             relative = sum(parts) / objective if objective > 0 else 0.0
             # Gradients that are bound too tightly leave the data behind, and the other way round.
             factor = _towards(*parts, power=0.25)
@@ -150,7 +252,12 @@ def _minimise(
             moved = _norm(smooth - before) / max(_norm(dual), _NOTHING)
             factor = _towards(apart, moved, power=0.5)
             rho, dual = rho * factor, dual / factor
-    return smooth, spent, relative
+            if prior.bounded:
+                apart = _norm(inside - smooth) / max(_norm(inside), _norm(smooth), _NOTHING)
+                moved = _norm(inside - before_inside) / max(_norm(dual_inside), _NOTHING)
+                factor = _towards(apart, moved, power=0.5)
+                rho_inside, dual_inside = rho_inside * factor, dual_inside / factor
+    return np.asarray(np.clip(smooth, *prior.bounds)), spent, relative
 
 
 def _towards(first: float, second: float, power: float) -> float:
@@ -160,27 +267,37 @@ def _towards(first: float, second: float, power: float) -> float:
     return 1.0 if 1 / _BALANCE <= ratio <= _BALANCE else float(np.clip(ratio**power, 1 / _STEP, _STEP))
 
 
-def _objective(prepared: Prepared, problem: DiagonalProblem, image: FloatArray, weight: float) -> float:
-    """P(X) of an ``image`` (n, n') at a ``weight``, without the energy outside the model's range."""
+def _objective(prepared: Prepared, problem: DiagonalProblem, image: FloatArray, prior: Prior) -> float:
+    """P(X) of an ``image`` (n, n') under a ``prior``, without the energy outside the model's range."""
     misfit = problem.projected - problem.sigma * prepared.coefficients(image)
-    return 0.5 * float(np.square(misfit).sum()) + weight * float(_length(_gradient(image)).sum())
+    variation = prior.weight * float(_length(_gradient(image)).sum()) if prior.weight else 0.0
+    return 0.5 * float(np.square(misfit).sum() + prior.ridge * np.square(image).sum()) + variation
 
 
 def _gap(
-    prepared: Prepared, problem: DiagonalProblem, image: FloatArray, weight: float, bounded: FloatArray
+    prepared: Prepared,
+    problem: DiagonalProblem,
+    image: FloatArray,
+    prior: Prior,
+    bounded: FloatArray,
+    pressed: FloatArray,
 ) -> tuple[float, float]:
-    """The gap of an ``image`` (n, n') in two parts, that of total variation and that of the quadratic; ``bounded`` (2,
-    n, n') is Q, no longer than ``weight`` anywhere."""
-    slopes = _gradient(image)
-    variation = weight * float(_length(slopes).sum()) - float(np.sum(bounded * slopes))
-    pull = _gradient_adjoint(bounded)
-    along = prepared.coefficients(pull)
+    """The gap of an ``image`` (n, n') in two parts, that of the ``prior`` and that of the quadratic; ``bounded`` (2, n,
+    n') is Q, no longer than the weight anywhere, and ``pressed`` (n, n') is N."""
+    pull, variation = pressed, prior.slack(image, pressed)
+    if prior.weight:
+        slopes = _gradient(image)
+        variation += prior.weight * float(_length(slopes).sum()) - float(np.sum(bounded * slopes))
+        pull = pull + _gradient_adjoint(bounded)
+    pull = pull + prior.ridge * image
+    along, seen = prepared.coefficients(pull), prepared.coefficients(image)
     unmeasured = float(np.square(pull - prepared.image(along)).sum())
-    squared = np.square(problem.sigma)
-    gradient = np.square(problem.sigma * (problem.sigma * prepared.coefficients(image) - problem.projected) + along)
+    squared = np.square(problem.sigma) + prior.ridge
+    gradient = np.square(problem.sigma * (problem.sigma * seen - problem.projected) + along)
     dampings, reach = problem.scale * _DAMPINGS, float(np.square(image).sum())
     quadratic = min(
-        0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / mu + mu * reach) for mu in dampings.tolist()
+        0.5 * (float(np.sum(gradient / (squared + mu))) + unmeasured / (prior.ridge + mu) + mu * reach)
+        for mu in dampings.tolist()
     )
     return max(variation, 0.0), quadratic
 
@@ -223,8 +340,8 @@ def _penalty(problem: DiagonalProblem) -> float:
 def _solution(
     prepared: Prepared,
     problem: DiagonalProblem,
+    prior: Prior,
     image: FloatArray,
-    weight: float,
     iterations: int,
     gap: float,
     converged: bool,
@@ -233,30 +350,31 @@ def _solution(
     outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
     lost = prepared.unknowns - prepared.rank
-    figures = f"{prepared.extent}."
+    figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
     if not converged:
         status = Status(
             Verdict.NOT_CONVERGED,
-            f"Not converged: after {iterations} iterations total variation may still be {gap:.1e} above its minimum",
-            "take a weight nearer the automatic one, or allow more iterations or a larger tolerance",
+            f"Not converged: after {iterations} iterations {name} may still be {gap:.1e} above its minimum",
+            f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more iterations or a "
+            "larger tolerance",
             figures,
         )
     elif lost:
         status = Status(
             Verdict.PARTLY_MEASURED,
             f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured and "
-            "follow from total variation alone",
+            f"follow from {name} alone",
             "use more patterns",
             figures,
         )
     else:
-        sentence = f"Solved: total variation converged in {iterations} iterations, {gap:.0e} or less above its minimum"
+        sentence = f"Solved: {name} converged in {iterations} iterations, {gap:.0e} or less above its minimum"
         status = Status(Verdict.SOLVED, sentence, "", figures)
     return Solution(
         image=image,
-        lam=weight,
+        lam=prior.weight or prior.ridge,
         iterations=iterations,
-        objective=outside / 2 + _objective(prepared, problem, image, weight),
+        objective=outside / 2 + _objective(prepared, problem, image, prior),
         relative_gap=gap,
         residual=float(np.sqrt(misfit / problem.energy)) if problem.energy > 0 else 0.0,
         status=status,
@@ -288,7 +406,9 @@ class Solver(Protocol):
         """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
         ...
 
-    def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+    ) -> Solution:
         """The image of one scene.
 
         Parameters
@@ -297,6 +417,8 @@ class Solver(Protocol):
             what :meth:`init` gives, and all frames, added up.
         lam
             lambda; what ``auto`` does is the solver's own.
+        bounds
+            least and largest number of the image, of solvers that heed them; None: the solver's own.
         """
         ...
 
@@ -310,7 +432,9 @@ class Tikhonov:
         """The ``camera``'s model under ``patterns``, factorised."""
         return prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
 
-    def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+    ) -> Solution:
         """The image of ``frames``.
 
         Parameters
@@ -319,6 +443,8 @@ class Tikhonov:
             what :meth:`init` gives, and all frames, added up.
         lam
             lambda; ``auto``: :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
+        bounds
+            None: a closed form knows no bounds.
         """
         return prepared.solve(frames, lam)
 
@@ -333,22 +459,40 @@ class Markov(Tikhonov):
         return super().init(camera, patterns).with_correlation()
 
 
-class TotalVariation(Tikhonov):
-    """Least squares with lambda times the total variation of X, by iterations."""
+class Nonnegative(Tikhonov):
+    """Tikhonov's least squares among images within bounds, by iterations."""
 
     linear = False
 
-    def compute(self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"]) -> Solution:
-        """The image of ``frames``.
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+    ) -> Solution:
+        """The image of ``frames``: :func:`solve_nonnegative`.
 
         Parameters
         ----------
-        prepared, frames
-            what :meth:`init` gives, and all frames, added up.
-        lam
-            weight; ``auto``: :func:`mitsim.reconstruct.solvers.automatic_weight`.
+        prepared, frames, lam, bounds
+            what :meth:`init` gives, all frames, added up, lambda, and ends of the image's numbers; None: 0 and inf.
         """
-        return solve_tv(prepared, frames, lam)
+        return solve_nonnegative(prepared, frames, lam, bounds=bounds)
+
+
+class TotalVariation(Tikhonov):
+    """Least squares with lambda times the total variation of X, within bounds, by iterations."""
+
+    linear = False
+
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+    ) -> Solution:
+        """The image of ``frames``: :func:`solve_tv`.
+
+        Parameters
+        ----------
+        prepared, frames, lam, bounds
+            what :meth:`init` gives, all frames, added up, the weight, and ends of the image's numbers; None: any.
+        """
+        return solve_tv(prepared, frames, lam, bounds=bounds)
 
 
 @dataclass(frozen=True)
@@ -386,5 +530,10 @@ class Convolutional:
         return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)
 
 
-SOLVERS: dict[str, Solver] = {TIKHONOV: Tikhonov(), MARKOV: Markov(), TV: TotalVariation()}
+SOLVERS: dict[str, Solver] = {
+    TIKHONOV: Tikhonov(),
+    MARKOV: Markov(),
+    NONNEGATIVE: Nonnegative(),
+    TV: TotalVariation(),
+}
 """By the method that an image is asked by."""

@@ -19,6 +19,7 @@ from mitsim.core.job import Job
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_colours, same_lines
 from mitsim.devices.chart import ChartPlace
+from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct_request
@@ -66,7 +67,7 @@ def reconstruct(
     job
         its clock.
     **options
-        ``method``, ``focus``, ``margin`` and ``depth_range``, as there.
+        ``method``, ``focus``, ``margin``, ``depth_range`` and ``bounds``, as there.
     """
     started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
     with job.clock.stage("read"):
@@ -85,6 +86,45 @@ def reconstruct(
         )
         with job.clock.stage("write"):
             judged.reconstruction.write(folder, judged.summary())
+    return judged
+
+
+def reconstruct_psf(
+    run: Path | str,
+    psf: Path | str,
+    output: Path | str,
+    reduce: int = 1,
+    overwrite: bool = False,
+    job: Job | None = None,
+    **options: Any,
+) -> Judged:
+    """Recover the image of a run with a measured point spread function; writes image.exr, image.png and result.json.
+
+    MitsimError as :func:`mitsim.reconstruct.point_spread_image.reconstruct_psf`, and for an output that cannot be
+    written.
+
+    Parameters
+    ----------
+    run, psf, output
+        RUN folder, picture of the light of a scene point, and a folder for the image, as for :func:`reconstruct`.
+    reduce
+        pixels a side, of frames and picture, that become one.
+    overwrite
+        whether an earlier image of other inputs may be replaced.
+    job
+        its clock.
+    **options
+        ``lam``, ``method`` and ``bounds``, as there.
+    """
+    from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
+
+    request = ImageRequest(**options)
+    request.check_point_spread(reduce)
+    shots, light = load_run(run), load_psf(psf, reduce)
+    replaces = may_replace(Path(output), psf_inputs(shots, light, reduce, request), overwrite)
+    with output_folder(output, overwrite=replaces) as folder:
+        judged = Judged(reconstruct_psf_request(shots, psf, reduce, request, job), None, str(folder))
+        judged.reconstruction.write(folder, judged.summary())
     return judged
 
 

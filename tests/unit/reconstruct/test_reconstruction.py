@@ -78,7 +78,7 @@ def test_memory_and_disk_give_the_same_image(shots: Capture, factors: Factors, t
     assert quality is not None and quality.psnr_db > 20 and quality.ssim is None, "4 pixels are less than its window"
 
 
-class NonNegative(Tikhonov):
+class Projected(Tikhonov):
     """Least squares without negative pixels, by projected gradients."""
 
     linear = False
@@ -100,9 +100,9 @@ def test_a_further_solver_is_a_class_and_its_name(
 ) -> None:
     """Asked for by its name, judged for misfit, written and refused as all are. (Planted: its image replaced by the
     closed form's; uncertainties of an image that is not linear in the frames.)"""
-    monkeypatch.setitem(SOLVERS, "nonnegative", NonNegative())
-    monkeypatch.setattr(request, "METHODS", (*request.METHODS, "nonnegative"))
-    found = reconstruct(shots, factors, method="nonnegative")
+    monkeypatch.setitem(SOLVERS, "projected", Projected())
+    monkeypatch.setattr(request, "METHODS", (*request.METHODS, "projected"))
+    found = reconstruct(shots, factors, method="projected")
     least = reconstruct(shots, factors, 0.0)
     assert str(found.status).startswith("Solved: no pixel is negative") and found.image.min() >= 0
     np.testing.assert_allclose(found.image, np.maximum(least.image, 0), atol=1e-5)
@@ -111,8 +111,8 @@ def test_a_further_solver_is_a_class_and_its_name(
         and found.misfit is not None
         and found.misfit.unexplained == (least.misfit and least.misfit.unexplained)
     )
-    assert json.loads((found.save(tmp_path / "image") / "result.json").read_text())["inputs"]["method"] == "nonnegative"
-    with pytest.raises(MitsimError, match=r"use tikhonov, markov, tv.* or nonnegative"):
+    assert json.loads((found.save(tmp_path / "image") / "result.json").read_text())["inputs"]["method"] == "projected"
+    with pytest.raises(MitsimError, match=r"use tikhonov, markov, nonnegative, tv.* or projected"):
         reconstruct(shots, factors, method="positive")
 
 

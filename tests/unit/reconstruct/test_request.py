@@ -7,7 +7,7 @@ import math
 import pytest
 
 from mitsim.core.errors import ArgumentError
-from mitsim.reconstruct.request import ImageRequest, check_joint
+from mitsim.reconstruct.request import ImageRequest, check_joint, plain_bounds
 from mitsim.reconstruct.solvers import SOLVERS
 
 TAKEN = [
@@ -21,7 +21,7 @@ REFUSED = [
     *((("auto", method, None, 0), "method", "use tikhonov, markov") for method in ("gram", "")),
     *(((lam, "tv", None, 0), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan, "none")),
     *((("auto", "tv", focus, 0), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan, "near")),
-    *((("auto", method, "map", 0), "method", "tikhonov alone") for method in ("markov", "tv")),
+    *((("auto", method, "map", 0), "method", "tikhonov alone") for method in ("markov", "nonnegative", "tv")),
     *((("auto", "tikhonov", None, margin), "margin", "at least 0") for margin in (-1, 1.0, True, False)),
     *((("auto", "tikhonov", focus, 1), "margin", "leave out focus") for focus in ("auto", "map", 400.0)),
     *((("auto", method, None, 1), "margin", "tikhonov at the calibrated depth alone") for method in ("markov", "tv")),
@@ -50,3 +50,17 @@ def test_behind_filters_lambda_is_above_zero() -> None:
     for lam in (0.0, -1.0, math.inf, math.nan, "none"):
         with pytest.raises(ArgumentError, match="a finite number above 0, or auto"):
             check_joint(lam)
+
+
+def test_bounds_are_two_numbers_of_a_method_that_heeds_them() -> None:
+    """(Planted: bounds that Tikhonov passes over; equal ends.)"""
+    for bounds in ((0, math.inf), (-math.inf, 1.0), (0.2, 0.3)):
+        for method in ("nonnegative", "tv"):
+            assert ImageRequest(method=method, bounds=bounds).bounds == bounds
+        for method in ("tikhonov", "markov"):
+            with pytest.raises(ArgumentError, match="come with method nonnegative or tv"):
+                ImageRequest(method=method, bounds=bounds)
+    for wrong in ((1.0, 0.0), (1.0, 1.0), (math.nan, 1), (0, math.nan), (0,), (0, True), (math.inf, math.inf), "01"):
+        with pytest.raises(ArgumentError, match="the smaller one first"):
+            ImageRequest(method="tv", bounds=wrong)  # type: ignore[arg-type]
+    assert plain_bounds((0.0, math.inf)) == [0.0, None]

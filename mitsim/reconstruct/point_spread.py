@@ -1,0 +1,623 @@
+"""Frames, patterns and a measured point spread function in; the image within bounds, and how far it is above its
+minimum, out.
+
+A camera whose scene points all cast one light h, each shifted by its place (:mod:`mitsim.reconstruct.convolution`),
+sees Y_i = crop(h * (P_i o X)). Minimised is, over all X within bounds,
+
+    P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
+
+**What is solved for.** Under uniform light everything that can put light on the sensor: frames of m pixels and h of k
+have m + k - 1 scene pixels a side. Convolutions on a grid of that size wrap round only where the sensor is not. The
+image is the middle of it, as large as the sensor; what is beside takes up light from outside, as a margin does. Under
+patterns the scene is theirs, and dark beyond.
+
+**How.** Conjugate gradients (Polak and Ribiere) in the pixels that bounds leave free, projected on the bounds after
+each step (Bertsekas, SIAM J. Control Optim. 20, 1982). |H|^2 spans seven decades, of which the first three lie in some
+hundred low frequencies. A division by |H|^2 + mu takes these out; and a start from the image of frames and light at
+half the size, made the same way, has them right. TV is taken for quadratic where slopes are below a thousandth of the
+peak over a pixel.
+
+**How far above the minimum.** With r = sum of frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that
+pushes against bounds alone, and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the
+bounds, no farther than R = ||X|| from X,
+
+    P(X) - min P <= weight TV(X) - Q . grad X + N . (X - bound) + ||e||^2 / 2 + R |g| - ridge R^2 / 2
+
+with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; and |g|^2 / (2 ridge) in place of the last two terms
+where not. d is a few steps of conjugate gradients on A^T A d = -g.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.convolution import check_lambda
+from mitsim.reconstruct.request import NONNEGATIVE, TV, Bounds
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solvers import Prior
+
+Array = npt.NDArray[Any]
+
+_MU = 10.0
+"""mu over the mean of |H|^2: of 10, 30 and 100 that which ends soonest on a measured diffuser, by up to a third."""
+_COARSE_STEPS, _LEAST_SIDE = 30, 32
+"""Steps at each of the smaller sizes, which take an eighth of the time of all, and sides that are not halved."""
+_SMOOTH = 1e-3
+"""Slope below which TV is quadratic, over the image's largest number."""
+_JUDGED_EACH, _TIGHTENED, _NEAR = 10, 2, 8.0
+"""Steps between two looks at the gap, those that its d takes, and how far above what is enough the bound with d = 0 may
+be for these to help, which lower it to a third: together a twentieth of the time."""
+_NOTHING = 1e-300
+"""In place of a zero that is divided by."""
+_FEWEST = 1e-12
+"""Shortest step, over the one that the quadratic calls for: below it nothing is gained in double precision."""
+_HUGE = 1e30
+"""In place of an infinite bound, where a distance to it is multiplied."""
+_RIDGE, _WEIGHT = 50.0, 1.2
+"""Automatic lambda over the mean square of a scene pixel's light, by a frame's noise over its mean; and automatic
+weight of TV in units of the noise that the data term's gradient carries to a pixel. Chosen on photographs seen by a
+measured diffuser with noise of 0.1 to 8 % (benchmarks/point_spread.py)."""
+
+
+# ---- The camera ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftedLight:
+    """A point spread function under patterns.
+
+    Attributes
+    ----------
+    psf
+        (k, k') light of one scene pixel, in sensor pixels.
+    sensor
+        (m, m') rows and columns of the sensor.
+    patterns
+        P_L (n, K) and P_R (n', K'); None: uniform light of all that reaches the sensor.
+    precision
+        of all numbers.
+    """
+
+    psf: FloatArray
+    sensor: tuple[int, int]
+    patterns: tuple[FloatArray, FloatArray] | None = None
+    precision: Any = np.float64
+
+    def __post_init__(self) -> None:
+        if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
+            raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
+        for size, most in zip(self.sensor, self._whole, strict=True):
+            if size > most:
+                raise MitsimError(
+                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light of {self.scene[0]} x {self.scene[1]} "
+                    f"scene pixels reaches {self._whole[0]} x {self._whole[1]} of them; give a point spread function "
+                    "of the frames' pixels, or patterns of more"
+                )
+
+    @property
+    def scene(self) -> tuple[int, int]:
+        """Rows and columns of the scene."""
+        if self.patterns is not None:
+            return len(self.patterns[0]), len(self.patterns[1])
+        rows, columns = (m + k - 1 for m, k in zip(self.sensor, self.psf.shape, strict=True))
+        return rows, columns
+
+    @property
+    def count(self) -> int:
+        """Number of frames."""
+        return 1 if self.patterns is None else self.patterns[0].shape[1] * self.patterns[1].shape[1]
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Part of the scene that is the image."""
+        if self.patterns is not None:
+            return slice(None), slice(None)
+        rows, columns = (
+            slice((k - 1) // 2, (k - 1) // 2 + m) for m, k in zip(self.sensor, self.psf.shape, strict=True)
+        )
+        return rows, columns
+
+    def image_of(self, scene: Array) -> Array:
+        """(K K', m, m') frames of a ``scene`` (n, n')."""
+        frames = np.empty((self.count, *self.sensor), self.precision)
+        for frame, light in zip(frames, self._lights, strict=True):
+            seen = fft.rfft2(scene if light is None else light * scene, self.grid) * self.spectrum
+            frame[:] = fft.irfft2(seen, self.grid)[self._crop]
+        return frames
+
+    def correlate(self, frames: Array) -> Array:
+        """Adjoint of :meth:`image_of`: (n, n') of ``frames`` (K K', m, m')."""
+        (rows, columns), total = self.scene, np.zeros(self.scene, self.precision)
+        placed = np.zeros(self.grid, self.precision)
+        for frame, light in zip(frames, self._lights, strict=True):
+            placed[self._crop] = frame
+            part = fft.irfft2(fft.rfft2(placed) * self.spectrum.conj(), self.grid)[:rows, :columns]
+            total += part if light is None else light * part
+        return total
+
+    def half_size(self) -> ShiftedLight | None:
+        """The same at half the size; None under patterns, and where that is too small."""
+        smaller = min(*self.psf.shape, *self.sensor) // 2 >= _LEAST_SIDE
+        if self.patterns is not None or not smaller:
+            return None
+        rows, columns = self.sensor
+        return replace(self, psf=4 * halve(self.psf), sensor=(rows // 2, columns // 2))
+
+    def double(self, smaller: Array) -> Array:
+        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
+        is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
+        image = np.zeros(self.scene, self.precision)
+        place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
+        for axis in (0, 1):
+            smaller = np.repeat(smaller, 2, axis=axis)
+            before = np.roll(smaller, 1, axis=axis)
+            smaller = (smaller + before) / self.precision(2)
+        rows, columns = (min(sizes) for sizes in zip(place.shape, smaller.shape, strict=True))
+        place[:rows, :columns] = smaller[:rows, :columns]
+        return image
+
+    @property
+    def column_power(self) -> float:
+        """Mean square of what one unit of a scene pixel puts into all frames, but for the crop."""
+        power = float(np.square(self.psf).sum())
+        if self.patterns is None:
+            return power
+        left, right = (float(np.square(side).sum(axis=1).mean()) for side in self.patterns)
+        return power * left * right
+
+    @cached_property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of transforms: light that wraps round lands beside the sensor."""
+        sides = zip(self.scene, self._whole, self._origin, self.sensor, strict=True)
+        rows, columns = (
+            fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
+            for scene, whole, origin, size in sides
+        )
+        return rows, columns
+
+    @cached_property
+    def spectrum(self) -> Array:
+        """Of h, on the grid."""
+        return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
+
+    @property
+    def _whole(self) -> tuple[int, int]:
+        rows, columns = (n + k - 1 for n, k in zip(self.scene, self.psf.shape, strict=True))
+        return rows, columns
+
+    @property
+    def _origin(self) -> tuple[int, int]:
+        rows, columns = ((whole - size) // 2 for whole, size in zip(self._whole, self.sensor, strict=True))
+        return rows, columns
+
+    @property
+    def _crop(self) -> tuple[slice, slice]:
+        (row, column), (rows, columns) = self._origin, self.sensor
+        return slice(row, row + rows), slice(column, column + columns)
+
+    @property
+    def _lights(self) -> Iterable[Array | None]:
+        if self.patterns is None:
+            return [None]
+        left, right = (side.T.astype(self.precision) for side in self.patterns)
+        return (np.outer(row, column) for row in left for column in right)
+
+
+def halve(frame: Array) -> Array:
+    """(m // 2, m' // 2) means of 2 x 2 numbers of a ``frame`` (m, m')."""
+    return reduce_frame(frame, 2)
+
+
+def reduce_frame(frame: Array, reduce: int) -> Array:
+    """Means of ``reduce`` x ``reduce`` numbers of a ``frame``; rows and columns that remain are left out."""
+    rows, columns = (size // reduce for size in frame.shape)
+    blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
+    return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
+
+
+# ---- The objective at one image --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """An image X (n, n') of ``frames``, and what follows of it.
+
+    Attributes
+    ----------
+    residual
+        A X - Y.
+    smooth
+        the slope below which TV is quadratic.
+    """
+
+    light: ShiftedLight
+    frames: Array
+    prior: Prior
+    image: Array
+    residual: Array
+    smooth: float
+
+    @cached_property
+    def _slopes(self) -> tuple[Array, Array, Array]:
+        down, across = np.zeros_like(self.image), np.zeros_like(self.image)
+        np.subtract(self.image[1:], self.image[:-1], out=down[:-1])
+        np.subtract(self.image[:, 1:], self.image[:, :-1], out=across[:, :-1])
+        return down, across, np.sqrt(down * down + across * across)
+
+    @cached_property
+    def _flattened(self) -> float:
+        """How far the quadratic TV is below TV, times the weight."""
+        if not self.prior.weight:
+            return 0.0
+        low = np.minimum(self._slopes[2], self.smooth)
+        return self.prior.weight * (float(low.sum(dtype=np.float64)) - _dot(low, low) / (2 * self.smooth))
+
+    @cached_property
+    def objective(self) -> float:
+        """P(X)."""
+        squares = _dot(self.residual, self.residual) + self.prior.ridge * _dot(self.image, self.image)
+        if not self.prior.weight:
+            return squares / 2
+        return squares / 2 + self.prior.weight * float(self._slopes[2].sum(dtype=np.float64))
+
+    @property
+    def smoothed(self) -> float:
+        """P(X) with the quadratic TV, which is what a step lowers."""
+        return self.objective - self._flattened
+
+    @cached_property
+    def bounded(self) -> tuple[Array, Array]:
+        """Q."""
+        down, across, length = self._slopes
+        scale = self.prior.weight / np.maximum(length, self.smooth)
+        return down * scale, across * scale
+
+    @cached_property
+    def gradient(self) -> Array:
+        """Of the smoothed objective."""
+        slope = self.light.correlate(self.residual)
+        if self.prior.ridge:
+            slope += self.prior.ridge * self.image
+        if self.prior.weight:
+            down, across = self.bounded
+            slope[1:] += down[:-1]
+            slope[:-1] -= down[:-1]
+            slope[:, 1:] += across[:, :-1]
+            slope[:, :-1] -= across[:, :-1]
+        return slope
+
+    @property
+    def free(self) -> npt.NDArray[np.bool_]:
+        """Pixels that no bound holds."""
+        low, high = self.prior.bounds
+        free = np.ones(self.image.shape, dtype=bool)
+        if math.isfinite(low):
+            free &= (self.image > low) | (self.gradient < 0)
+        if math.isfinite(high):
+            free &= (self.image < high) | (self.gradient > 0)
+        return free
+
+    def curvature(self, direction: Array, seen: Array) -> float:
+        """Second derivative along a ``direction``, which the sensor sees as ``seen``, with TV for a quadratic of the
+        slopes at X."""
+        total = _dot(seen, seen) + self.prior.ridge * _dot(direction, direction)
+        if self.prior.weight:
+            length = np.maximum(self._slopes[2], self.smooth)
+            down, across = np.diff(direction, axis=0), np.diff(direction, axis=1)
+            bent = np.sum(down * down / length[:-1], dtype=np.float64)
+            bent += np.sum(across * across / length[:, :-1], dtype=np.float64)
+            total += self.prior.weight * float(bent)
+        return total
+
+    def move(self, direction: Array, seen: Array, length: float) -> _State:
+        """The state a ``length`` along a ``direction``, which the sensor sees as ``seen``, within the bounds."""
+        image = self.image + self.precise(length) * direction
+        if not self.prior.bounded:
+            return replace(self, image=image, residual=self.residual + self.precise(length) * seen)
+        np.clip(image, *self.prior.bounds, out=image)
+        return replace(self, image=image, residual=self.residual + self.light.image_of(image - self.image))
+
+    def precise(self, number: float) -> Any:
+        """A ``number`` that leaves arrays in their precision."""
+        return self.image.dtype.type(number)
+
+    # ---- how far above the minimum
+
+    def gap(self, divide: _Division, enough: float = math.inf) -> float:
+        """Upper bound of P(X) - min P; the module's text says of which images. The closer to ``enough``, the more is
+        done for a tight one."""
+        variation = 0.0
+        if self.prior.weight:
+            length = self._slopes[2]
+            held = length * length / np.maximum(length, self.smooth)
+            variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
+        pressed, left = self._parts(self.gradient)
+        best = pressed + self._most_lowered(math.sqrt(_dot(left, left)))
+        if best <= enough or best > _NEAR * enough:
+            return max(variation, 0.0) + best
+        # Conjugate gradients on A^T A d = -g in the pixels that no bound holds.
+        free, slope, direction, power = self.free, self.gradient, None, 1.0
+        seen = np.zeros_like(self.residual)
+        for _ in range(_TIGHTENED):
+            left = np.where(free, slope, self.precise(0))
+            turned = divide(left) * free
+            before, power = power, _dot(left, turned)
+            if power <= 0:
+                break
+            direction = -turned if direction is None else self.precise(power / before) * direction - turned
+            ahead = self.light.image_of(direction)
+            seen = seen + self.precise(power / max(_dot(ahead, ahead), _NOTHING)) * ahead
+            slope = self.gradient + self.light.correlate(seen)
+            pressed, left = self._parts(slope)
+            best = min(best, pressed + _dot(seen, seen) / 2 + self._most_lowered(math.sqrt(_dot(left, left))))
+        return max(variation, 0.0) + best
+
+    def _parts(self, slope: Array) -> tuple[float, Array]:
+        """N . (X - bound) and ``slope`` - N, for an N that makes little of both."""
+        if not self.prior.bounded:
+            return 0.0, slope
+        reach = max(math.sqrt(_dot(self.image, self.image)), 1 / _HUGE)
+        below, above = (
+            np.abs(self.image - self.precise(bound)) if math.isfinite(bound) else None for bound in self.prior.bounds
+        )
+        pressed = np.zeros_like(slope)
+        left = np.where(self.free, slope, 0)
+        for _ in range(2):
+            rate = self.precise(max(self.prior.ridge, math.sqrt(_dot(left, left)) / reach))
+            pressed = np.zeros_like(slope)
+            if below is not None:
+                pressed += np.maximum(slope - rate * below, 0)
+            if above is not None:
+                pressed += np.minimum(slope + rate * above, 0)
+            left = slope - pressed
+        total = 0.0
+        for room, part in ((below, np.maximum(pressed, 0)), (above, np.minimum(pressed, 0))):
+            total += 0.0 if room is None else abs(_dot(room, part))
+        return total, left
+
+    def _most_lowered(self, slope: float) -> float:
+        """Most that a gradient of that norm can lower P within R."""
+        ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
+        if slope <= ridge * reach:
+            return slope * slope / (2 * ridge) if ridge else 0.0
+        return slope * reach - ridge * reach**2 / 2
+
+
+def _dot(first: Array, second: Array) -> float:
+    return float(np.vdot(first, second))
+
+
+@dataclass(frozen=True, eq=False)
+class _Division:
+    """Near the inverse of the second derivative under uniform light: a division in the Fourier domain."""
+
+    light: ShiftedLight
+    prior: Prior
+    smooth: float
+
+    @cached_property
+    def _weight(self) -> Array:
+        light = self.light
+        power = np.square(np.abs(light.spectrum))
+        total = power + _MU * float(np.square(light.psf).sum()) + self.prior.ridge
+        if self.prior.weight and self.smooth:
+            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
+            total += self.prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
+        return np.asarray(1 / total, light.precision)
+
+    def __call__(self, image: Array) -> Array:
+        if self.light.patterns is not None:
+            return image
+        rows, columns = image.shape
+        turned = fft.rfft2(image, self.light.grid) * self._weight
+        return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
+
+
+# ---- Minimising ------------------------------------------------------------------------------------------------------
+
+
+def minimise(
+    light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float
+) -> tuple[Array, int, float, float]:
+    """The whole scene (n, n') whose relative gap is at most ``tolerance``, or that after ``iterations`` steps; the
+    steps, its objective, and its gap over that.
+
+    Parameters
+    ----------
+    light, frames
+        the camera, and what it saw (K K', m, m').
+    prior
+        what is known of scenes.
+    iterations, tolerance
+        most steps at full size, and the gap over the objective at which they end.
+    """
+    state, spent, relative = _descend(_start(light, frames, prior), iterations, tolerance)
+    return state.image, spent, state.objective, relative
+
+
+def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
+    """Where steps begin: at the image of half the size, or at none."""
+    low, high = prior.bounds
+    smaller = light.half_size()
+    if smaller:
+        # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
+        half = replace(prior, weight=prior.weight / 2)
+        found = _descend(_start(smaller, np.stack([halve(each) for each in frames]), half), _COARSE_STEPS, 0.0)[0]
+        image = light.double(found.image)
+    else:
+        image = np.zeros(light.scene, light.precision)
+    image = np.clip(image, low, high)
+    start = _State(light, frames, prior, image, light.image_of(image) - frames, 0.0)
+    if prior.weight and not smaller:
+        # Least squares first: they tell how bright the scene is.
+        unweighted = replace(start, prior=replace(prior, weight=0.0))
+        found = _descend(unweighted, _COARSE_STEPS // 3, 0.0)[0]
+        start = replace(found, prior=prior)
+    peak = float(np.abs(start.image).max())
+    return replace(start, smooth=_SMOOTH * peak or _SMOOTH)
+
+
+def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
+    """The state after at most so many steps, their number, and its relative gap (inf where ``tolerance`` is 0)."""
+    divide = _Division(state.light, state.prior, state.smooth)
+
+    def judge() -> float:
+        objective = max(state.objective, _NOTHING)
+        return state.gap(divide, tolerance * objective) / objective
+
+    direction: Array | None = None
+    earlier, power = state.gradient, 1.0
+    spent, relative = 0, math.inf
+    while spent < iterations:
+        spent += 1
+        free = state.free
+        pull = np.where(free, state.gradient, state.precise(0))
+        turned = divide(pull)
+        turned *= free
+        before, power = power, _dot(pull, turned)
+        if power <= 0:
+            break
+        if direction is None:
+            direction = -turned
+        else:
+            kept = max((power - _dot(earlier, turned)) / before, 0.0)
+            direction = state.precise(kept) * direction * free - turned
+            if _dot(direction, pull) >= 0:
+                direction = -turned
+        earlier = pull
+        seen = state.light.image_of(direction)
+        step = -_dot(pull, direction) / state.curvature(direction, seen)
+        least, following = _FEWEST * step, state.move(direction, seen, step)
+        while following.smoothed > state.smoothed and step > least:
+            step /= 2
+            following = state.move(direction, seen, step)
+        stuck = step <= least
+        if not stuck:
+            state = following
+        elif _dot(direction, turned) == -_dot(turned, turned):
+            break
+        else:
+            direction = None
+        if tolerance and (spent % _JUDGED_EACH == 0 or spent == iterations):
+            relative = judge()
+            if relative <= tolerance:
+                break
+    if tolerance and not math.isfinite(relative):
+        relative = judge()
+    return state, spent, relative
+
+
+# ---- Weights from the frames themselves ------------------------------------------------------------------------------
+
+
+def frame_noise(frame: Array) -> float:
+    """Standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer, Comput. Vis.
+    Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3 pixels."""
+    if min(frame.shape) < 3:
+        return 0.0
+    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
+    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
+    return float(np.median(np.abs(bent))) / 6 / 0.6745
+
+
+def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
+    """Lambda for one frame under uniform light: proportional to its noise over its mean. MitsimError for patterns, and
+    for a frame without light.
+
+    Parameters
+    ----------
+    light, frames
+        the camera, and the frame (1, m, m') that it saw.
+    """
+    if light.patterns is not None:
+        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+    mean = float(frames.mean())
+    if mean <= 0:
+        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
+    return _RIDGE * frame_noise(frames[0]) / mean * light.column_power
+
+
+def automatic_weight(light: ShiftedLight, frames: Array) -> float:
+    """Weight of TV: as :func:`mitsim.reconstruct.solvers.automatic_weight`, with the noise that ``frames`` (K K', m,
+    m') of ``light`` tell by :func:`frame_noise`, and a constant of its own."""
+    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
+    return _WEIGHT * noise * math.sqrt(light.column_power)
+
+
+# ---- The image -------------------------------------------------------------------------------------------------------
+
+
+def solve_point_spread(
+    light: ShiftedLight,
+    frames: Array,
+    method: str,
+    lam: float | Literal["auto"] = "auto",
+    bounds: Bounds | None = None,
+    iterations: int = 300,
+    tolerance: float = 0.05,
+) -> Solution:
+    """The image of all frames.
+
+    Parameters
+    ----------
+    light
+        the camera under its patterns.
+    frames
+        (K K', m, m') row-major over patterns (i, j).
+    method
+        ``tikhonov``, ``nonnegative`` or ``tv``.
+    lam
+        lambda, or the weight of ``tv``; ``auto``: :func:`automatic_ridge`, :func:`automatic_weight`.
+    bounds
+        least and largest number; None: 0 and inf of ``nonnegative``, any of the others.
+    iterations, tolerance
+        it ends where the gap is at most ``tolerance`` of the objective, or after so many steps.
+
+    Raises
+    ------
+    MitsimError
+        for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
+    """
+    if frames.shape != (light.count, *light.sensor) or not np.isfinite(frames).all():
+        raise MitsimError(
+            f"frames of shape {frames.shape}: give {light.count} of {light.sensor[0]} x {light.sensor[1]} finite "
+            "numbers"
+        )
+    if iterations < 1:
+        raise MitsimError(f"iterations are {iterations}; give at least 1")
+    if lam == "auto":
+        lam = automatic_weight(light, frames) if method == TV else automatic_ridge(light, frames)
+    lam = check_lambda(lam)
+    known = bounds or ((0.0, math.inf) if method == NONNEGATIVE else Prior.bounds)
+    prior = Prior(weight=lam, bounds=known) if method == TV else Prior(ridge=lam, bounds=known)
+    frames = frames.astype(light.precision)
+    energy = _dot(frames, frames)
+    scene, spent, objective, gap = minimise(light, frames, prior, iterations, tolerance)
+    residual = light.image_of(scene) - frames
+    figures = f"{spent} iterations, objective {objective:.4g}."
+    if gap <= tolerance:
+        sentence = f"Solved: {gap:.0e} of the objective or less above its minimum"
+        status = Status(Verdict.SOLVED, sentence, "", figures)
+    else:
+        sentence = f"Not converged: after {spent} iterations the objective may be {gap:.1e} of itself above its minimum"
+        remedy = "take a larger lambda, or allow more iterations"
+        status = Status(Verdict.NOT_CONVERGED, sentence, remedy, figures)
+    return Solution(
+        image=np.asarray(scene[light.window], np.float64),
+        lam=lam,
+        residual=math.sqrt(_dot(residual, residual) / energy) if energy else 0.0,
+        status=status,
+        iterations=spent,
+        objective=objective,
+        relative_gap=gap,
+    )

@@ -1,0 +1,152 @@
+"""A run and a measured point spread function in, the scene's image out, and how far it is above its minimum."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.job import Cost, Job, Limits
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import Capture
+from mitsim.devices.mask_profile import load_psf
+from mitsim.reconstruct.point_spread import ShiftedLight, reduce_frame, solve_point_spread
+from mitsim.reconstruct.reconstruct import Reconstruction
+from mitsim.reconstruct.request import TIKHONOV, Bounds, ImageRequest, plain_bounds
+
+_NUMBERS = 24
+"""Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
+
+
+@check_arguments
+def reconstruct_psf(
+    shots: Capture,
+    psf: Path | str | FloatArray,
+    reduce: int = 1,
+    lam: float | Literal["auto"] = "auto",
+    method: str = TIKHONOV,
+    bounds: Bounds | None = None,
+) -> Reconstruction:
+    """Recover the image of a camera whose scene points all cast one pattern of light, each shifted by its place.
+
+    One scene pixel shifts it by one pixel of the frames. Under uniform light the image is as large as the sensor, and
+    what lies beside is solved for too; under patterns it is theirs (:mod:`mitsim.reconstruct.point_spread`).
+
+    Parameters
+    ----------
+    shots
+        in memory, or of :func:`mitsim.core.runs.load_run`.
+    psf
+        (k, k') light of a scene pixel, or a picture of it as :func:`mitsim.devices.mask_profile.load_psf` takes it, of
+        the same pixels as the frames.
+    reduce
+        pixels a side, of frames and of the picture, that become one.
+    lam
+        lambda >= 0 in the unit of the point spread function squared, for ``tv`` the weight of the total variation;
+        ``auto`` chooses it from the frames.
+    method
+        ``tikhonov``, ``nonnegative`` or ``tv``.
+    bounds
+        least and largest number of the image [electrons/s], by ``nonnegative`` and ``tv``.
+
+    Raises
+    ------
+    MitsimError
+        for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
+        than is free, another lambda, method or bounds, and ``auto`` under patterns other than uniform light.
+    """
+    return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds))
+
+
+@single_threaded_blas()
+def reconstruct_psf_request(
+    shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
+) -> Reconstruction:
+    """The image that a request asks for, as :func:`reconstruct_psf`.
+
+    Parameters
+    ----------
+    shots, psf, reduce, request
+        as there.
+    job
+        of whose work it is a part.
+    """
+    request.check_point_spread(reduce)
+    clock = (job or Job()).apart("").clock
+    with clock.stage("read"):
+        light, seen = _light(psf, reduce), _Frames(shots, reduce)
+        patterns = None if seen.uniform else shots.patterns
+        camera = ShiftedLight(light, seen.sensor, patterns, np.float32)
+        grid = camera.grid[0] * camera.grid[1]
+        numbers = grid + camera.count * camera.sensor[0] * camera.sensor[1]
+        Cost(memory_bytes=4.0 * _NUMBERS * numbers).check(f"{shots.name}: its image", Limits())
+        frames = seen.read()
+    with clock.stage("solve"):
+        solution = solve_point_spread(camera, frames, request.method, request.lam, request.bounds)
+    flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
+    if seen.saturated:
+        flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")
+    return Reconstruction(
+        **{**vars(solution), "status": replace(solution.status, flags=(*solution.status.flags, *flags))},
+        rank=None,
+        condition=None,
+        rank_sides=None,
+        condition_sides=None,
+        misfit=None,
+        uncertainties=None,
+        seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
+        inputs=psf_inputs(shots, light, reduce, request),
+    )
+
+
+def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
+    """What decides an image.
+
+    Parameters
+    ----------
+    shots, psf
+        whose fingerprints count, (k, k') of the second.
+    reduce, request
+        as for :func:`reconstruct_psf_request`.
+    """
+    digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
+    asked = {"run": shots.fingerprint, "psf": digest, "reduce": reduce, "lambda": request.lam, "method": request.method}
+    return asked if request.bounds is None else {**asked, "bounds": plain_bounds(request.bounds)}
+
+
+def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
+    """(k, k') of sum 1, or as it was given where that was an array."""
+    if isinstance(psf, (str, Path)):
+        return load_psf(psf, reduce)
+    light = np.asarray(psf, np.float64)
+    if light.ndim != 2 or min(light.shape) < reduce:
+        raise ArgumentError("psf", f"shape {light.shape}: give rows x columns, at least {reduce} a side")
+    return reduce_frame(light, reduce)
+
+
+class _Frames:
+    """Frames of a capture, of which ``reduce`` x ``reduce`` pixels become one."""
+
+    def __init__(self, shots: Capture, reduce: int) -> None:
+        self._shots, self._reduce = shots, reduce
+        self.saturated = 0
+        left, right = shots.patterns
+        self.uniform = left.shape[1] == right.shape[1] == 1 and bool((left == 1).all() and (right == 1).all())
+        first = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
+        if min(first) < reduce:
+            raise MitsimError(f"{shots.name}: frames of {first[0]} x {first[1]} pixels; reduce by less than {reduce}")
+        self.sensor = (first[0] // reduce, first[1] // reduce)
+        self._shape, self._columns, self._count = (first[0], first[1]), right.shape[1], left.shape[1] * right.shape[1]
+
+    def read(self) -> FloatArray:
+        """(K K', m, m') of all patterns, row-major [electrons/s]."""
+        frames = np.empty((self._count, *self.sensor), np.float32)
+        for each in self._shots.pattern_measurements(self._shape):
+            frames[each.row * self._columns + each.column] = reduce_frame(each.frame, self._reduce)
+            self.saturated += each.saturated
+        return frames

@@ -1,0 +1,177 @@
+"""Images by a point spread function, against matrices written out, active sets, and a smoothed Newton method.
+
+A camera's matrix is made here from its definition, pixel by pixel, without a transform; numbers are double precision.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear, nnls
+
+from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.point_spread import (
+    ShiftedLight,
+    automatic_ridge,
+    automatic_weight,
+    frame_noise,
+    halve,
+    minimise,
+    reduce_frame,
+    solve_point_spread,
+)
+from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solvers import Prior
+from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
+
+INF = np.inf
+
+
+def spread(rows: int = 5, columns: int = 4) -> np.ndarray:
+    light = np.random.default_rng(7).random((rows, columns)) ** 4
+    return light / light.sum()
+
+
+def dots(rows: int, columns: int, period: int) -> tuple[np.ndarray, np.ndarray]:
+    rows_lit, columns_lit = (
+        (np.arange(size)[:, None] % period == np.arange(period)).astype(float) for size in (rows, columns)
+    )
+    return rows_lit, columns_lit
+
+
+def matrix(light: ShiftedLight) -> np.ndarray:
+    """(K K' m m', n n') from y[s] = sum_p h[s - p] x[p], the sensor centred in all that light reaches."""
+    rows, columns = light.psf.shape
+    whole = [n + k - 1 for n, k in zip(light.scene, light.psf.shape, strict=True)]
+    top, left = ((most - size) // 2 for most, size in zip(whole, light.sensor, strict=True))
+    seen = []
+    for row, column in np.ndindex(*light.scene):
+        plane = np.zeros(whole)
+        plane[row : row + rows, column : column + columns] = light.psf
+        seen.append(plane[top : top + light.sensor[0], left : left + light.sensor[1]].ravel())
+    one = np.stack(seen, axis=1)
+    if light.patterns is None:
+        return one
+    lit = [np.outer(row, column).ravel() for row in light.patterns[0].T for column in light.patterns[1].T]
+    return np.concatenate([one * each for each in lit])
+
+
+LIGHTS = [
+    ShiftedLight(spread(), (6, 7)),
+    ShiftedLight(spread(4, 5), (9, 3)),
+    ShiftedLight(spread(), (7, 6), dots(8, 7, 2)),
+    ShiftedLight(spread(), (12, 10), dots(8, 7, 1)),
+]
+"""More unknowns than data, twice; cropped frames of dots; all light of a scene, which is dark beyond."""
+
+
+def noisy(light: ShiftedLight, seed: int = 0) -> np.ndarray:
+    """Frames of a scene of numbers of both signs, with noise."""
+    rng = np.random.default_rng(seed)
+    frames = light.image_of(rng.normal(size=light.scene))
+    return frames + 0.02 * rng.normal(size=frames.shape)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: ShiftedLight) -> None:
+    """Where light wraps round on the small grid, it lands beside the sensor. (Planted: a grid one column smaller.)"""
+    rng, whole = np.random.default_rng(0), matrix(light)
+    scene = rng.normal(size=light.scene)
+    frames = light.image_of(scene)
+    np.testing.assert_allclose(frames.ravel(), whole @ scene.ravel(), atol=1e-13)
+    data = rng.normal(size=frames.shape)
+    np.testing.assert_allclose(light.correlate(data).ravel(), whole.T @ data.ravel(), atol=1e-13)
+    assert np.square(whole).sum(axis=0).mean() <= light.column_power * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("bounds", [(-INF, INF), (0.0, INF), (0.0, 0.5), (-INF, 0.3)])
+def test_the_image_is_that_of_active_sets(light: ShiftedLight, bounds: tuple[float, float]) -> None:
+    """Objectives are no less than that of scipy's active sets, and no more above it than the gap says, after one step
+    and after many. (Planted: a gap without N . (X - bound); e counted once too little; bounds heeded by the image only
+    after the last step.)"""
+    lam, frames, whole = 1e-2, noisy(light), matrix(light)
+    system = np.concatenate([whole, np.sqrt(lam) * np.eye(whole.shape[1])])
+    target = np.concatenate([frames.ravel(), np.zeros(whole.shape[1])])
+    exact = nnls(system, target)[0] if bounds == (0, INF) else lsq_linear(system, target, bounds, "bvls", 1e-14).x
+    least = 0.5 * np.square(system @ exact - target).sum()
+    for iterations in (1, 4, 2000):
+        image, _, objective, gap = minimise(light, frames, Prior(ridge=lam, bounds=bounds), iterations, 1e-9)
+        assert bounds[0] <= image.min() and image.max() <= bounds[1]
+        assert objective == pytest.approx(0.5 * np.square(system @ image.ravel() - target).sum(), rel=1e-9)
+        assert least * (1 - 1e-9) <= objective <= least + gap * objective * (1 + 1e-9)
+    assert gap <= 1e-9
+    np.testing.assert_allclose(image.ravel(), exact, atol=np.sqrt(2e-9 * least / lam) + 1e-9)
+
+
+SQUARE = [ShiftedLight(spread(), (8, 9)), ShiftedLight(spread(), (10, 9), dots(SIZE, SIZE, 2))]
+"""The same of scenes that the other solver takes."""
+
+
+@pytest.mark.parametrize("light", SQUARE)
+@pytest.mark.parametrize("weight", [1e-3, 0.05])
+def test_total_variation_is_no_further_above_its_minimum_than_the_gap_says(light: ShiftedLight, weight: float) -> None:
+    """(Planted: Q that is longer than the weight; a gap without the part of the quadratic TV.)"""
+    frames = noisy(light)
+    lower, upper = smoothed_minimum(matrix(light), frames.ravel(), weight)
+    for iterations in (1, 10, 3000):
+        found = minimise(light, frames, Prior(weight=weight), iterations, 0.01)
+        assert lower * (1 - 1e-9) <= found[2] <= upper + found[3] * found[2]
+    assert found[3] <= 0.01 and found[2] <= upper * 1.01
+    held = minimise(light, frames, Prior(weight=weight, bounds=(0.0, 1.0)), 3000, 0.01)
+    assert held[0].min() >= 0 and held[0].max() <= 1 and held[2] >= lower * (1 - 1e-9) and held[3] <= 0.01
+
+
+def test_half_the_size_sees_half_the_frame() -> None:
+    """Of a scene without fine detail; a pixel beside, the two differ by a tenth. (Planted: a start one pixel off.)"""
+    for side in (70, 71):
+        rows, columns = np.mgrid[:side, :side] / side - 0.5
+        light = ShiftedLight(np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100, (80, 82))
+        half = light.half_size()
+        assert half is not None and half.sensor == (40, 41) and half.half_size() is None
+        rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
+        scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
+        seen, expected = halve(light.image_of(light.double(scene))[0]), half.image_of(scene)[0]
+        inside = np.s_[5:-5, 5:-5]
+        assert np.abs(seen - expected)[inside].max() < 4e-3 * np.ptp(expected)
+    assert LIGHTS[2].half_size() is None
+    np.testing.assert_array_equal(reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
+
+
+def test_noise_is_told_and_weights_follow_it() -> None:
+    """Of a frame of thin bright lines the noise is found to a tenth; twice the noise has twice the weight, in any unit
+    of the frames."""
+    rng = np.random.default_rng(3)
+    frame = 50 * (rng.random((60, 80)) > 0.997) + np.linspace(0, 9, 80) ** 2
+    frame = frame + 0.3 * rng.normal(size=frame.shape)
+    assert frame_noise(frame) == pytest.approx(0.3, rel=0.25) and frame_noise(frame[:2]) == 0
+    light = ShiftedLight(spread(), frame.shape)
+    lam, weight = automatic_ridge(light, frame[None]), automatic_weight(light, frame[None])
+    assert lam > 0 and automatic_ridge(light, 7 * frame[None]) == pytest.approx(lam)
+    assert automatic_weight(light, 7 * frame[None]) == pytest.approx(7 * weight)
+
+
+def test_what_cannot_be_solved_is_refused_and_too_few_steps_are_said() -> None:
+    light = LIGHTS[0]
+    frames = noisy(light)
+    short = solve_point_spread(light, frames, "nonnegative", 1e-6, iterations=1, tolerance=1e-9)
+    assert short.status.verdict is Verdict.NOT_CONVERGED and not short.ok and short.iterations == 1
+    assert short.image.shape == light.sensor
+    for wrong in (frames[0], frames[:, 1:], frames * np.nan):
+        with pytest.raises(MitsimError, match="give 1 of 6 x 7 finite numbers"):
+            solve_point_spread(light, wrong, "tikhonov", 1.0)
+    with pytest.raises(MitsimError, match="give at least 1"):
+        solve_point_spread(light, frames, "tv", 1.0, iterations=0)
+    for lam in (-1.0, INF, "none"):
+        with pytest.raises(MitsimError, match="finite number of at least 0"):
+            solve_point_spread(light, frames, "tv", lam)  # type: ignore[arg-type]
+    with pytest.raises(MitsimError, match="under uniform light alone"):
+        automatic_ridge(LIGHTS[2], noisy(LIGHTS[2]))
+    with pytest.raises(MitsimError, match="cannot be chosen; check exposure"):
+        automatic_ridge(light, 0 * frames)
+    with pytest.raises(MitsimError, match="give a point spread function of the frames' pixels"):
+        ShiftedLight(spread(), (20, 7), dots(8, 7, 2))
+    with pytest.raises(MitsimError, match="not all 0"):
+        ShiftedLight(np.zeros((3, 3)), (6, 7))
+    dark = solve_point_spread(light, 0 * frames, "nonnegative", 1.0)
+    assert dark.ok and not dark.image.any() and dark.residual == 0
