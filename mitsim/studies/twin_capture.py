@@ -35,15 +35,15 @@ CROP = slice(6, 506), slice(10, 630)
 """Rows and columns of the turned plane that their program keeps."""
 SCALES = 0.475, 0.48
 """Sensor pixels of a plane that a scene pixel moves the mask's shadow by, along rows and columns: where the residual of
-learned codes is least, for both captures; 0.005 beside, it is larger by a hundredth."""
+learned codes is least, to 0.003."""
 FLIPPED = True, True
-"""The scene lies turned by 180 degrees before that camera: of all eight orientations only this one gives a code."""
+"""Whether the scene lies upside down, and mirrored, before that camera: any other way codes explain next to nothing."""
 PLANES = {"b": ((0, 0), 2), "gb": ((0, 1), 1), "r": ((1, 1), 0)}
-"""Planes that are compared: row and column in a cell of the Bayer sensor, and channel of the authors' images. The second
-green one lies half a pixel beside the first and tells nothing else."""
+"""Planes that are compared: row and column in a cell of the Bayer sensor, and channel of the authors' images. The
+second green one lies half a pixel beside the first and tells nothing else."""
 _RIDGE = 1e-3
-"""Of a code's normal equations, over their mean diagonal: at 1e-4 and 1e-2 a frame that is held out is explained as well
-to 0.002."""
+"""Of a code's normal equations, over their mean diagonal: at 1e-4 and 1e-2 a frame that is held out is explained as
+well to 0.002."""
 _TURNS = 4
 """Of both sides: what codes explain stands still to 1e-4 from the third on."""
 _BLOCK = 48
@@ -111,7 +111,9 @@ def read_plane(path: Path, plane: str) -> FloatArray:
     power of two. MitsimError for a file that is none, or another size."""
     numbers = read_image(path, Wanted("capture"))
     if numbers.shape[0] // 2 < CROP[0].stop or numbers.shape[1] // 2 < CROP[1].stop:
-        raise MitsimError(f"capture {path}: is {numbers.shape[0]} x {numbers.shape[1]}; give the raw frame, 1024 x 1280")
+        raise MitsimError(
+            f"capture {path}: is {numbers.shape[0]} x {numbers.shape[1]}; give the raw frame, 1024 x 1280"
+        )
     (row, column), _ = PLANES[plane]
     common = max(int(np.gcd.reduce(numbers.astype(np.int64).ravel())), 1)
     return np.asarray(numbers[row::2, column::2] / common, dtype=np.float64)
@@ -205,7 +207,9 @@ def _fit_side(scale: float, lights: Sequence[FloatArray], frames: Sequence[Float
     (scene, width), sensor = hats.shape, len(frames[0])
     weights = [1 / float(np.square(frame).sum()) for frame in frames]
     gram = np.sum([part * light @ light.T for part, light in zip(weights, lights, strict=True)], axis=0)
-    product = np.sum([p * frame @ light.T for p, frame, light in zip(weights, frames, lights, strict=True)], axis=0) @ hats
+    product = (
+        np.sum([p * frame @ light.T for p, frame, light in zip(weights, frames, lights, strict=True)], axis=0) @ hats
+    )
     block = hats.T @ gram @ hats
     length = sensor + width - 1
     matrix, right, total = np.zeros((length, length)), np.zeros(length), np.zeros((scene, length))

@@ -63,7 +63,7 @@ class TwinFiles:
             raise MitsimError(f"--calibration {calibration}: has no effect without {folder / FLATCAM}; leave it out")
         if len(captures) == 1 and calibration is None:
             raise MitsimError(
-                f"--data {folder}: has one capture of a FlatCam, and its mask is learned from others; give --calibration "
-                "CAL, or a second capture"
+                f"--data {folder}: has one capture of a FlatCam, and its mask is learned from others; give "
+                "--calibration CAL, or a second capture"
             )
         return found

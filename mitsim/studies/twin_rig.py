@@ -3,8 +3,8 @@ the measured one it does not explain, by cause.
 
 The rig: the scene's image on a matt sheet, evenly lit; before the sensor a drawn mask of the transmission
 (1 + c_r(row) c_c(column)) / 2, codes scaled to 1, without diffraction, which the learned codes have in them. Light and
-frame are those of any mitsim scene. How far mask and sheet are is not known of the real camera, and no frame tells: only
-the product of mask distance and angle moves a shadow. The rig takes distances at which the angle hardly dims light.
+frame are those of any mitsim scene. How far the real camera's mask and scene were no frame tells: only the product of
+the mask's distance and an angle moves a shadow. The rig takes distances at which the angle hardly dims light.
 """
 
 from __future__ import annotations
@@ -157,6 +157,8 @@ class Twin:
         measured mean light over the simulated, of frames whose coded parts agree.
     render_error
         simulated frame against the product of factors, relative.
+    electrons
+        (m, m') expected of the simulated camera, means and all.
     """
 
     measured: Measured
@@ -170,6 +172,13 @@ class Twin:
     columns: float
     level: float
     render_error: float
+    electrons: FloatArray
+
+    def means(self, axis: int) -> dict[str, FloatArray]:
+        """Means along an ``axis`` about their mean [DN], measured and simulated."""
+        scale = float(np.linalg.norm(self.expected) / np.linalg.norm(centre_frame(self.electrons)))
+        found = {"measured": self.measured.level, "simulated": scale * self.electrons}
+        return {name: each.mean(axis=axis) - each.mean() for name, each in found.items()}
 
 
 @single_threaded_blas()
@@ -197,6 +206,7 @@ def compare(
         *(_correlation(*(each.mean(axis=axis) for each in levels)) for axis in (1, 0)),
         float(measured.level.mean() / (scale * electrons.mean())),
         float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model)),
+        electrons,
     )
 
 
@@ -224,12 +234,14 @@ def _parts(measured: Measured, codes: tuple[Code, Code], expected: FloatArray, g
 
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
-    """What of a ``rest`` is smooth light, or a smooth change of the ``expected`` frame's gain; and of how many numbers."""
+    """What of a ``rest`` is smooth light, or a smooth gain of the ``expected`` frame; and of how many numbers."""
     sides = [legvander(np.linspace(-1, 1, count), _DEGREE) for count in rest.shape]
     degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
     shapes = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
     fields = [expected * shape for shape in shapes] + [
-        shape for shape, each in zip(shapes, degrees, strict=True) if min(each)  # others are means of rows or columns
+        shape
+        for shape, each in zip(shapes, degrees, strict=True)
+        if min(each)  # others are means of rows or columns
     ]
     design = np.stack([centre_frame(each).ravel() for each in fields], axis=1)
     found = np.linalg.solve(design.T @ design, design.T @ rest.ravel())
