@@ -37,7 +37,8 @@ SCALES = 0.475, 0.48
 """Sensor pixels of a plane that a scene pixel moves the mask's shadow by, along rows and columns: where the residual of
 learned codes is least, to 0.003."""
 FLIPPED = True, True
-"""Whether the scene lies upside down, and mirrored, before that camera: any other way codes explain next to nothing."""
+"""Whether the scene lies upside down, and mirrored, before that camera: frames that are held out then correlate by 0.87
+and 0.80 with codes learned from the other capture; any other way by 0.81 and 0.68 at most."""
 PLANES = {"b": ((0, 0), 2), "gb": ((0, 1), 1), "r": ((1, 1), 0)}
 """Planes that are compared: row and column in a cell of the Bayer sensor, and channel of the authors' images. The
 second green one lies half a pixel beside the first and tells nothing else."""

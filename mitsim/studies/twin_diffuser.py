@@ -43,9 +43,8 @@ TRACED = 6
 _RAYS = 1280, 2048
 """A side of the square of rays, of the fit and of what is traced: 20 and 50 a pixel."""
 _BANDS = 14
-_LOWEST, _HIGHEST = 1 / 150, 0.4
-"""Bands of the radial spectrum, from a period of the compared square to where noise of rays would show
-[cycles / pixel]."""
+_LOWEST, _HIGHEST = 1 / 70, 0.4
+"""Bands of the radial spectrum, from a few caustic cells to where noise of rays would show [cycles / pixel]."""
 _LIT, _SURE = 0.2, 12.0
 """Part of the brightest smoothed light that counts as lit, and the width of that smoothing [pixels], a cell's."""
 _BRIGHTEST = 0.05
@@ -148,9 +147,9 @@ def lit_square(light: FloatArray) -> FloatArray:
     ends = [np.flatnonzero(lit.any(axis=axis))[[0, -1]] for axis in (1, 0)]
     middle = [int(each.mean()) for each in ends]
     half = int(min(np.ptp(each) for each in ends) / 2 - _SURE)
-    if half < 1 / (2 * _LOWEST):
+    if half < 1 / _LOWEST:  # else bands have no frequency
         raise MitsimError(
-            f"point spread function: its lit part is {2 * half} pixels wide; a twin needs {1 / _LOWEST:.0f}, so give a "
+            f"point spread function: its lit part is {2 * half} pixels wide; a twin needs {2 / _LOWEST:.0f}, so give a "
             "larger picture"
         )
     return light[middle[0] - half : middle[0] + half, middle[1] - half : middle[1] + half]

@@ -149,6 +149,9 @@ class Twin:
         found, over that of the learned codes; None where codes are of a calibration in another unit.
     correlation, chi_square
         of the two frames, means off; the latter with the measured frame's noise.
+    other
+        correlation of the measured frame with another capture's scene through the same codes: what any bright scene has
+        in common; None where there is no other.
     parts
         of the measured frame's energy by :data:`CAUSES`; noise that a correction takes with it counts as noise.
     rows, columns
@@ -167,6 +170,7 @@ class Twin:
     gain: float | None
     correlation: float
     chi_square: float
+    other: float | None
     parts: dict[str, float]
     rows: float
     columns: float
@@ -183,17 +187,24 @@ class Twin:
 
 @single_threaded_blas()
 def compare(
-    measured: Measured, codes: tuple[Code, Code], electrons: FloatArray, seed: int, learned: bool = True
+    measured: Measured,
+    codes: tuple[Code, Code],
+    electrons: FloatArray,
+    seed: int,
+    learned: bool = True,
+    other: FloatArray | None = None,
 ) -> Twin:
     """A ``measured`` frame beside simulated ``electrons`` of its scene through ``codes``; noise from ``seed``.
 
-    ``learned`` codes give frames in DN. The scale of the simulated one is the only number that is fitted.
+    ``learned`` codes give frames in DN. The scale of the simulated one is the only number that is fitted. ``other`` is
+    the scene of another capture.
     """
     frame, simulated = measured.frame, centre_frame(electrons)
     scale = _dot(frame, simulated) / _dot(simulated, simulated)
     expected = scale * simulated
     model = codes[0].factor @ measured.scene @ codes[1].factor.T
     own = _dot(model, simulated) / _dot(simulated, simulated)
+    wrong = None if other is None else codes[0].factor @ other @ codes[1].factor.T
     levels = measured.level, electrons
     return Twin(
         measured,
@@ -202,6 +213,7 @@ def compare(
         scale / own if learned else None,
         _correlation(frame, expected),
         float((np.square(frame - expected) / measured.variance).mean()),
+        None if wrong is None else _correlation(frame, wrong),
         _parts(measured, codes, expected, scale / own if learned else 1.0),
         *(_correlation(*(each.mean(axis=axis) for each in levels)) for axis in (1, 0)),
         float(measured.level.mean() / (scale * electrons.mean())),

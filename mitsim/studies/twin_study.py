@@ -114,11 +114,12 @@ class TwinFindings(Findings):
             "A FlatCam's frames",
             f"Codes of the mask are of {codes}. The simulated frame is of the authors' image on a sheet, through a "
             "drawn mask; its scale alone is fitted. Row and column means are off, as in the camera's own program.",
-            ("frame", "correlation", "explained", "chi-square", "noise alone", "scale"),
+            ("frame", "correlation", "other scene", "explained", "chi-square", "noise alone", "scale"),
             tuple(
                 (
                     twin.measured.name,
                     f"{twin.correlation:.3f}",
+                    "" if twin.other is None else f"{twin.other:.3f}",
                     f"{_explained(twin):.1%}",
                     f"{twin.chi_square:.2f}",
                     f"{twin.measured.variance.sum() / np.square(twin.measured.frame).sum():.1%}",
@@ -128,6 +129,8 @@ class TwinFindings(Findings):
             ),
             ("frames.png", "spectra.png"),
             (
+                "Other scene: correlation with another capture's scene through the same codes: what bright scenes have "
+                "in common. A twin is worth what it has above that.",
                 "Explained: part of the frame's energy. Noise alone: part that no model explains, by the frame's own "
                 "fine structure. Chi-square: 1 where only noise is left. Scale: light over what the learned codes "
                 "expect.",
@@ -222,7 +225,8 @@ def measure(
             _check_size(measured, codes, files)
             with tempfile.TemporaryDirectory(prefix="mitsim-twin-") as folder:
                 electrons = render(measured.scene, codes, Path(folder), variant)
-            twins.append(compare(measured, codes, electrons, request.seed, learned=known is None))
+            other = next((each.scene for key, each in captures.items() if key != name), None)
+            twins.append(compare(measured, codes, electrons, request.seed, known is None, other))
     diffuser = None
     if files.psf is not None:
         diffuser = twin_of(load_psf(files.psf, REDUCE), request.seed, variant, job.progress)
@@ -267,6 +271,7 @@ def _row(twin: Twin) -> dict[str, Any]:
         "frame": measured.name,
         "correlation": twin.correlation,
         "explained": _explained(twin),
+        "correlation_other_scene": twin.other,
         "chi_square": twin.chi_square,
         "noise": float(measured.variance.sum() / np.square(measured.frame).sum()),
         "scale": twin.gain,
