@@ -99,7 +99,10 @@ def render(scene: FloatArray, codes: tuple[Code, Code], folder: Path, variant: s
     (folder / "camera.toml").write_text(camera, encoding="utf-8")
     bench = open_bench(str(folder), variant, str(folder / "camera.toml"))
     plan = bench.plan("uniform", accuracy=_ACCURACY, effects="-diffraction")
-    return np.asarray(bench.capture(plan, exposure=_EXPOSURE_S).electrons[0], dtype=np.float64)
+    expected = bench.capture(plan, exposure=_EXPOSURE_S).electrons
+    if expected is None:
+        raise AssertionError  # a simulated capture has them
+    return np.asarray(expected[0], dtype=np.float64)
 
 
 def _picture(values: FloatArray) -> bytes:
@@ -205,7 +208,7 @@ def compare(
     model = codes[0].factor @ measured.scene @ codes[1].factor.T
     own = _dot(model, simulated) / _dot(simulated, simulated)
     wrong = None if other is None else codes[0].factor @ other @ codes[1].factor.T
-    levels = measured.level, electrons
+    rows, columns = (_correlation(measured.level.mean(axis=axis), electrons.mean(axis=axis)) for axis in (1, 0))
     return Twin(
         measured,
         expected,
@@ -215,7 +218,8 @@ def compare(
         float((np.square(frame - expected) / measured.variance).mean()),
         None if wrong is None else _correlation(frame, wrong),
         _parts(measured, codes, expected, scale / own if learned else 1.0),
-        *(_correlation(*(each.mean(axis=axis) for each in levels)) for axis in (1, 0)),
+        rows,
+        columns,
         float(measured.level.mean() / (scale * electrons.mean())),
         float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model)),
         electrons,
@@ -247,9 +251,9 @@ def _parts(measured: Measured, codes: tuple[Code, Code], expected: FloatArray, g
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
     """What of a ``rest`` is smooth light, or a smooth gain of the ``expected`` frame; and of how many numbers."""
-    sides = [legvander(np.linspace(-1, 1, count), _DEGREE) for count in rest.shape]
+    sides = [legvander(np.linspace(-1, 1, count), _DEGREE).astype(np.float64) for count in rest.shape]
     degrees = [each for each in product(range(_DEGREE + 1), repeat=2) if 0 < sum(each) <= _DEGREE]
-    shapes = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
+    shapes: list[FloatArray] = [np.outer(sides[0][:, row], sides[1][:, column]) for row, column in degrees]
     fields = [expected * shape for shape in shapes] + [
         shape
         for shape, each in zip(shapes, degrees, strict=True)
