@@ -92,7 +92,7 @@ class Measured:
         return float(np.square(self.level - self.level.mean()).sum())
 
 
-def turned(plane: FloatArray) -> FloatArray:
+def turn_plane(plane: FloatArray) -> FloatArray:
     """A ``plane``, or noise alone, turned and cut as the camera's own program does, between pixels linearly."""
     return np.asarray(ndimage.map_coordinates(plane, _places(plane.shape), order=1, mode="nearest"))
 
@@ -130,11 +130,23 @@ def read_scene(path: Path, plane: str) -> FloatArray:
 
 
 def measure_plane(name: str, raw: FloatArray, gain: float, read_variance: float, scene: FloatArray) -> Measured:
-    """A ``raw`` plane as :class:`Measured`, which says what the others are."""
+    """A raw plane, turned and cut, with its noise.
+
+    Parameters
+    ----------
+    name
+        of capture and plane.
+    raw
+        (rows, columns) of it [DN].
+    gain, read_variance
+        of its noise, as :func:`noise_of`.
+    scene
+        (n, n') what it is of.
+    """
     places = _places(raw.shape)
     rows, columns = places - np.floor(places)
     kept = (rows**2 + (1 - rows) ** 2) * (columns**2 + (1 - columns) ** 2)  # of white noise between pixels
-    level = turned(raw)
+    level = turn_plane(raw)
     light = np.maximum(ndimage.uniform_filter(level, _SMOOTH), 0)
     left = (1 - 1 / level.shape[0]) * (1 - 1 / level.shape[1])  # of it without means
     variance = kept * (gain * light + read_variance) * left
@@ -267,11 +279,11 @@ def read_code(factor: FloatArray) -> tuple[Code, bool, float]:
     shift = -(peak if peak < len(factor) else peak - 2 * len(factor)) / step
     if abs(shift) * step < 1:
         raise MitsimError("factor: its columns are not one shadow, shifted; a twin needs a mask that fills the view")
-    turned_factor = without if shift > 0 else without[:, ::-1]
+    straight = without if shift > 0 else without[:, ::-1]
 
     def fit(scale: float) -> tuple[Code, float]:
-        code = _fit_side(scale, [np.eye(factor.shape[1])], [turned_factor])
-        return code, float(np.square(turned_factor - code.factor).sum() / np.square(turned_factor).sum())
+        code = _fit_side(scale, [np.eye(factor.shape[1])], [straight])
+        return code, float(np.square(straight - code.factor).sum() / np.square(straight).sum())
 
     near = 1.0 / step  # a peak is found to a pixel
     found = minimize_scalar(lambda s: fit(s)[1], bounds=(abs(shift) - near, abs(shift) + near), method="bounded")

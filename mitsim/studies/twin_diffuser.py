@@ -43,6 +43,7 @@ TRACED = 6
 _RAYS = 1280, 2048
 """A side of the square of rays, of the fit and of what is traced: 20 and 50 a pixel."""
 _BANDS = 14
+"""Of the radial spectrum: a fourth of a frequency wide, as caustic cells vary."""
 _LOWEST, _HIGHEST = 1 / 70, 0.4
 """Bands of the radial spectrum, from a few caustic cells to where noise of rays would show [cycles / pixel]."""
 _LIT, _SURE = 0.2, 12.0

@@ -46,7 +46,7 @@ class TwinFiles:
 
     @classmethod
     def find(cls, folder: Path | None, calibration: Path | None = None) -> TwinFiles:
-        """Those in a ``folder``; MitsimError where there are none, or too few."""
+        """Those in a ``folder``, with a ``calibration``; MitsimError where there are none, or too few."""
         if folder is None:
             raise MitsimError(f"study twin: needs real captures; give --data FOLDER with {SOURCES}")
         if not folder.is_dir():

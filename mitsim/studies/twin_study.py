@@ -1,9 +1,9 @@
-"""`mitsim study twin`: real captures beside simulations of the same rigs; what agrees, what does not, and why.
+"""`mitsim study twin`: real captures beside their simulations; what agrees, what does not, and why.
 
 A FlatCam's captures (:mod:`mitsim.studies.twin_capture`): codes of its mask come of other captures, or of a
 calibration. The scene, as the authors' own calibration shows it, is put on a sheet, and captured by a simulated camera
-(:mod:`mitsim.studies.twin_rig`). A DiffuserCam's point spread function: a diffuser whose statistics are fitted to it is
-traced (:mod:`mitsim.studies.twin_diffuser`).
+(:mod:`mitsim.studies.twin_frame`). A DiffuserCam's point spread function: a diffuser whose statistics are fitted to it
+is traced (:mod:`mitsim.studies.twin_diffuser`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from mitsim.studies.twin_capture import (
 )
 from mitsim.studies.twin_diffuser import REDUCE, DiffuserTwin, frequencies, twin_of
 from mitsim.studies.twin_files import TwinFiles
-from mitsim.studies.twin_rig import Twin, compare, render
+from mitsim.studies.twin_frame import Twin, compare, render
 
 _GREEN = "gb"
 """Plane that a calibration is of."""
@@ -120,7 +120,7 @@ class TwinFindings(Findings):
                     twin.measured.name,
                     f"{twin.correlation:.3f}",
                     "" if twin.other is None else f"{twin.other:.3f}",
-                    f"{_explained(twin):.1%}",
+                    f"{_explained_part(twin):.1%}",
                     f"{twin.chi_square:.2f}",
                     f"{twin.measured.variance.sum() / np.square(twin.measured.frame).sum():.1%}",
                     "" if twin.gain is None else f"{twin.gain:.2f}",
@@ -196,7 +196,7 @@ def measure(
     Parameters
     ----------
     bench
-        none: rigs are made of the captures.
+        none: benches are made of the captures.
     request, job
         the seed of noise and diffusers, and who is told how far the work is.
     files
@@ -260,7 +260,7 @@ def _check_size(measured: Measured, codes: tuple[Code, Code], files: TwinFiles) 
 # ---- Tables ----
 
 
-def _explained(twin: Twin) -> float:
+def _explained_part(twin: Twin) -> float:
     frame = twin.measured.frame
     return 1 - float(np.square(frame - twin.expected).sum() / np.square(frame).sum())
 
@@ -270,7 +270,7 @@ def _row(twin: Twin) -> dict[str, Any]:
     return {
         "frame": measured.name,
         "correlation": twin.correlation,
-        "explained": _explained(twin),
+        "explained": _explained_part(twin),
         "correlation_other_scene": twin.other,
         "chi_square": twin.chi_square,
         "noise": float(measured.variance.sum() / np.square(measured.frame).sum()),

@@ -13,9 +13,9 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.solver import centre_frame
-from mitsim.studies.twin_capture import CROP, TURN_DEG, Code, Measured, learn_codes, noise_of, read_code, turned
+from mitsim.studies.twin_capture import CROP, TURN_DEG, Code, Measured, learn_codes, noise_of, read_code, turn_plane
 from mitsim.studies.twin_files import TwinFiles
-from mitsim.studies.twin_rig import CAUSES, compare, render
+from mitsim.studies.twin_frame import CAUSES, compare, render
 
 SCALES, SCENE, SENSOR = (0.6, 0.7), 40, (80, 90)
 GAIN, LIGHT = 0.1, 600.0
@@ -86,7 +86,7 @@ def test_a_plane_is_turned_as_the_cameras_program_turns_it() -> None:
     """scipy's rotation, cut. (Planted: the other way round.)"""
     plane = smooth(np.random.default_rng(2), 512, 640, width=3.0)
     theirs = ndimage.rotate(plane, TURN_DEG, reshape=False, order=1, mode="nearest")[CROP]
-    assert np.abs(turned(plane) - theirs).max() < 1e-9
+    assert np.abs(turn_plane(plane) - theirs).max() < 1e-9
 
 
 def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path) -> None:
 
 def cause_of(measured: Measured, codes: tuple[Code, Code], monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """Parts by cause, where the simulation is the model itself."""
-    monkeypatch.setattr("mitsim.studies.twin_rig.draw_noise", lambda measured, seed: np.zeros(SENSOR))
+    monkeypatch.setattr("mitsim.studies.twin_frame.draw_noise", lambda measured, seed: np.zeros(SENSOR))
     electrons = 1000 + codes[0].factor @ measured.scene @ codes[1].factor.T
     return compare(measured, codes, electrons, 0).parts
 

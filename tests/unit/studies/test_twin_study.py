@@ -25,7 +25,7 @@ from mitsim.studies.twin_diffuser import (
     lit_square,
     spread_of,
 )
-from mitsim.studies.twin_rig import CAUSES, Twin
+from mitsim.studies.twin_frame import CAUSES, Twin
 from mitsim.studies.twin_study import TwinFindings
 from mitsim.transport.plugins.diffuser import random_relief
 from tests.unit.studies.test_twin_capture import made, made_codes

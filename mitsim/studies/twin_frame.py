@@ -1,10 +1,10 @@
-"""A measured frame, its scene and the mask's codes in; the frame of a simulated camera of the same rig out, and what of
-the measured one it does not explain, by cause.
+"""A measured frame, its scene and the mask's codes in; the frame of a simulated camera like the real one out, and
+what of the measured one it does not explain, by cause.
 
-The rig: the scene's image on a matt sheet, evenly lit; before the sensor a drawn mask of the transmission
+The bench: the scene's image on a matt sheet, evenly lit; before the sensor a drawn mask of the transmission
 (1 + c_r(row) c_c(column)) / 2, codes scaled to 1, without diffraction, which the learned codes have in them. Light and
 frame are those of any mitsim scene. How far the real camera's mask and scene were no frame tells: only the product of
-the mask's distance and an angle moves a shadow. The rig takes distances at which the angle hardly dims light.
+the mask's distance and an angle moves a shadow. The bench takes distances at which the angle hardly dims light.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.sensor.chain import expose
-from mitsim.studies.twin_capture import CROP, Code, Measured, learn_codes, turned
+from mitsim.studies.twin_capture import CROP, Code, Measured, learn_codes, turn_plane
 
 _PITCH_MM = 0.0106
 """Of a Bayer plane's pixels, twice 5.3 um: the sensors of 1024 x 1280 pixels in use then have it. Frames do not depend
@@ -72,7 +72,16 @@ _SCENE = Template("""<scene version="3.0.0">
 def render(scene: FloatArray, codes: tuple[Code, Code], folder: Path, variant: str) -> FloatArray:
     """(m, m') expected electrons of a simulated camera that sees a ``scene`` (n, n') through a mask of ``codes``.
 
-    The rig's files are written to ``folder``, which exists: any verb takes them.
+    Parameters
+    ----------
+    scene
+        as the camera sees it, 0 to 1.
+    codes
+        of rows and of columns.
+    folder
+        that gets the bench's files, which any verb takes; it exists.
+    variant
+        of Mitsuba.
     """
     shape = tuple(len(code.values) - int(code.scale * (code.scene - 1)) - 1 for code in codes)
     feature = _PITCH_MM * (1 - _MASK_MM / _SHEET_MM)
@@ -117,7 +126,8 @@ def _picture(values: FloatArray) -> bytes:
 
 
 def draw_noise(measured: Measured, seed: int) -> FloatArray:
-    """(m, m') noise [DN] of the simulated sensor at the measured light, put through the same turn and cut."""
+    """(m, m') noise [DN] of the simulated sensor at the ``measured`` light, put through the same turn and cut; its
+    ``seed``."""
     sensor = SensorModel(
         name="twin", pixel_pitch_um=_PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=measured.gain,
         read_noise_e=float(np.sqrt(measured.read_variance)) / measured.gain, source="mitsim study twin",
@@ -125,7 +135,7 @@ def draw_noise(measured: Measured, seed: int) -> FloatArray:
     light = np.full(tuple(side.start + side.stop for side in CROP), measured.level.mean() / measured.gain)
     shot, read = (stream(seed, "twin", kind, measured.name) for kind in ("shot", "read"))
     noisy = np.asarray(expose(light, _EXPOSURE_S, sensor, shot, read), dtype=np.float64)
-    return centre_frame(turned(noisy - noisy.mean()))
+    return centre_frame(turn_plane(noisy - noisy.mean()))
 
 
 # ---- What is compared ----
@@ -197,10 +207,20 @@ def compare(
     learned: bool = True,
     other: FloatArray | None = None,
 ) -> Twin:
-    """A ``measured`` frame beside simulated ``electrons`` of its scene through ``codes``; noise from ``seed``.
+    """A measured frame beside a simulated one, whose scale is the only number that is fitted.
 
-    ``learned`` codes give frames in DN. The scale of the simulated one is the only number that is fitted. ``other`` is
-    the scene of another capture.
+    Parameters
+    ----------
+    measured
+        the frame.
+    codes, electrons
+        of rows and of columns; and what the simulated camera expects behind them.
+    seed
+        of the simulated noise.
+    learned
+        whether codes were learned from frames in DN, so that they state the scale.
+    other
+        scene of another capture.
     """
     frame, simulated = measured.frame, centre_frame(electrons)
     scale = _dot(frame, simulated) / _dot(simulated, simulated)
