@@ -25,7 +25,6 @@ from mitsim.core.job import Job
 from mitsim.devices.mask_profile import load_psf
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.report import plots
-from mitsim.report.pages import with_error
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 from mitsim.studies.twin_capture import (
@@ -303,7 +302,7 @@ def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
         ("brightest", "light in the brightest twentieth of the pixels"),
     ):
         value, mean, scatter = twin.deviations(name)
-        rows.append((text, f"{value:.3f}", with_error(mean, scatter)))
+        rows.append((text, f"{value:.3f}", f"{mean:.3f} \N{PLUS-MINUS SIGN} {scatter:.3f}"))
     own, others = twin.spectrum_error
     rows.append(("radial spectrum: rms of the logarithm, to the mean of simulated ones", f"{own:.2f}", f"{others:.2f}"))
     numbers = zip(
@@ -324,7 +323,7 @@ def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
         ),
         Part(
             "The diffuser that was fitted",
-            "By the radial spectrum, on a grid. Scatter: standard deviation of fits to single simulated diffusers.",
+            "By the radial spectrum, on a grid (blur in steps of 0.2). Scatter: standard deviation of fits to single simulated diffusers.",
             ("number", "fitted", "scatter"),
             tuple((name, text, f"{scatter:.3f}") for name, text, scatter in numbers),
             notes=(
