@@ -323,7 +323,8 @@ def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
         ),
         Part(
             "The diffuser that was fitted",
-            "By the radial spectrum, on a grid (blur in steps of 0.2). Scatter: standard deviation of fits to single simulated diffusers.",
+            "By the radial spectrum, on a grid (blur in steps of 0.2). Scatter: "
+            "standard deviation of fits to single simulated diffusers.",
             ("number", "fitted", "scatter"),
             tuple((name, text, f"{scatter:.3f}") for name, text, scatter in numbers),
             notes=(
