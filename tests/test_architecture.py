@@ -359,6 +359,8 @@ WITHOUT_NUMPY = (
     "study accuracy photograph -o full",
     "study calibration photograph -o s --camera endless.toml",
     "study solver -o full",
+    "study twin -o s",
+    "study twin --data none -o s",
     "study merge bad -o s",
 )
 """Of a folder that is missing or holds something, a bad manifest, and words that are not known."""

@@ -53,6 +53,8 @@ class Studied:
     patterns: Patterns = _MAIN_PATTERNS
     seed: Seed = 0
     recipe: Path | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
+    data: Path | None = option(None, "of twin: folder of real captures", metavar="DIR")
+    calibration: Path | None = option(None, "of twin: CAL folder of the mask, else learned", metavar="CAL")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
 
 
@@ -73,7 +75,8 @@ def study(
     """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
     of a ColorChecker; what `drift` between calibration and capture costs; `models` of a calibration; `sweep` of any
     knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
-    how good a `calibration` session is, and why; `merge` joins the parts of --shard.
+    how good a `calibration` session is, and why; `twin`: real captures beside their simulation; `merge` joins the parts
+    of --shard.
     """
     from mitsim.studies import EXPOSED, OF_NO_SCENE
     from mitsim.studies.framework.experiment import is_experiment
@@ -84,6 +87,8 @@ def study(
         refuse_unused(context, others, "on parts, which say themselves what they are of")
     else:
         refuse_unused(context, ["experiment"], "but with merge; give the module as the study's NAME")
+    if name != "twin":
+        refuse_unused(context, ["data", "calibration"], "but on the study twin")
     session, request = recipe_for(name, studied.recipe), mitsim.Request.of(patterns=studied.patterns, seed=studied.seed)
     warnings: Sequence[str] = ()
     with common.job() as job:
@@ -106,7 +111,12 @@ def study(
             _check_setup(scope, _only(scenes))
             result = run_experiment(name, scope, studied.output, job, where)
         else:
-            run_study = find_study(name, **({"recipe": session} if session else {}))
+            settings: dict[str, Any] = {"recipe": session} if session else {}
+            if name == "twin":
+                from mitsim.studies.twin_files import TwinFiles
+
+                settings = {"files": TwinFiles.find(studied.data, studied.calibration), "variant": common.variant}
+            run_study = find_study(name, **settings)
             if not points.are_main:
                 raise MitsimError(
                     f"study {name}: is measured whole, here; leave out --over, --measure, --shard, --jobs, --scheduler"
@@ -117,6 +127,7 @@ def study(
                 if scenes:
                     raise MitsimError(f"study {name} {' '.join(scenes)}: it is of no scene; leave the scene out")
                 refuse_unused(context, _OF_SCENES, f"on the study {name}, which is of no scene")
+                check_study_folder(studied.output, name)
             else:
                 check_study_folder(studied.output, name)
                 if name in EXPOSED:

@@ -5,10 +5,10 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("accuracy", "calibration", "diffraction", "solver")
+STUDIES = ("accuracy", "calibration", "diffraction", "solver", "twin")
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.run.Findings`."""
-OF_NO_SCENE = ("solver",)
+OF_NO_SCENE = ("solver", "twin")
 """Those whose bench is None."""
 EXPOSED = ("calibration", "diffraction")
 """Those whose frames fill a part of the camera's full well."""

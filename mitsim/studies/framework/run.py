@@ -131,8 +131,8 @@ def run_study(
         if findings.title:
             from mitsim.studies.framework.page import build_findings
 
-            where = f"Scene {bench.loaded.path.parent.name}, " if bench else ""
-            where += f"patterns {patterns}, seed {request.seed}."
+            scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
+            where = f"{scene_name} {request.seed}."
             page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")

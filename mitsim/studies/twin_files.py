@@ -1,0 +1,69 @@
+"""What `mitsim study twin` compares with: a folder of real captures in, their files out; or a line that says where to
+get them.
+
+The folder has one of two others, or both, named and filled as the public repositories have them:
+
+* ``flatcam``: raw captures ``fc_6.png``, .. of a FlatCam behind a Bayer sensor, and their authors' images of them,
+  ``rec_6.png``, .. (siddiquesalman/flatnet on GitHub);
+* ``diffusercam``: the point spread function of a DiffuserCam, ``psf_sample.tif`` (Waller-Lab/DiffuserCam-Tutorial).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mitsim.core.errors import MitsimError
+from mitsim.core.files import check_plain
+
+FLATCAM, DIFFUSERCAM = "flatcam", "diffusercam"
+"""Folders of captures."""
+PSF = "psf_sample.tif"
+SOURCES = (
+    f"{FLATCAM}/fc_6.png, rec_6.png, .. of github.com/siddiquesalman/flatnet, {DIFFUSERCAM}/{PSF} of "
+    "github.com/Waller-Lab/DiffuserCam-Tutorial, or one of both"
+)
+"""Where the files are from, for people."""
+
+
+@dataclass(frozen=True)
+class TwinFiles:
+    """Files of real captures.
+
+    Attributes
+    ----------
+    captures
+        raw frame and its authors' image, by the capture's name.
+    psf
+        point spread function of a DiffuserCam; None: none is compared.
+    calibration
+        CAL folder of the FlatCam's green plane; None: codes are learned from the other captures.
+    """
+
+    captures: dict[str, tuple[Path, Path]]
+    psf: Path | None
+    calibration: Path | None = None
+
+    @classmethod
+    def find(cls, folder: Path | None, calibration: Path | None = None) -> TwinFiles:
+        """Those in a ``folder``, with a ``calibration``; MitsimError where there are none, or too few."""
+        if folder is None:
+            raise MitsimError(f"study twin: needs real captures; give --data FOLDER with {SOURCES}")
+        if not folder.is_dir():
+            raise MitsimError(f"--data {folder}: there is no such folder; give one with {SOURCES}")
+        frames = sorted((folder / FLATCAM).glob("fc_*.png"))
+        captures = {frame.stem: (frame, frame.with_name(f"rec_{frame.stem[3:]}.png")) for frame in frames}
+        psf = folder / DIFFUSERCAM / PSF
+        found = cls(captures, psf if psf.exists() else None, calibration)
+        for file in (*(each for pair in captures.values() for each in pair), *([found.psf] if found.psf else ())):
+            check_plain(file, "capture")
+        if not captures and found.psf is None:
+            raise MitsimError(f"--data {folder}: has no captures; give a folder with {SOURCES}")
+        if calibration is not None and not captures:
+            raise MitsimError(f"--calibration {calibration}: has no effect without {folder / FLATCAM}; leave it out")
+        if len(captures) == 1 and calibration is None:
+            raise MitsimError(
+                f"--data {folder}: has one capture of a FlatCam, and its mask is learned from others; give "
+                "--calibration CAL, or a second capture"
+            )
+        return found

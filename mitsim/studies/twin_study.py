@@ -1,0 +1,427 @@
+"""`mitsim study twin`: real captures beside their simulations; what agrees, what does not, and why.
+
+A FlatCam's captures (:mod:`mitsim.studies.twin_capture`): codes of its mask come of other captures, or of a
+calibration. The scene, as the authors' own calibration shows it, is put on a sheet, and captured by a simulated camera
+(:mod:`mitsim.studies.twin_frame`). A DiffuserCam's point spread function: a diffuser whose statistics are fitted to it
+is traced (:mod:`mitsim.studies.twin_diffuser`).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mitsim.bench.request import Request
+from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import DEFAULT_VARIANT
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.devices.mask_profile import load_psf
+from mitsim.reconstruct.factors import load_calibration
+from mitsim.report import plots
+from mitsim.studies.framework.page import Part
+from mitsim.studies.framework.run import Findings
+from mitsim.studies.twin_capture import (
+    FLIPPED,
+    PLANES,
+    Code,
+    Measured,
+    codes_of,
+    learn_codes,
+    measure_plane,
+    noise_of,
+    read_plane,
+    read_scene,
+)
+from mitsim.studies.twin_diffuser import REDUCE, DiffuserTwin, frequencies, twin_of
+from mitsim.studies.twin_files import TwinFiles
+from mitsim.studies.twin_frame import Twin, compare, render
+
+_GREEN = "gb"
+"""Plane that a calibration is of."""
+_SHOWN = 160
+"""Side of the middle of a frame that is shown [pixels]: features of four pixels are seen on a page."""
+_BRIGHT = 3.0
+"""Standard deviations of a frame from mid-grey to white."""
+_NO_CODE = 0.05
+"""Part of a calibration's factor, in energy, that is no shifted code, from which a twin is not to be trusted: half of
+what it is to explain."""
+_UNKNOWN = (
+    "Distances of mask and scene: only the product of the mask's distance and an angle moves a shadow.",
+    "The scene: its image by the authors' own calibration stands for it, with what that smooths and cuts at 0.",
+    "The mask's mean transmission, black level and stray light: means of rows and columns are off before codes are "
+    "learned. Where coded parts agree, the mean levels do not: the drawn mask, whose code is scaled by its largest "
+    "value, lets more even light through than the real one.",
+    "The mask as it was made: learned codes hold its diffraction and flaws as far as these are separable, and errors "
+    "of the scenes that they were learned from.",
+)
+"""What no comparison of these frames can tell."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwinFindings(Findings):
+    """Twins of captures, and of a diffuser; ``calibration`` is the CAL folder of the codes, None: learned; ``no_code``
+    the part of its factors that is none."""
+
+    twins: tuple[Twin, ...]
+    diffuser: DiffuserTwin | None
+    calibration: str | None
+    no_code: float | None
+
+    title = "Real captures beside their simulation"
+
+    def payload(self) -> dict[str, Any]:
+        """The JSON of the command line."""
+        return {
+            "captures": [_row(twin) for twin in self.twins],
+            "calibration": self.calibration,
+            "factors_not_a_code": self.no_code,
+            "diffuser": None if self.diffuser is None else _diffuser_row(self.diffuser),
+            "not_known": list(_UNKNOWN),
+        }
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """That the factors of a calibration are no shifted codes."""
+        if self.no_code is None or self.no_code <= _NO_CODE:
+            return ()
+        return (
+            f"{self.no_code:.0%} of the calibration's factors, in energy, is no code seen through shifts, which the "
+            "simulated mask lacks; calibrate by captures of known pictures",
+        )
+
+    def parts(self) -> Sequence[Part]:
+        """Of its page."""
+        return [
+            *(self._capture_parts() if self.twins else ()),
+            *(_diffuser_parts(self.diffuser) if self.diffuser else ()),
+        ]
+
+    def _capture_parts(self) -> Iterator[Part]:
+        codes = (
+            f"the calibration {self.calibration}"
+            if self.calibration
+            else "the other captures and their images alone, so every frame is a prediction"
+        )
+        yield Part(
+            "A FlatCam's frames",
+            f"Codes of the mask are of {codes}. The simulated frame is of the authors' image on a sheet, through a "
+            "drawn mask; its scale alone is fitted. Row and column means are off, as in the camera's own program.",
+            ("frame", "correlation", "other scene", "explained", "chi-square", "noise alone", "scale"),
+            tuple(
+                (
+                    twin.measured.name,
+                    f"{twin.correlation:.3f}",
+                    "" if twin.other is None else f"{twin.other:.3f}",
+                    f"{_explained_part(twin):.1%}",
+                    f"{twin.chi_square:.2f}",
+                    f"{twin.measured.variance.sum() / np.square(twin.measured.frame).sum():.1%}",
+                    "" if twin.gain is None else f"{twin.gain:.2f}",
+                )
+                for twin in self.twins
+            ),
+            ("frames.png", "spectra.png"),
+            (
+                "Other scene: correlation with another capture's scene through the same codes: what bright scenes have "
+                "in common. A twin is worth what it has above that.",
+                "Explained: part of the frame's energy. Noise alone: part that no model explains, by the frame's own "
+                "fine structure. Chi-square: 1 where only noise is left. Scale: light over what the learned codes "
+                "expect.",
+            ),
+        )
+        causes = list(self.twins[0].parts)
+        yield Part(
+            "By cause",
+            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave. "
+            "Smooth field: polynomials of light and of gain. Mask's code: codes fitted to this very frame. Scene's "
+            "image: a correction of least risk. Noise that a fit takes with it counts as noise; the rest is not "
+            "explained: of what is not separable, moved or grew.",
+            ("frame", *causes),
+            tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in causes)) for twin in self.twins),
+            ("causes.png",),
+        )
+        yield Part(
+            "Means of rows and columns, and what cannot be known",
+            "The camera's program takes the means off. Correlation of measured and simulated means, and the measured "
+            "mean level over the simulated one where coded parts agree.",
+            ("frame", "rows", "columns", "level"),
+            tuple(
+                (twin.measured.name, f"{twin.rows:.2f}", f"{twin.columns:.2f}", f"{twin.level:.2f}")
+                for twin in self.twins
+            ),
+            ("means.png",),
+            _UNKNOWN,
+        )
+
+    def figures(self) -> dict[str, Figure]:
+        """By file name."""
+        shown: dict[str, Figure] = {}
+        if self.twins:
+            shown |= {
+                "frames.png": _frames_figure(self._first()),
+                "spectra.png": _spectra_figure(self._first()),
+                "causes.png": plots.stacked_bars(
+                    {
+                        twin.measured.name: {name: max(100 * part, 0.0) for name, part in twin.parts.items()}
+                        for twin in self.twins
+                    },
+                    "energy of the frame [%]",
+                ),
+                "means.png": _means_figure(self._first()[0]),
+            }
+        if self.diffuser:
+            shown |= {
+                "diffuser.png": _light_figure(self.diffuser),
+                "diffuser_spectrum.png": _rings_figure(self.diffuser),
+            }
+        return shown
+
+    def _first(self) -> list[Twin]:
+        """Green frames of two captures."""
+        return [twin for twin in self.twins if twin.measured.name.endswith(_GREEN)][:2]
+
+
+def measure(
+    bench: None, request: Request, job: Job, files: TwinFiles | None = None, variant: str = DEFAULT_VARIANT
+) -> TwinFindings:
+    """Twins of all that the ``files`` hold.
+
+    Parameters
+    ----------
+    bench
+        none: benches are made of the captures.
+    request, job
+        the seed of noise and diffusers, and who is told how far the work is.
+    files
+        real captures.
+    variant
+        of Mitsuba.
+
+    Raises
+    ------
+    MitsimError
+        without files, and for files that are not what they are to be.
+    """
+    files = files or TwinFiles.find(None)
+    known, no_code = None, None
+    if files.calibration is not None:
+        left, right, turned, no_code = codes_of(load_calibration(files.calibration))
+        known = (left, right), turned
+    planes = [_GREEN] if known else list(PLANES)
+    todo = [(name, plane) for plane in planes for name in files.captures]
+    twins: list[Twin] = []
+    for plane in planes:
+        captures = _read(files, plane, known[1] if known else None)
+        for name, measured in captures.items():
+            job.progress("FlatCam", len(twins) / len(todo))
+            codes = known[0] if known else learn_codes([captures[each] for each in captures if each != name])
+            _check_size(measured, codes, files)
+            with tempfile.TemporaryDirectory(prefix="mitsim-twin-") as folder:
+                electrons = render(measured.scene, codes, Path(folder), variant)
+            other = next((each.scene for key, each in captures.items() if key != name), None)
+            twins.append(compare(measured, codes, electrons, request.seed, known is None, other))
+    diffuser = None
+    if files.psf is not None:
+        diffuser = twin_of(load_psf(files.psf, REDUCE), request.seed, variant, job.progress)
+    twins.sort(key=lambda twin: twin.measured.name)
+    return TwinFindings(tuple(twins), diffuser, str(files.calibration) if files.calibration else None, no_code)
+
+
+def _read(files: TwinFiles, plane: str, turned: tuple[bool, bool] | None) -> dict[str, Measured]:
+    """A ``plane`` of all captures, by name; scenes as a calibration's codes run, ``turned`` or not."""
+    raw = {name: read_plane(frame, plane) for name, (frame, _) in files.captures.items()}
+    gain, dark = noise_of(list(raw.values()))
+    found = {}
+    for name, (_, image) in files.captures.items():
+        scene = read_scene(image, plane)
+        if turned is not None:
+            steps = (-1 if own != asked else 1 for own, asked in zip(FLIPPED, turned, strict=True))
+            scene = scene[:: next(steps), :: next(steps)].copy()
+        found[name] = measure_plane(f"{name} {plane}", raw[name], gain, dark, scene)
+    return found
+
+
+def _check_size(measured: Measured, codes: tuple[Code, Code], files: TwinFiles) -> None:
+    shapes = tuple(tuple(code.factor.shape[axis] for code in codes) for axis in (0, 1))
+    if shapes != (measured.frame.shape, measured.scene.shape):
+        raise MitsimError(
+            f"--calibration {files.calibration}: is of frames of {shapes[0]} and scenes of {shapes[1]} pixels; "
+            f"{measured.name} has {measured.frame.shape} and {measured.scene.shape}, so calibrate by captures cut alike"
+        )
+
+
+# ---- Tables ----
+
+
+def _explained_part(twin: Twin) -> float:
+    frame = twin.measured.frame
+    return 1 - float(np.square(frame - twin.expected).sum() / np.square(frame).sum())
+
+
+def _row(twin: Twin) -> dict[str, Any]:
+    measured = twin.measured
+    return {
+        "frame": measured.name,
+        "correlation": twin.correlation,
+        "explained": _explained_part(twin),
+        "correlation_other_scene": twin.other,
+        "chi_square": twin.chi_square,
+        "noise": float(measured.variance.sum() / np.square(measured.frame).sum()),
+        "scale": twin.gain,
+        "gain_dn_per_e": measured.gain,
+        "read_variance_dn2": measured.read_variance,
+        "rows": twin.rows,
+        "columns": twin.columns,
+        "level": twin.level,
+        "render_error": twin.render_error,
+        "parts": {name: float(part) for name, part in twin.parts.items()},
+    }
+
+
+def _diffuser_row(twin: DiffuserTwin) -> dict[str, Any]:
+    found = dict(zip(("correlation_mm", "move_mm", "blur", "haze"), twin.scatter, strict=True))
+    compared = {name: twin.deviations(name) for name in ("contrast", "brightest")}
+    return {
+        **{name: getattr(twin, name) for name in found},
+        "scatter": found,
+        **{name: {"measured": a, "simulated": b, "scatter": c} for name, (a, b, c) in compared.items()},
+        "spectrum_error": {"measured": twin.spectrum_error[0], "simulated": twin.spectrum_error[1]},
+    }
+
+
+def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
+    rows = []
+    for name, text in (
+        ("contrast", "contrast of the light: deviation over mean"),
+        ("brightest", "light in the brightest twentieth of the pixels"),
+    ):
+        value, mean, scatter = twin.deviations(name)
+        rows.append((text, f"{value:.3f}", f"{mean:.3f} \N{PLUS-MINUS SIGN} {scatter:.3f}"))
+    own, others = twin.spectrum_error
+    rows.append(("radial spectrum: rms of the logarithm, to the mean of simulated ones", f"{own:.2f}", f"{others:.2f}"))
+    numbers = zip(
+        ("correlation length", "light moved, rms along an axis", "blur", "even part of the light"),
+        (f"{twin.correlation_mm:.3f} mm", f"{twin.move_mm:.3f} mm", f"{twin.blur:.1f} pixels", f"{twin.haze:.2f}"),
+        twin.scatter,
+        strict=True,
+    )
+    return [
+        Part(
+            "A DiffuserCam's point spread function",
+            "A normal relief with the measured picture's statistics, traced by Mitsuba. No caustic of a random one "
+            "lies where the real one has it: what is compared holds for all of its kind. The spectrum was fitted, "
+            "contrast and brightest pixels were not.",
+            ("of the lit square", "measured", "simulated"),
+            tuple(rows),
+            ("diffuser.png", "diffuser_spectrum.png"),
+        ),
+        Part(
+            "The diffuser that was fitted",
+            "By the radial spectrum, on a grid (blur in steps of 0.2). Scatter: "
+            "standard deviation of fits to single simulated diffusers.",
+            ("number", "fitted", "scatter"),
+            tuple((name, text, f"{scatter:.3f}") for name, text, scatter in numbers),
+            notes=(
+                "Lengths are in pixels of 23.4 um, which the public file does not state.",
+                "The relief's height and its distance cannot be told apart: light is moved by distance x (n - 1) x "
+                "slope, the slope of a normal relief being its rms height over its correlation length.",
+                "Blur and the even part stand for the size of the point, diffraction, pixels and stray light together.",
+            ),
+        ),
+    ]
+
+
+# ---- Figures ----
+
+
+def _frames_figure(twins: Sequence[Twin]) -> Figure:
+    """Middles of measured and simulated frames with noise, and their difference."""
+    figure, places = plots.panels_of(len(twins), 3, 2.9 * len(twins) + 0.3, layout="compressed")
+    for line, twin in zip(places, twins, strict=True):
+        frame, sigma = twin.measured.frame, float(twin.measured.frame.std())
+        first = [(side - _SHOWN) // 2 for side in frame.shape]
+        middle = np.s_[first[0] : first[0] + _SHOWN, first[1] : first[1] + _SHOWN]
+        images = {
+            "measured": frame,
+            "simulated, with noise": twin.noisy,
+            "measured less simulated": frame - twin.expected,
+        }
+        for axes, (name, image) in zip(line, images.items(), strict=True):
+            axes.imshow(image[middle], cmap="gray", vmin=-_BRIGHT * sigma, vmax=_BRIGHT * sigma, interpolation="none")
+            axes.set(xticks=[], yticks=[])
+            axes.set_title(f"{twin.measured.name}: {name}" if name == "measured" else name, fontsize=plots.FONT - 1)
+    figure.suptitle(f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off, one scale", fontsize=plots.FONT)
+    return figure
+
+
+def _power(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Frequencies [cycles / pixel] and radial mean of the power of a windowed ``frame``, a pixel."""
+    window = np.outer(*(np.hanning(side) for side in frame.shape))
+    power = np.square(np.abs(np.fft.fft2(frame * window))) / np.square(window).sum()
+    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(side) for side in frame.shape), indexing="ij"))
+    edges = np.geomspace(0.005, 0.5, 29)
+    which = np.digitize(radius.ravel(), edges)
+    sums, counts = (np.bincount(which, weights, len(edges) + 1) for weights in (power.ravel(), None))
+    return np.sqrt(edges[1:] * edges[:-1]), sums[1:-1] / np.maximum(counts[1:-1], 1)
+
+
+def _spectra_figure(twins: Sequence[Twin]) -> Figure:
+    figure, places = plots.panels_of(1, len(twins), 0.42 * plots.WIDTH, sharey=True)
+    for axes, twin in zip(places[0], twins, strict=True):
+        frame = twin.measured.frame
+        curves = {
+            "measured": frame,
+            "simulated, with noise": twin.noisy,
+            "simulated, its noise alone": twin.noisy - twin.expected,
+            "measured less simulated": frame - twin.expected,
+        }
+        for index, (name, shown) in enumerate(curves.items()):
+            axes.loglog(*_power(shown), label=name, lw=1.8, **plots.line_style(index))
+        axes.set_title(twin.measured.name, fontsize=plots.FONT)
+        first = axes is places[0][0]
+        plots.label_axes(axes, "frequency [cycles / pixel]", "power [DN\N{SUPERSCRIPT TWO}]" if first else "")
+    plots.legend_below(figure, 2, *places[0][0].get_legend_handles_labels())
+    return figure
+
+
+def _means_figure(twin: Twin) -> Figure:
+    """Means of rows and of columns about their mean, the simulated ones in the measured scale."""
+    figure, places = plots.panels_of(1, 2, 0.4 * plots.WIDTH)
+    for axes, axis, name in zip(places[0], (1, 0), ("row", "column"), strict=True):
+        for index, (label, values) in enumerate(twin.means(axis).items()):
+            axes.plot(values, label=label, lw=1.5, **plots.line_style(index))
+        axes.set_title(f"{twin.measured.name}: means of {name}s, about their mean", fontsize=plots.FONT - 1)
+        plots.label_axes(axes, name, "light [DN]" if axis else "")
+    plots.legend_below(figure, 2, *places[0][0].get_legend_handles_labels())
+    return figure
+
+
+def _light_figure(twin: DiffuserTwin) -> Figure:
+    figure, places = plots.panels_of(1, 2, 0.5 * plots.WIDTH, layout="compressed")
+    for axes, (name, light) in zip(
+        places[0], {"measured": twin.measured, "simulated": twin.simulated}.items(), strict=True
+    ):
+        axes.imshow(np.sqrt(light), cmap="gray", vmin=0, vmax=_BRIGHT, interpolation="none")
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(f"{name}, root of light over its mean", fontsize=plots.FONT - 1)
+    return figure
+
+
+def _rings_figure(twin: DiffuserTwin) -> Figure:
+    figure, axes = plots.figure_of(0.45 * plots.WIDTH)
+    simulated = np.array([each.spectrum for each in twin.spreads[1:]])
+    axes.fill_between(
+        frequencies(), simulated.min(axis=0), simulated.max(axis=0), color=plots.PALE, label="simulated, all"
+    )
+    axes.plot(frequencies(), simulated.mean(axis=0), label="simulated, mean", lw=1.8, **plots.line_style(0))
+    axes.plot(frequencies(), twin.spreads[0].spectrum, label="measured", lw=1.8, **plots.line_style(1))
+    axes.set(xscale="log", yscale="log")
+    plots.label_axes(axes, "frequency [cycles / pixel]", "power of light over its mean [1]")
+    plots.legend_below(figure, 3, *axes.get_legend_handles_labels())
+    return figure
