@@ -110,11 +110,30 @@ def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
 
     The ``taken`` sets are in any order.
     """
-    mean, variance = (np.array([float(getattr(each.said.pair, name)) for each in taken]) for name in ("mean", "variance"))
+    mean, variance = (
+        np.array([float(getattr(each.said.pair, name)) for each in taken]) for name in ("mean", "variance")
+    )
     lit = np.flatnonzero([each.light > 0 for each in taken])
     still = variance[[not each.light for each in taken]].min()
     peak, last = lit[variance[lit].argmax()], lit[mean[lit].argmax()]
     return int(peak), int(last) if variance[last] - still < _SATURATED * (variance[peak] - still) else None
+
+
+def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
+    """Which of the ``taken`` sets tell nonuniformity: one in the dark, and one under light of its exposure.
+
+    Under light that of most frames between three and seven tenths of saturation, or of the brightest; of several the
+    nearest to half.
+    """
+    mean = np.array([float(each.said.pair.mean) for each in taken])
+    dark = [index for index, each in enumerate(taken) if not each.light]
+    lit = [index for index, each in enumerate(taken) if each.light and each.said.cut[1] < _CUT]
+    floor, full = mean[dark].min(), mean[saturation_of(taken)[0]]
+    part = (mean - floor) / max(full - floor, 1e-9)
+    near = [index for index in lit if 0.3 <= part[index] <= MOST_FITTED] or lit
+    bright = max(near, key=lambda index: (taken[index].said.count, -abs(part[index] - 0.5)))
+    time = taken[bright].exposure_s
+    return min(dark, key=lambda index: (abs(taken[index].exposure_s - time), -taken[index].said.count)), bright
 
 
 def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: float = 0.0) -> Transfer:
@@ -177,7 +196,9 @@ class _Solution:
     def light_chi_square(self) -> float:
         """Of the lit sets' means, and of how far their light is off."""
         count = len(self.problem.light)
-        return float(np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum())
+        return float(
+            np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
+        )
 
     def transfer(self, drifts: bool) -> Transfer:
         problem = self.problem
@@ -229,7 +250,9 @@ class _Problem:
         # A set without any noise, of which few codes leave nothing, is known to a code's rounding.
         least = 1e-3 if bits is not None else 1e-6 * max(dark, 1.0)
         # Offsets matter where an end of the ADC or its steps hide part of the noise: elsewhere moments are straight.
-        hidden = bits is not None and (variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100)
+        hidden = bits is not None and (
+            variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100
+        )
         found = cls(
             light[used], time[used], mean[used], variance[used], np.maximum(errors[used, 0], least / 10),
             np.maximum(errors[used, 1], least), spread if hidden else 0.0, dead, bits, saturation,
@@ -250,7 +273,9 @@ class _Problem:
             gain = 0.0
         if not gain > 0:
             gain = max(float((noise.sum() - self.variance[first]) / max((signal - self.mean[first]).sum(), 1e-9)), 1e-9)
-        response = float((self.light[lit] * (signal - self.mean[first])).sum() / np.square(self.light[lit]).sum()) / gain
+        response = (
+            float((self.light[lit] * (signal - self.mean[first])).sum() / np.square(self.light[lit]).sum()) / gain
+        )
         times, current = self.time[dark], 0.0
         if np.ptp(times) > 0:
             current = max(float(np.polyfit(times, self.mean[dark], 1)[0]) / gain, 0.0)
@@ -300,7 +325,9 @@ class _Problem:
             if best.chi_square <= _FITS * max(best.freedom, 1):
                 break
             start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
-            best = min(best, replace(self, start=start).solve(bend=False, lamp=self.lamp), key=lambda each: each.chi_square)
+            best = min(
+                best, replace(self, start=start).solve(bend=False, lamp=self.lamp), key=lambda each: each.chi_square
+            )
         return best
 
     def settle(self, solution: _Solution) -> _Solution:
@@ -365,7 +392,9 @@ class _Problem:
         covariance[np.ix_(free, free)] = inverse[: free.sum(), : free.sum()]
         values[1] = abs(values[1])
         # Means that are off tell of the lamp too: both parts of how far light is off.
-        left = (scale - 1)[lit] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(self.mean[lit] - values[2], 1e-9)
+        left = (scale - 1)[lit] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
+            self.mean[lit] - values[2], 1e-9
+        )
         scatter = float(np.sqrt(np.square(left).sum() / max(lights - 1 - 2 * bend, 1)))
         freedom = 2 * count - int(free.sum())
         return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun, freedom)
