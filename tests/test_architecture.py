@@ -63,6 +63,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.sensor",
     "mitsim.devices.session",
     "mitsim.devices.framelist",
+    "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.formats",
 )

@@ -382,10 +382,12 @@ class _Problem:
         solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=60)
         values, scale = take_apart(solved.x)
         normal = solved.jac.T @ solved.jac
-        # What no number depends on is known to half a code: of what few codes hide, that is all there is.
-        span = max(float(np.ptp(self.time[~lit])), 1e-12)
-        known = np.array([math.inf, _HALF, _HALF, _HALF / values[0] / span, math.inf, 1.0, 1.0])[free]
-        normal[np.diag_indices(len(known))] += 1 / known**2
+        # Of what few codes hide, readings in the dark are known to half a code all the same.
+        span, code = float(np.ptp(self.time[~lit])), max(_HALF, values[1])
+        known = np.zeros((5, len(NAMES)))
+        known[0, [0, 3]] = np.array([values[3], values[0]]) * span / code
+        known[[1, 2, 3, 4], [1, 2, 5, 6]] = 1 / code, 1 / code, 1.0, 1.0
+        normal[: free.sum(), : free.sum()] += known[:, free].T @ known[:, free]
         size = np.sqrt(np.diagonal(normal))
         inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size)
         covariance = np.zeros((len(NAMES), len(NAMES)))
