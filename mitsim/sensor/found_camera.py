@@ -341,22 +341,22 @@ class _Findings:
             return dict.fromkeys(names, nothing)
         seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
         unit, count = gain * seconds, maps.excess.size
-        cool = maps.excess[~maps.hot]
-        part = float(maps.hot.mean())
-        beyond = max(float((maps.excess[maps.hot] - cool.mean()).mean()) / unit, 0.0) if part else 0.0
-        noise = (
-            _left(taken, maps.long)
-            + _left(taken, maps.short)
-            - gain * part * beyond * unit / taken[maps.long].said.count
-        )
-        variance = float(cool.var())
+        cool, (m, n) = ~maps.hot, maps.excess.shape
+        middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
+        beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
+        both = taken[maps.long], taken[maps.short]
+        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both)
+        # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
+        theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
+        noise = _left(taken, maps.long) + _left(taken, maps.short) - rows - part * sum(theirs)
+        even = np.where(cool, maps.excess - middle, 0.0)
+        even -= even.mean(axis=1, keepdims=True)
+        variance = float(np.square(even[cool]).mean()) * n / (n - 1)
         spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
         base = mean - part * beyond
         wide = math.sqrt(spread) if spread > _SURE * spread_error and base > 0 else 0.0
-        hot_error = math.hypot(math.sqrt(variance) / unit, wide) / math.sqrt(max(part * count, 1))
-        base_error = math.hypot(error, max(wide, 0.0) / math.sqrt(count), part * hot_error)
-        if base < _SURE * base_error and not wide:
-            base = max(base, 0.0)
+        hot_error = math.sqrt((variance + sum(theirs)) / max(part * count, 1) + rows / m) / unit
+        base_error = math.hypot(error, wide / math.sqrt(count), part * hot_error)
         return dict(zip(names, (
             (max(base, 0.0), base_error), (wide, _root_error(wide**2, spread_error)),
             (part, math.sqrt(max(part, 1 / count) / count)), (beyond, hot_error if part else 0.0),
