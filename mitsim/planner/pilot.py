@@ -222,7 +222,10 @@ class PilotRuns:
             self.switched = EffectRuns(bench, self._everything, sample, seed, *judged)
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
-            self.followed = FollowedRuns(bench, self._everything, sample, tolerance, seed, self.fine.judging, lit=lit)
+            before = vars(self).get("followed")
+            others = sample, tolerance, seed, self.fine.judging, lit
+            self.followed = FollowedRuns(bench, self._everything, *others, before=before)
+            self.followed.coarse = self._over_tolerance(self.switched.coarse)
         elif run == "occluded":
             if base.occluded:
                 self.occluded = PenumbraRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
@@ -230,11 +233,15 @@ class PilotRuns:
             self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
             if sample.anchored == self.samples["cells"].anchored:
                 self.anchored.take_over({1: self.fine.first})
-            self.anchored.coarse = self.fine.coarse
+            self.anchored.coarse = self._over_tolerance(self.fine.coarse)
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         """Norm of that ``part`` of all light that the capture may leave out."""
         return part * self.accuracy * self.switched.light
+
+    def _over_tolerance(self, parts: tuple[float, float]) -> tuple[float, float]:
+        cells, layer = parts
+        return cells / self._tolerance(), layer / self._tolerance()
 
     @property
     def _everything(self) -> Settings:
@@ -435,6 +442,8 @@ def light_reach(simulation: Simulation, seed: int) -> float | None:
         of the connections.
     """
     bench, depth = simulation.bench, simulation.settings.depth
+    if float(bench.loaded.scene.bbox().min.z) > depth * (1 - _FLAT):
+        return None
     tracer = simulation.spread
     path_samples = tracer.trace(seed, 0, max(1, _CONNECTIONS // tracer.paths_per_sample))
     if not path_samples.value.size:

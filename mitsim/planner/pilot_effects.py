@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,10 +45,31 @@ _SHARING, _CLEARLY = 2, 0.7
 """Replicates that tell whether shared paths take fewer, and the part of others' variance times paths below which they
 are taken to: two tell it to a fifth (corner 0.27, 0.32, 0.34, where four tell 0.31, 0.30, 0.34), and may miss heavy
 paths (cookie_bag 0.98, and the run took 24 processor seconds in place of 20)."""
-_OPEN = 0.1
-"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a hundredth of the
+_OF_CLOSER = 4
+"""Samples of closer replicates over those that tell what layers change of indirect light: it changes alike in all."""
+_OPEN = 0.15
+"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a fiftieth of the
 budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
 5e-4, first replicates: 1e-3 open, and 110 processor seconds in place of 33)."""
+
+
+class Bounced(NamedTuple):
+    """Light from the projector's side, replicate by replicate; what of it is indirect light; and samples of each."""
+
+    replicates: list[PathSamples]
+    indirect: list[PathSamples]
+    samples: int
+
+    @classmethod
+    def of(cls, replicates: list[PathSamples], samples: int) -> Bounced:
+        """That of ``replicates`` of so many ``samples``."""
+        indirect = [light.where(light.kind == records.INDIRECT) for light in replicates]
+        return cls(replicates, indirect, samples)
+
+    @property
+    def is_indirect(self) -> bool:
+        """Whether it is all indirect light; else some came over mirrors or curved glass."""
+        return sum(light.value.size for light in self.indirect) == sum(light.value.size for light in self.replicates)
 
 
 # -------- All effects, and each switched off
@@ -103,51 +124,70 @@ class EffectRuns:
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by coarse cells for indirect light; none where there is no such light."""
-        if not any(light.value.size for light in self._bounced):
+        if not any(light.value.size for light in self._closer.indirect):
             return {}
-        return coarsening_changes("indirect", partial(self._indirect, self._bounced, self._closer[1]), self.layers)
+        changes = coarsening_changes("indirect", self._indirect, ())
+        if self.layers:
+            layered, one = (self._indirect(1, layers, self._few) for layers in (self.layers, ()))
+            changes[Approximation("indirect layers", 1)] = layered - one
+        return changes
 
-    def _indirect(
-        self, bounced: Sequence[PathSamples], samples: int, cells: int, layers: tuple[float, ...]
-    ) -> FloatArray:
-        """Frames of ``bounced`` light in so many samples, in coarse cells and layers; of the mean wavelength alone, as
-        those of :class:`AnchorRuns`."""
-        coarse = replace(self.everything, coarse_cells=cells, coarse_layers=bool(layers), layers=layers)
+    @property
+    def coarse(self) -> tuple[float, float]:
+        """Parts that one cell a pixel, and one layer, leave of indirect light."""
+        light = norm(self._indirect(1, ())) if self._coarse else 0.0
+        if not light:
+            return math.inf, math.inf
+        parts = (Approximation(f"indirect {each}", 1) for each in ("cells", "layers"))
+        cells, layer = (norm(self._coarse[part]) / light if part in self._coarse else 0.0 for part in parts)
+        return cells, layer
+
+    def _indirect(self, cells: int, layers: tuple[float, ...], seen: Bounced | None = None) -> FloatArray:
+        """Frames of indirect light that was ``seen``, of closer replicates where not given, in coarse cells and layers;
+        of the mean wavelength and of what the shots show alone, as those of :class:`AnchorRuns`."""
+        seen = seen or self._closer
+        effects = self.everything.effects - {"black-level"}
+        coarse = replace(
+            self.everything, effects=effects, coarse_cells=cells, coarse_layers=bool(layers), layers=layers
+        )
         simulation = self.sample.simulation(self.bench, coarse, one_line=True)
-        return self._form(simulation, followed={"indirect": bounced}, samples=samples)
+        return self._form(simulation, followed={"indirect": seen.indirect}, samples=seen.samples)
+
+    def _noise_of_bounced(self, seen: Bounced) -> float:
+        """Error of a replicate of light that was ``seen``."""
+        if seen.is_indirect:
+            return noise(self._indirect(1, (), seen))
+        followed = self._by_kind({"indirect": seen.replicates})
+        return noise(self._form(self.simulation, followed=followed, samples=seen.samples))
+
+    @property
+    def _closer(self) -> Bounced:
+        """Light from the projector's side in closer replicates."""
+        return self._looks[1]
+
+    @property
+    def _few(self) -> Bounced:
+        """The first of these samples: layers change the same in all of them."""
+        return self._looks[0]
 
     @cached_property
-    def _bounced(self) -> list[PathSamples]:
-        """Indirect light from the projector's side in closer replicates, replicate by replicate."""
-        replicates, _ = self._closer
-        return self._first_bounced if replicates is self.followed["indirect"] else _indirect_of(replicates)
-
-    @cached_property
-    def _first_bounced(self) -> list[PathSamples]:
-        return _indirect_of(self.followed["indirect"])
-
-    @cached_property
-    def _closer(self) -> tuple[list[PathSamples], int]:
-        """Looks at the projector's side's light, and their samples: more where noise hides what coarse cells change."""
-        replicates, samples, tracer = self.followed["indirect"], self.sample.followed, self.simulation.indirect
-        if tracer is None or not any(light.value.size for light in self._first_bounced):
-            return replicates, samples
-        seen = coarsening_changes("indirect", partial(self._indirect, self._first_bounced, samples), ())
+    def _looks(self) -> tuple[Bounced, Bounced]:
+        """Looks at the projector's side's light: more where noise hides what coarse cells change."""
+        first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
+        if tracer is None or not any(light.value.size for light in first.indirect):
+            return first, first
+        seen = coarsening_changes("indirect", partial(self._indirect, seen=first), ())
         value, bound = ErrorCovariance.between(seen, self.light**2).estimate(seen)
-        wanted = math.ceil(samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
-        most = _OF_INDIRECT * self._indirect_samples(replicates, samples) / REPLICATES
+        wanted = math.ceil(first.samples * (bound**2 - value**2) / (_OPEN * self.accuracy) ** 2)
+        cost = SampleCost.relative(self._noise_of_bounced(first), self.light, first.samples, 1)
+        most = _OF_INDIRECT * float(cost.noise.samples_for(self.accuracy)) / REPLICATES
         more = min(wanted, self.sample.closer(tracer.paths_per_sample), math.ceil(most))
-        if more <= samples:
-            return replicates, samples
+        if more <= first.samples:
+            return first, first
         # Seeds of their own: that the first replicates are vague says nothing of these.
-        return tracer.replicates([integer(seed, "closer") for seed in self.seeds], more)[0], more
-
-    def _indirect_samples(self, replicates: Sequence[PathSamples], samples: int) -> float:
-        """Samples of all groups that the projector's side's light takes, as noisy as in ``replicates`` of so many
-        ``samples``."""
-        seen = self._form(self.simulation, followed=self._by_kind({"indirect": list(replicates)}), samples=samples)
-        cost = SampleCost.relative(noise(seen), self.light, samples, 1)
-        return float(cost.noise.samples_for(self.accuracy))
+        seeds, few = [integer(seed, "closer") for seed in self.seeds], math.ceil(more / _OF_CLOSER)
+        some, whole = tracer.replicates(seeds, few, more)
+        return Bounced.of(some, few), Bounced.of(whole, more)
 
     @property
     def received(self) -> float:
@@ -197,7 +237,7 @@ class EffectRuns:
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
         """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
         pixels = self.bench.n
-        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._bounced]
+        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer.indirect]
         repeats = adaptive_counts(np.sum(moments, axis=0))
         # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
         halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
@@ -215,10 +255,10 @@ class EffectRuns:
         tracer = self._sharing.indirect
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
-        samples = max(1, self._closer[1] // SHARED_COST)
+        samples = max(1, self._closer.samples // SHARED_COST)
         seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
         seen += [PathSamples.none()] * (REPLICATES - _SHARING)
-        frames = self._form(self._sharing, followed=self._by_kind({"indirect": seen}), samples=samples)[:_SHARING]
+        frames = self._indirect(1, (), Bounced.of(seen, samples))[:_SHARING]
         shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
@@ -246,10 +286,13 @@ class EffectRuns:
         found = {}
         for name, each in self.simulation.passes.items():
             if name in _FOLLOWED:
-                first = self.followed[name], self.sample.followed
-                replicates, samples = self._closer if name == "indirect" else first
-                frames = self._form(self.simulation, followed=self._by_kind({name: replicates}), samples=samples)
-                found[name] = noise(frames), samples, each.tracer.paths_per_sample
+                if name == "indirect":
+                    error, samples = self._noise_of_bounced(self._closer), self._closer.samples
+                else:
+                    samples = self.sample.followed
+                    seen = self._by_kind({name: self.followed[name]})
+                    error = noise(self._form(self.simulation, followed=seen, samples=samples))
+                found[name] = error, samples, each.tracer.paths_per_sample
         return found
 
     def _without(self, effect: Effect) -> FloatArray:
@@ -324,11 +367,6 @@ class EffectRuns:
         return frames if specular is None else frames + np.tensordot(light[:, specular.classes], specular.irradiance, 1)
 
 
-def _indirect_of(replicates: Sequence[PathSamples]) -> list[PathSamples]:
-    """Indirect light in ``replicates``, replicate by replicate."""
-    return [light.where(light.kind == records.INDIRECT) for light in replicates]
-
-
 # -------- Light at anchors of the sensor
 
 _JUDGE = 2
@@ -338,10 +376,9 @@ WIDTHS = (1, 2, 4)
 as fine as all of it; wider cells hold light of many anchors in memory."""
 _AT_ONCE = 2**20
 """Connections that are traced at a time: 0.5 GB while they are accumulated."""
-_AS_ROUGH, _COUNTS = 20.0, 1 / 3
+_AS_ROUGH = 15.0
 """Part that one cell, or layer, leaves of what a few anchors see beyond their mean, over what it leaves of all their
-light, at most (photograph 0, cards 4.1, corner 5.5, gift_card 5.1, cookie_bag 6.9), and the part of the tolerance up to
-which that is not looked at: a tenth of the accuracy."""
+light, at most (photograph 3.9, cards 4.2, gift_card 5.6, metal_blade 6.3, cookie_bag 7.4)."""
 _FOLLOWED_JUDGE = 1
 """Index of the number that judges at first, for light that is followed."""
 
@@ -373,7 +410,7 @@ class AnchorRuns:
     traced
         light by number of anchors, replicate by replicate.
     coarse
-        parts that one cell a pixel, and one layer, leave of such light as a whole, as far as known.
+        parts that one cell a pixel, and one layer, leave of such light as a whole, over what all may leave.
     """
 
     _pass = PASSES["anchor_residual"]
@@ -427,12 +464,17 @@ class AnchorRuns:
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every number of anchors that was tried, and by coarse cells for what they see beyond
         their mean, where that may be too much."""
-        changes, most = self._until(self.tolerance), _AS_ROUGH * norm(self._beyond_mean())
-        cells, layer = (most * part > _COUNTS * self.tolerance for part in self.coarse)
-        if not (cells or (layer and self.layers)):
+        changes, (cells, layers) = self._until(self.tolerance), self._worth_a_look
+        if not (cells or layers):
             return changes
-        layers = self.layers if layer else ()
         return {**changes, **coarsening_changes(self._pass.name, self._coarsen, layers)}
+
+    @property
+    def _worth_a_look(self) -> tuple[bool, tuple[float, ...]]:
+        """Whether coarse cells, and which layers, may change too much of what a few anchors see beyond their mean."""
+        most = _AS_ROUGH * norm(self._beyond_mean())
+        cells, layer = (most * part > 1 for part in self.coarse)
+        return cells, self.layers if layer else ()
 
     @property
     def of_few(self) -> dict[Approximation, FloatArray]:
@@ -519,7 +561,13 @@ class PenumbraRuns(AnchorRuns):
 
 
 class FollowedRuns(AnchorRuns):
-    """The same of light that is followed, of settings with all effects on; to every anchor go the same paths."""
+    """The same of light that is followed, of settings with all effects on; to every anchor go the same paths.
+
+    Attributes
+    ----------
+    before
+        the same of their first samples alone, which are not traced again.
+    """
 
     _pass = PASSES["indirect_residual"]
     _stream = "followed"
@@ -528,8 +576,23 @@ class FollowedRuns(AnchorRuns):
     passes = "indirect_residual", "camera_residual"
     """From the projector's side, and from the camera's."""
 
+    def __init__(self, *arguments: Any, before: FollowedRuns | None = None, **others: Any) -> None:
+        """Nothing is traced yet.
+
+        Parameters
+        ----------
+        arguments, others
+            as for :class:`AnchorRuns`.
+        before
+            what the first samples told, if they were looked at.
+        """
+        self.before = before
+        super().__init__(*arguments, **others)
+
     def _choose(self, sample: Sample) -> None:
-        self._samples = sample.followed
+        self._all_samples = sample.followed
+        self._first = self.before._all_samples if self.before else 0
+        self._samples = self._all_samples - self._first
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
@@ -546,17 +609,19 @@ class FollowedRuns(AnchorRuns):
         if not self.changes:
             return dict.fromkeys(self.passes, SampleCost.none())
         every = self._beyond_mean()
-        if None in tracers:
-            seen = every, every
-        else:
-            from_camera = self._beyond(self._simulation(self.few), self._few_by_tracer[1])
-            seen = every - from_camera, from_camera
+        seen = (every, every) if None in tracers else (every - self._from_camera, self._from_camera)
         return {
-            name: SampleCost.relative(noise(each), light, self._samples, tracer.paths_per_sample)
+            name: SampleCost.relative(noise(each), light, self._all_samples, tracer.paths_per_sample)
             if tracer
             else SampleCost.none()
             for name, each, tracer in zip(self.passes, seen, tracers, strict=True)
         }
+
+    @cached_property
+    def _from_camera(self) -> FloatArray:
+        """The camera's part of the frames of what a few anchors see beyond their mean."""
+        seen = self._beyond(self._simulation(self.few), self._few_by_tracer[1])
+        return self._with_first(seen, lambda before: before._from_camera)
 
     def with_more(self, light: float, samples: int) -> SampleCost:
         """That of what is followed from the camera, by replicates of so many ``samples``; ``light`` as for those."""
@@ -573,9 +638,9 @@ class FollowedRuns(AnchorRuns):
     @property
     def _widths(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by every width of cells for what a few anchors see beyond their mean."""
-        one = self._beyond_mean()
-        missing = (self._beyond_mean(coarse_cells=2) - one) / (1 - EVEN_CELLS)
-        layered = self._beyond_mean(coarse_layers=True, layers=self.layers) if self.layers else one
+        one, (cells, layers) = self._beyond_mean(), self._worth_a_look
+        missing = (self._beyond_mean(coarse_cells=2) - one) / (1 - EVEN_CELLS) if cells else np.zeros_like(one)
+        layered = self._beyond_mean(coarse_layers=True, layers=layers) if layers else one
         wide = {width: layered + missing - self._beyond_mean(followed_width=width) for width in WIDTHS[1:]}
         return {Approximation("followed_width", width): change for width, change in {1: missing, **wide}.items()}
 
@@ -587,20 +652,32 @@ class FollowedRuns(AnchorRuns):
     def _few_by_tracer(self) -> list[list[PathSamples]]:
         """The same by tracer."""
         tracers = _tracers(self._simulation(self.few))
-        return [tracer.replicates(self._seeds, self._samples)[0] for tracer in tracers]
+        return [tracer.replicates(self._seeds, self._samples, first=self._first)[0] for tracer in tracers]
 
     def _at_anchors(self, anchors: int) -> FloatArray:
         simulation, samples = self._simulation(anchors), self._samples
         grids, tracers = self._grids(simulation), _tracers(simulation)
         if anchors == self.few:
-            return self._form(grids, self._few)
-        each = max(1, _AT_ONCE // sum(tracer.paths_per_sample for tracer in tracers))
+            return self._with_first(self._form(grids, self._few), lambda before: before._frames(anchors))
+        each = max(1, _AT_ONCE // (REPLICATES * sum(tracer.paths_per_sample for tracer in tracers)))
         found = []
         for first in range(0, samples, each):
             some = min(each, samples - first)
-            traced = [tracer.replicates(self._seeds, some, first=first)[0] for tracer in tracers]
+            traced = [tracer.replicates(self._seeds, some, first=self._first + first)[0] for tracer in tracers]
             found.append(self._form(grids, _join(traced)))
-        return np.asarray(sum(found))
+        return self._with_first(np.asarray(sum(found)), lambda before: before._frames(anchors))
+
+    def _in_cells(self, **cells: Any) -> FloatArray:
+        if self.before is None:
+            return super()._in_cells(**cells)
+        seen = self._beyond(self._simulation(self.few, **cells), self._few)
+        return self._with_first(seen, lambda before: before._beyond_mean(**cells))
+
+    def _with_first(self, seen: FloatArray, of: Callable[[FollowedRuns], FloatArray]) -> FloatArray:
+        """Frames of all samples, from those that were ``seen`` of the new ones and those ``of`` the first."""
+        if self.before is None:
+            return seen
+        return seen + (self._first / self._all_samples) * (of(self.before) - seen)
 
 
 def _tracers(simulation: Simulation) -> list[PassTracer]:

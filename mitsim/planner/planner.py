@@ -54,6 +54,9 @@ _MOSTLY = 0.75
 is said of all by less than predictions are good to."""
 _UNTIMED = 0.15
 """Part of the run that may be untimed tracing: off by 2 at most, it moves what is said of all by so much."""
+_USUAL = 1.5
+"""Times as long as at fixed unit costs that a launch takes at most where it neither compiles a kernel nor is disturbed;
+one of few paths takes longer for itself, and is cheap to repeat."""
 _LEAST_SLOPE = 0.25
 """Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
@@ -325,12 +328,12 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
 
     def once(samples: int) -> float:
         seconds = _seconds(simulation, name, seed, labels, samples)
-        # What disturbs a moment would be multiplied.
-        again = samples <= _TIMED * every
+        # The first may compile the kernel, and what disturbs a moment would be multiplied.
+        unusual = seconds > _USUAL * samples * paths_per_sample * FIXED.passes[name]
+        again = unusual and (samples == 1 or samples <= _TIMED * every)
         return min(seconds, _seconds(simulation, name, seed, labels, samples)) if again else seconds
 
-    # Twice, as the first may compile the kernel.
-    launch = min(_seconds(simulation, name, seed, labels, 1) for _ in range(2))
+    launch = once(1)
     samples = max(1, _REHEARSED // paths_per_sample)
     longest = once(samples) if samples > 1 else launch
     least = longest / samples

@@ -25,7 +25,7 @@ from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
-from mitsim.transport.records import PathSamples
+from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 N = 16
@@ -332,7 +332,7 @@ def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeyp
     loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
     for found, asked in ((loose, False), (close, True)):
         found.indirect_cost()
-        assert ("_sharing" in vars(found)) == asked and found._closer[1] == sample.followed
+        assert ("_sharing" in vars(found)) == asked and found._closer.samples == sample.followed
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
@@ -403,9 +403,8 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
     """Where one cell, and one layer, leave little of all light, and anchors see little beyond their mean, neither is.
     (Planted: the part of the mean, not of what is beyond it.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
-    light, beyond = runs.switched.light, pilot_effects.norm(runs.anchored._beyond_mean())
     cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1e-3 * light / (20 * beyond)
+    enough = 1 / (15 * pilot_effects.norm(runs.anchored._beyond_mean()))
     for coarse, looked_at in (
         ((0.9 * enough, 0.9 * enough), set()),
         ((1.1 * enough, 0.9 * enough), {cells}),
@@ -414,6 +413,67 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
         runs.anchored.coarse = coarse
         vars(runs.anchored).pop("changes", None)
         assert {part for part in runs.anchored.changes if part.name.startswith("anchor_")} == looked_at
+
+
+def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: Bench) -> None:
+    """Light whose kind is direct light's, as over mirrors and curved glass, comes by the same paths. (Planted: indirect
+    light alone.)"""
+    sample = pilot_samples.Sample.of(
+        parse_patterns("dots:4", N).lighting, bench.geometry.frame_shape, bench.loaded.mirrors
+    )
+    everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
+    found = EffectRuns(bench, everything, sample, 5)
+    seen = found._closer
+    halves = [
+        replace(light, kind=np.where(np.arange(light.value.size) % 2, DIRECT, INDIRECT).astype(np.int16))
+        for light in seen.indirect
+    ]
+    parted = pilot_effects.Bounced.of(halves, seen.samples)
+    assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
+    assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
+
+
+def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: the better of two trials.)"""
+    taken = iter([4.9, 3.5, 3.1, 1.9, 1.8, 1.9])
+    clock = [0.0]
+
+    def wait(*_: object) -> None:
+        clock[0] += next(taken)
+
+    monkeypatch.setattr(pilot_direct, "in_threads", wait)
+    monkeypatch.setattr(pilot_direct.time, "perf_counter", lambda: clock[0])
+    assert pilot_direct._product_seconds() == pytest.approx(1.8 / (4 * 256**3))
+    assert not list(taken)
+
+
+def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
+    """A closer look traces the new samples alone, and tells what one of all samples tells. (Planted: the first samples
+    weighed as the new ones; the same samples twice; the camera's part of the new samples alone.)"""
+    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
+    first = runs.followed
+    runs.refine("followed")
+    closer = runs.followed
+    others = first.tolerance, 3, runs.fine.judging
+    whole = pilot_effects.FollowedRuns(bench, runs._everything, closer.sample, *others)
+    assert (closer._first, closer._samples, whole._samples) == (first._samples, 3 * first._samples, 4 * first._samples)
+    size = float(np.abs(whole._frames(1)).max())
+    for anchors in (1, 2, 3):
+        np.testing.assert_allclose(closer._frames(anchors), whole._frames(anchors), atol=1e-9 * size)
+    for cells in ({}, {"coarse_cells": 2}, {"followed_width": 4}):
+        np.testing.assert_allclose(closer._beyond_mean(**cells), whole._beyond_mean(**cells), atol=1e-9 * size)
+    for name, cost in whole.sample_costs(1.0).items():
+        assert closer.sample_costs(1.0)[name].noise.error == pytest.approx(cost.noise.error, rel=1e-6)
+        assert closer.sample_costs(1.0)[name].noise.samples == cost.noise.samples
+
+
+def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callable[..., Path]) -> None:
+    """No ray is traced for what can be no other; nor where the nearest surface is no nearer than all light."""
+    flat = pilot.PilotRuns(open_bench(small_scene()), parse_patterns("dots:4", N).lighting, 1e-2, 0)
+    assert flat.fine.spread(1.0) == flat.fine.sample_cost(1.0)
+    assert flat.fine._sample_cost(flat.fine._spread_noise, 1.0).noise.error == pytest.approx(
+        flat.fine.sample_cost(1.0).noise.error, rel=0.1
+    )
 
 
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
