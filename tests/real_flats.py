@@ -29,7 +29,9 @@ CAMERAS: dict[str, dict[str, Any]] = {
     },
     "saturating ADC": {"full_well_e": 40_000.0, "gain_dn_per_e": 0.19},
     "dark current": {"dark_current_e_per_s": 20_000.0, "dark_current_spread_e_per_s": 4000.0},
-    "high gain": {"bits": 16, "full_well_e": 10_000.0, "read_noise_e": 0.3, "gain_dn_per_e": 5.0, "black_level_dn": 100.0},
+    "high gain": {
+        "bits": 16, "full_well_e": 10_000.0, "read_noise_e": 0.3, "gain_dn_per_e": 5.0, "black_level_dn": 100.0
+    },
     "nonuniform": {
         "prnu_pixel": 0.03, "prnu_row": 0.004, "prnu_column": 0.01, "dsnu_pixel_e": 6.0, "dsnu_row_e": 1.5,
         "dsnu_column_e": 2.0,
@@ -55,7 +57,8 @@ Light = Callable[[float, int, int], Any]
 
 def write_flats(
     folder: Path, model: SensorModel, side: int = 96, steps: int = 16, stack: int = 2, seed: int = 0,
-    light: Light = lambda photons, number, frame: photons, read: Callable[[np.ndarray], np.ndarray] = lambda frame: frame,
+    light: Light = lambda photons, number, frame: photons,
+    read: Callable[[np.ndarray], np.ndarray] = lambda frame: frame,
     longest_s: float = LONGEST_S, ending: str = ".npy", **changes: Any,
 ) -> Path:  # fmt: skip
     """Pairs at ``steps`` exposures up to 1.15 of saturation, under light and in the dark, and ``stack`` frames at half.

@@ -116,8 +116,8 @@ def _check_sets(flats: FlatFrames) -> None:
             if len(each.files) < 2:
                 held = each.files[0] if each.files else "no frame"
                 raise MitsimError(
-                    f"{where}: {kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame tells no noise; "
-                    "add its partner, taken alike"
+                    f"{where}: {kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame tells no "
+                    "noise; add its partner, taken alike"
                 )
             for name in each.files:
                 if name in seen:
@@ -129,6 +129,6 @@ def _check_sets(flats: FlatFrames) -> None:
     for number, each in enumerate(flats.listed.lit):
         if each.exposure_s not in exposures:
             raise MitsimError(
-                f"{where}: lit.{number} ({each.files[0]}) is exposed for {each.exposure_s:g} s, and no dark set is; add a "
-                "dark pair of that exposure"
+                f"{where}: lit.{number} ({each.files[0]}) is exposed for {each.exposure_s:g} s, and no dark set is; "
+                "add a dark pair of that exposure"
             )

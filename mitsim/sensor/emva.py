@@ -248,8 +248,8 @@ def figures(session: Session) -> dict[str, FloatArray]:
     `system_gain` [DN/e-], `quantum_efficiency` [e-/photon], `dark_noise` [e-], `saturation_capacity` (at the largest
     variance) and `full_well` (of the brightest frames) [e-], `linearity_min` and `linearity_max` [1], `dark_current`
     (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2] and
-    `prnu_PART` [1] for each PART of :data:`SPLIT`. What the frames do not tell is left out: saturation without saturated
-    frames, linearity of fewer than three steps, dark current of one exposure.
+    `prnu_PART` [1] for each PART of :data:`SPLIT`. What the frames do not tell is left out: saturation where nothing is
+    saturated, linearity of fewer than three steps, dark current of one exposure.
     """
     photons, signal, noise = session.transfer()
     variance, unlit = session.pairs.variance, session.unlit

@@ -84,7 +84,7 @@ class FoundCamera:
         lines.append("")
         for name, value in self.sensor.model_dump(exclude_defaults=True).items():
             text = (
-                f'"{_quoted(value)}"'
+                f'"{_quote(value)}"'
                 if isinstance(value, str)
                 else str([*value])
                 if isinstance(value, tuple)
@@ -95,7 +95,7 @@ class FoundCamera:
         return "\n".join(lines) + "\n"
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
@@ -159,7 +159,7 @@ class _Maps:
         offset = images(short)
         contrast = images(bright) - (offset if dark == short else images(dark))
         middle = float(np.median(contrast))
-        noise = math.sqrt(_left(taken, bright) + _left(taken, dark))
+        noise = math.sqrt(_noise_left(taken, bright) + _noise_left(taken, dark))
         dead = contrast < _DEAD * middle if 10 * noise < middle else np.zeros(contrast.shape, bool)
         hot, excess = np.zeros(contrast.shape, bool), None
         if taken[long].exposure_s > taken[short].exposure_s:
@@ -167,7 +167,7 @@ class _Maps:
             middle = float(np.median(excess))
             wide = _ROBUST * float(np.median(np.abs(excess - middle)))
             # Of few codes most readings are one number: noise is then what is left of it.
-            wide = max(wide, math.sqrt(_left(taken, long) + _left(taken, short)), 1e-9)
+            wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
             hot = excess > middle + _HOT * wide
         surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
         uneven = float(np.ptp(surface) / surface.mean())
@@ -178,23 +178,23 @@ class _Maps:
     def offsets(self) -> _Parts:
         """Of the offsets [DN^2], dark current's part at that exposure among them."""
         said = self.taken[self.short].said
-        return _split(
-            self.offset, self.dead | self.hot, _left(self.taken, self.short), float(said.pair.rows) / said.count
+        return _spatial_parts(
+            self.offset, self.dead | self.hot, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count
         )
 
     def responses(self) -> _Parts:
         """Of the responses, over their mean."""
-        noise = _left(self.taken, self.bright) + _left(self.taken, self.dark)
+        noise = _noise_left(self.taken, self.bright) + _noise_left(self.taken, self.dark)
         rows = sum(
             float(self.taken[index].said.pair.rows) / self.taken[index].said.count for index in (self.bright, self.dark)
         )
-        found = _split(self.contrast, self.dead | self.hot, noise, rows)
+        found = _spatial_parts(self.contrast, self.dead | self.hot, noise, rows)
         mean = float(self.contrast[~(self.dead | self.hot)].mean())
         return _Parts(found.values / mean**2, found.errors / mean**2)
 
     @property
     def offset_spread(self) -> float:
-        """Variance of the offsets [DN^2]: of dark frames, or of the darkest ones under light where those are cut at 0."""
+        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light."""
         if self.taken[self.short].said.cut[0] < _CUT:
             return float(self.offsets().values.sum())
         lit = [each for each in self.taken if each.light and not any(each.said.cut)]
@@ -212,13 +212,13 @@ def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
     return float(image[~without].mean())
 
 
-def _left(taken: Sequence[Taken], index: int) -> float:
+def _noise_left(taken: Sequence[Taken], index: int) -> float:
     """Variance [DN^2] that noise leaves in a pixel of a mean image."""
     return float(taken[index].said.pair.variance) / taken[index].said.count
 
 
-def _split(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
-    """Spatial variances of an ``image`` (M, N) [DN], in which noise of a variance is left, of which rows share a part."""
+def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
+    """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
     about = np.where(without, 0.0, image - middle_of(image, without))
     total = float(np.square(about).sum()) / (max(np.count_nonzero(~without), 2) - 1) - noise
@@ -269,8 +269,8 @@ class _Findings:
             found["quantum_efficiency"] = transfer["response"], response * transfer["response"]
             if transfer["response"] > 1 + _SURE * found["quantum_efficiency"][1]:
                 raise MitsimError(
-                    f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, so "
-                    "correct photons_per_s (photons on one pixel in a second), or leave it out"
+                    f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
+                    "so correct photons_per_s (photons on one pixel in a second), or leave it out"
                 )
         found |= self._end(stated, gain_error, notes)
         bend = [transfer["bend"], transfer["bend_2"]]
@@ -312,8 +312,9 @@ class _Findings:
             self.offsets.values[0] / self.maps.offset.size,
         )
         still = math.sqrt(max(float(lines[0].sum() + lines[1]), 0.0))
+        own_error = math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
         return {
-            "read_noise_e": (own / gain, math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0) / gain),
+            "read_noise_e": (own / gain, own_error / gain),
             "row_noise_e": (math.sqrt(shared) / gain, _root_error(shared, row_error) / gain),
             "black_level_dn": (max(transfer["black"], 0.0), math.hypot(transfer.error("black"), still)),
         }  # fmt: skip
@@ -348,7 +349,7 @@ class _Findings:
         rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both)
         # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
         theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
-        noise = _left(taken, maps.long) + _left(taken, maps.short) - rows - part * sum(theirs)
+        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)
         even = np.where(cool, maps.excess - middle, 0.0)
         even -= even.mean(axis=1, keepdims=True)
         variance = float(np.square(even[cool]).mean()) * n / (n - 1)

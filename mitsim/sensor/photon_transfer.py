@@ -2,7 +2,7 @@
 
 EMVA 1288 reads gain and noise off straight lines, which readings that are cut at 0 and rounding to few codes bend. Here
 the closed-form moments of the whole chain (`mitsim.sensor.moments`) are fitted to means and variances at once, so
-that cutting, rounding and saturation are part of what is expected. Light of each set may be off by what the lamp varies.
+that cutting, rounding and saturation are part of what is expected. Light of a set may be off by what the lamp varies.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from mitsim.sensor.emva import MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
-"""What is fitted: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a unit
-of light, and the first two coefficients of linearity."""
+"""What is fitted: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
+unit of light, and the first two coefficients of linearity."""
 _STEPS = (1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0)
+"""Steps by which slopes are found, as parts of a number: where moments change by some of their errors."""
 _LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
-"""Steps by which slopes are found, as parts of a number and at least: where moments change by some of their errors."""
+"""The same in the number's unit, at least: also where it is 0."""
 _STARTS = (0.9, 0.8, 0.7, 0.6, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
 _DITHERED = 0.64
@@ -298,13 +299,13 @@ class _Problem:
             }
         )  # fmt: skip
         leak = np.maximum(current, 0.0) * self.time
-        lit, noise = self._averaged(np.maximum(response * self.light * scale, 0.0) + leak, model)
+        lit, noise = self._average(np.maximum(response * self.light * scale, 0.0) + leak, model)
         if not self.dead:
             return lit, noise
-        still, rest = self._averaged(leak, model)
+        still, rest = self._average(leak, model)
         return (1 - self.dead) * lit + self.dead * still, (1 - self.dead) * noise + self.dead * rest
 
-    def _averaged(self, electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+    def _average(self, electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
         """Moments of pixels whose offsets are spread: an offset is another black level."""
         if not self.spread:
             return frame_moments(electrons, 0.0, model)

@@ -1,9 +1,9 @@
 """A camera's file, or frames of a real camera, in; its figures after EMVA 1288 release 4.0 and its file out.
 
-Of a file, frames are simulated, and what they show is held against what is set. Real frames show the camera that explains
-them (`mitsim.sensor.found_camera`), and the standard's figures are held against what that camera's frames would show. Each
-figure's standard error is predicted: closed-form moments tell how far every statistic may be off, and a thousand sessions
-of such statistics are evaluated as that of the frames is (GUM, supplement 1).
+Of a file, frames are simulated, and what they show is held against what is set. Real frames show the camera that
+explains them (`mitsim.sensor.found_camera`), and the standard's figures are held against what that camera's frames
+would show. Each figure's standard error is predicted: closed-form moments tell how far every statistic may be off, and a
+thousand sessions of such statistics are evaluated as that of the frames is (GUM, supplement 1).
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ def characterise(
         source = f"simulated frames of {sensor.name}"
         stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
         found = find_camera(taken, lambda index: np.mean([*frames.images(index)], axis=0), stated)
-        return _held_against(frames, taken, found, {"asked": asdict(procedure), "camera": sensor.name}, folder)
+        return _hold_against(frames, taken, found, {"asked": asdict(procedure), "camera": sensor.name}, folder)
 
-    return _written(measure, output)
+    return _write(measure, output)
 
 
 def characterise_frames(
@@ -101,14 +101,14 @@ def characterise_frames(
         frames = Frames.as_taken(taken, found.sensor, found.transfer["response"])
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)
-        return _held_against(
+        return _hold_against(
             frames, taken, found, {"asked": asked, "camera": facts.name, "real": True, "about": about}, folder
         )
 
-    return _written(measure, output)
+    return _write(measure, output)
 
 
-def _held_against(
+def _hold_against(
     frames: Frames, taken: list[Taken], found: FoundCamera, what: Mapping[str, Any], output: str | None
 ) -> Characterisation:
     """Figures of sets that were ``taken``, beside those of the sensor of ``frames``, which real frames have found."""
@@ -124,7 +124,7 @@ def _held_against(
     )
 
 
-def _written(measure: Callable[[str | None], Characterisation], output: Path | str | None) -> Characterisation:
+def _write(measure: Callable[[str | None], Characterisation], output: Path | str | None) -> Characterisation:
     """What is measured, written to the folder ``output`` where there is one."""
     if output is None:
         return measure(None)

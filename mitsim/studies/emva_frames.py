@@ -1,8 +1,8 @@
 """A camera in, which frames a characterisation takes of it out, and what they are expected to say.
 
 The frames are those that a test bench takes: pairs under even light from dark to beyond saturation, pairs in the dark
-over a series of exposures, and stacks in the dark and at half of saturation. Those of a real camera are as its list says.
-Closed-form moments (`mitsim.sensor.moments`) tell what every statistic is expected to be, and how far it may be off.
+over a series of exposures, and stacks in the dark and at half of saturation. Those of a real camera are as its list
+says. Closed-form moments (`mitsim.sensor.moments`) tell what a statistic is expected to be, and how far it may be off.
 """
 
 from __future__ import annotations

@@ -105,9 +105,8 @@ def _figure_text(done: Characterisation, name: str) -> str:
     row = _figure(done, name)
     error = round_to_error(row.standard_error, row.standard_error)
     unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-    return typeset(
-        f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, {'camera' if done.real else 'set'} {row.set:.5g}"
-    )
+    beside = f"{'camera' if done.real else 'set'} {row.set:.5g}"
+    return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, {beside}")
 
 
 def _deviations(done: Characterisation) -> Figure:

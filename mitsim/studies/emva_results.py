@@ -1,4 +1,4 @@
-"""What a characterisation found: figures of EMVA 1288 beside those that are set, and the camera that explains the frames."""
+"""What a characterisation found: figures of EMVA 1288 beside those set, and the camera that explains the frames."""
 
 from __future__ import annotations
 
@@ -150,8 +150,8 @@ class Characterisation:
             if not abs(row.deviations) <= MOST_OFF
         ]
         off += [
-            f"{row.name} of the camera found: {row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off "
-            f"{row.set:.5g}, which is set"
+            f"{row.name} of the camera found: {row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors "
+            f"off {row.set:.5g}, which is set"
             for row in self.fields
             if row.deviations is not None and not abs(row.deviations) <= MOST_OFF
         ]
@@ -219,10 +219,8 @@ class Characterisation:
         lines = [f"{self.camera}: {m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"]
         lines += text_table(head, rows)
         if any(row.expected is not None for row in self.rows):
-            lines.append(
-                f"expected: where the procedure finds another figure than the {'camera has' if self.real else 'one set'},"
-                " at these steps and frames"
-            )
+            figure = "the camera has" if self.real else "the one set"
+            lines.append(f"expected: where the procedure finds another figure than {figure}, at these steps and frames")
         fields = [
             (
                 row.name, row.unit, *(() if self.real else (f"{row.set:.5g}" if row.set is not None else "",)),
@@ -306,7 +304,7 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
 
 
 def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, ...]:
-    """The fields of a camera that was ``found``, beside those of the ``model`` that took the frames; None: not known."""
+    """The fields of a camera that was ``found``, beside those of the ``model`` that took frames; None: not known."""
     rows = []
     for name, unit in FIELDS.items():
         value, error = getattr(found.sensor, name), found.errors.get(name, 0.0)
@@ -326,7 +324,7 @@ def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, 
 
 
 def _set_field(model: SensorModel, name: str) -> float | None:
-    """What a ``model`` sets of a field of the camera whose pixels its superpixels are; None: of binned ones no number."""
+    """What a ``model`` sets of a field of the camera whose pixels its superpixels are; None: no number."""
     pixel, row, column = model.offset_parts
     of_pixel, of_row, of_column = model.response_parts
     defects = {kind: getattr(model, kind) for kind in ("hot_pixels", "dead_pixels", "hot_dark_current_e_per_s")}

@@ -124,7 +124,8 @@ def _read_set(flats: FlatFrames, listed: DarkSet, shape: tuple[int, int]) -> Fla
                 least, most = float(values.min()), float(values.max())
                 if least < 0 or most > largest:
                     raise MitsimError(
-                        f"frame {path}: holds {least if least < 0 else most:g}, and numbers of {facts.bits} bits are 0 to "
+                        f"frame {path}: holds {least if least < 0 else most:g}, and numbers of {facts.bits} bits "
+                        "are 0 to "
                         f"{largest:g}; correct bits"
                     )
                 if values.dtype.kind == "f" and np.any(values != np.rint(values)):
@@ -144,7 +145,8 @@ def _check_numbers(where: str, flats: FlatFrames, sets: Sequence[FlatSet]) -> No
     factor = math.gcd(*(each.factor for each in sets))
     if factor > 1:
         raise MitsimError(
-            f"{where}: all numbers are multiples of {factor}, so they were scaled after the ADC; divide them by {factor}, "
+            f"{where}: all numbers are multiples of {factor}, so they were scaled after the ADC; divide them by "
+            f"{factor}, "
             f"and state the bits that are left of {flats.listed.bits}"
         )
 
@@ -158,24 +160,28 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
         signal = float(said.pair.mean) - float(still.pair.mean)
         if signal <= _SURE * math.hypot(said.mean_error, still.mean_error):
             raise MitsimError(
-                f"{where}: {each.name} is no brighter than the dark frames of its exposure; light it, or list it as dark"
+                f"{where}: {each.name} is no brighter than the dark frames of its exposure; light it, or list it as "
+                "dark"
             )
         if said.flicker > _UNEQUAL * signal:
             raise MitsimError(
-                f"{where}: {each.name} differ by {100 * said.flicker / signal:.0f} % of their light; take the frames of a "
+                f"{where}: {each.name} differ by {100 * said.flicker / signal:.0f} % of their light; take the "
+                "frames of a "
                 "set with one exposure, under a steady lamp"
             )
     if any(_is_lit(each, lit) for each in dark.values()):
         each = next(each for each in dark.values() if _is_lit(each, lit))
         raise MitsimError(
-            f"{where}: {each.name} are listed as dark and differ by {each.taken.said.flicker:.3g} DN; cover the camera, "
+            f"{where}: {each.name} are listed as dark and differ by {each.taken.said.flicker:.3g} DN; cover the "
+            "camera, "
             "and take them again"
         )
     below = [each for each in lit if each.taken.said.cut[1] == 0]
     if not below:
         part = min(each.taken.said.cut[1] for each in lit)
         raise MitsimError(
-            f"{where}: all sets under light hold saturated numbers, {100 * part:.3g} % of them at least; expose some for less"
+            f"{where}: all sets under light hold saturated numbers, {100 * part:.3g} % of them at least; expose "
+            "some for less"
         )
     for each in below:
         if not float(each.taken.said.pair.variance) and not _is_saturated(sets, each):
@@ -210,32 +216,39 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
         each = sets[smooth[1]]
         lines.append(
             f"noise of neighbouring pixels is correlated by {smooth[0]:.2g} in {each.name}: frames were compressed, "
-            "smoothed, scaled or demosaiced, and gain and noise are of those pictures, not of the camera; give raw frames"
+            "smoothed, scaled or demosaiced, and gain and noise are of those pictures, not of the camera; give raw "
+            "frames"
         )
     bent = [
-        (abs(transfer.off[index]) * sets[index].taken.said.variance_error / float(sets[index].taken.said.pair.variance), index)
-        for index in used if abs(transfer.off[index]) > _SURE and sets[index].taken.light
+        (abs(transfer.off[index]) * said.variance_error / float(said.pair.variance), index)
+        for index in used
+        for said in [sets[index].taken.said]
+        if abs(transfer.off[index]) > _SURE and sets[index].taken.light
     ]  # fmt: skip
     if bent and max(bent)[0] > _STRAIGHT:
         part, index = max(bent)
         lines.append(
             f"variances do not rise with means as those of counted electrons: {sets[index].name} is off by "
-            f"{100 * part:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are widened by "
+            f"{100 * part:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are "
+            "widened by "
             f"{math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1)):.2g}"
         )
     if transfer.lamp_drifts:
         lines.append(
-            f"means bend with exposure and variances over means do not, so the lamp drifts or exposures are not as listed, "
+            "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not as "
+            "listed, "
             f"by {100 * transfer.lamp:.2g} %; gain and noise hold, linearity and quantum efficiency are off by as much"
         )
     elif transfer.lamp > _STEADY:
         lines.append(
-            f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; linearity is known to that, gain and "
+            f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; linearity is known to that, "
+            "gain and "
             "noise hold"
         )
     if found.uneven > _EVEN:
         lines.append(
-            f"light differs by {100 * found.uneven:.0f} % over the frame, and EMVA 1288 allows {100 * _EVEN:.0f} %: the "
+            f"light differs by {100 * found.uneven:.0f} % over the frame, and EMVA 1288 allows {100 * _EVEN:.0f} %: "
+            "the "
             "figures prnu_* hold it; in the camera found a surface of second degree is taken off"
         )
     return tuple(lines)

@@ -83,7 +83,8 @@ AMISS: dict[str, tuple[dict[str, Any], str]] = {
     "a scattering lamp": ({"light": lambda photons, number, frame: photons * (1 + 0.03 * np.sin(5.0 * number))},
                           "light scatters by"),
     "8 bits as of a JPEG": ({"read": compressed, "bits": 8}, "noise of neighbouring pixels is correlated by"),
-    "a gamma curve": ({"read": lambda frame: np.rint(4095 * (frame / 4095) ** (1 / 2.2))}, "variances do not rise with means"),
+    "a gamma curve": ({"read": lambda frame: np.rint(4095 * (frame / 4095) ** (1 / 2.2))},
+                      "variances do not rise with means"),
 }  # fmt: skip
 
 
