@@ -1,9 +1,9 @@
 """A camera's file, or frames of a real camera, in; its figures after EMVA 1288 release 4.0 and its file out.
 
 Of a file, frames are simulated, and what they show is held against what is set. Real frames show the camera that
-explains them (`mitsim.sensor.found_camera`), and the standard's figures are held against what that camera's frames
-would show. Each figure's standard error is predicted: closed-form moments tell how far every statistic may be off, and a
-thousand sessions of such statistics are evaluated as that of the frames is (GUM, supplement 1).
+explains them (`mitsim.sensor.found_camera`), and figures are held against what that camera's frames would show. Each
+figure's standard error is predicted: closed-form moments tell how far every statistic may be off, and a thousand
+sessions of such statistics are evaluated as that of the frames is (GUM, supplement 1).
 """
 
 from __future__ import annotations
