@@ -353,7 +353,8 @@ class _Findings:
         even = np.where(cool, maps.excess - middle, 0.0)
         even -= even.mean(axis=1, keepdims=True)
         variance = float(np.square(even[cool]).mean()) * n / (n - 1)
-        spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
+        error_of_noise = math.hypot(math.sqrt(2 / count) * variance, math.sqrt(2 * part / count) * sum(theirs))
+        spread, spread_error = (variance - noise) / unit**2, error_of_noise / unit**2
         base = mean - part * beyond
         wide = math.sqrt(spread) if spread > _SURE * spread_error and base > 0 else 0.0
         hot_error = math.sqrt((variance + sum(theirs)) / max(part * count, 1) + rows / m) / unit
