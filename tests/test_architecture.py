@@ -64,6 +64,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.session",
     "mitsim.devices.framelist",
     "mitsim.devices.knownlist",
+    "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
 )

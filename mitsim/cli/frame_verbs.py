@@ -13,6 +13,7 @@ from mitsim.cli.options import (
     Common,
     ExposureFraction,
     Seed,
+    is_given,
     number_of,
     option,
     option_name,
@@ -297,7 +298,11 @@ class Procedure:
 
     pixels: int = option(256, "rows and columns of the frames")
     steps: int = option(50, "steps of light, from dark to beyond saturation")
-    frames: int = option(100, "frames of each stack")
+    frames: str = option(
+        "100",
+        "frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the dark",
+        metavar="N|DIR",
+    )
     wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]")
     seed: Seed = 0
 
@@ -306,21 +311,30 @@ class Procedure:
 def characterise(
     *,
     context: typer.Context,
-    camera: Annotated[str, typer.Argument(help="camera electronics: name or TOML file", metavar="CAMERA")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON and plots")] = Path(
+    camera: Annotated[
+        str | None, typer.Argument(help="camera electronics: name or TOML file", metavar="[CAMERA]", show_default=False)
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml")] = Path(
         "characterise-output"
     ),
     asked: Procedure,
     common: Common,
 ) -> int:
-    """Measure a camera after EMVA 1288 on simulated frames; figures found beside those that its file sets."""
+    """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames."""
+    from mitsim.studies.framework.run import check_study_folder
+
+    if camera is None:
+        return _characterise_frames(context, asked, output, common)
     from mitsim.core.configuration import locate
     from mitsim.devices.sensor import load_sensor
     from mitsim.studies import emva_options
-    from mitsim.studies.framework.run import check_study_folder
 
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    procedure = emva_options.Procedure(asked.pixels, asked.steps, asked.frames, asked.seed, asked.wavelength)
+    if not asked.frames.isdecimal():
+        raise ArgumentError(
+            "frames", f"{asked.frames}: give the frames of each stack, or leave out {camera} to measure a real camera"
+        )
+    procedure = emva_options.Procedure(asked.pixels, asked.steps, int(asked.frames), asked.seed, asked.wavelength)
     emva_options.capacity_of(sensor)
     emva_options.efficiency_of(sensor, procedure)
     if sensor.quantum_efficiency_curve is None:
@@ -330,6 +344,23 @@ def characterise(
 
     with common.job() as job:
         done = run_characterise(sensor, procedure, output, job)
+    return finish(common.as_json, done.payload(), done.lines(), done.warnings)
+
+
+def _characterise_frames(context: typer.Context, asked: Procedure, output: Path, common: Common) -> int:
+    """What frames say of the real camera that took them."""
+    from mitsim.devices.flatlist import load_flats
+    from mitsim.studies.framework.run import check_study_folder
+
+    if not is_given(context, "frames"):
+        raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
+    refuse_unused(context, ["pixels", "steps", "seed", "wavelength"], "on frames of a real camera")
+    listed = load_flats(Path(asked.frames))
+    check_study_folder(output, "characterise")
+    from mitsim.studies.characterise import characterise_frames
+
+    with common.job() as job:
+        done = characterise_frames(listed, output, job)
     return finish(common.as_json, done.payload(), done.lines(), done.warnings)
 
 

@@ -7,6 +7,7 @@ the nonuniformity, split into rows, columns and pixels. Statistics may have lead
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -20,8 +21,10 @@ QUANTISATION = 1 / 12
 LEAST_DARK = 0.24
 """Variance [DN^2] of dark frames below which rounding hides their noise: it counts as this much, an upper limit of
 0.4 DN for the noise (EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
-_FITTED, _LEAST, _MOST = 0.7, 0.05, 0.95
+MOST_FITTED, LINEAR = 0.7, (0.05, 0.95)
 """Parts of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
+LINE = 3
+"""Least points of a line that tell how straight it is."""
 SPLIT = ("total", "row", "column", "pixel")
 """Parts of a nonuniformity."""
 
@@ -67,56 +70,166 @@ class Stack:
 
 @dataclass(frozen=True)
 class Session:
-    """What the frames of one characterisation say; S steps of light, T exposures in the dark.
+    """What the frames of one characterisation say, in S sets that were taken alike.
 
     Attributes
     ----------
     shape
         rows and columns of the frames.
     photons
-        (S,) mean photons that fall on a pixel, rising, to beyond saturation.
-    ladder
-        pairs (..., S) under them, all at one exposure time.
-    dark
-        the pair (...) in the dark at that time.
-    overexposed
-        mean (...) [DN] of frames far beyond saturation.
-    dark_times
-        (T,) exposures [s] of the series of dark pairs.
-    dark_series
-        these pairs (..., T).
+        (S,) mean photons that fall on a pixel, or light in any unit; 0 in the dark.
+    exposure_s
+        (S,) of each set [s].
+    pairs
+        (..., S) means and temporal variances.
+    dark, bright
+        which sets tell nonuniformity: one in the dark, one near half of saturation.
     dark_stack, bright_stack
-        at that time, in the dark and at half of saturation.
+        of these.
+    saturates
+        whether the brightest set is saturated.
     rounded
         whether the frames are whole numbers.
     """
 
     shape: tuple[int, int]
     photons: FloatArray
-    ladder: Pair
-    dark: Pair
-    overexposed: FloatArray
-    dark_times: FloatArray
-    dark_series: Pair
+    exposure_s: FloatArray
+    pairs: Pair
+    dark: int
+    bright: int
     dark_stack: Stack
     bright_stack: Stack
+    saturates: bool = True
     rounded: bool = True
+
+    @property
+    def lit(self) -> npt.NDArray[np.intp]:
+        """Sets under light, by light."""
+        order = np.argsort(self.photons, kind="stable")
+        return order[self.photons[order] > 0]
+
+    @property
+    def unlit(self) -> npt.NDArray[np.intp]:
+        """Sets in the dark, by exposure."""
+        order = np.argsort(self.exposure_s, kind="stable")
+        return order[self.photons[order] == 0]
+
+    @property
+    def partners(self) -> npt.NDArray[np.intp]:
+        """For each set under light, one in the dark of its exposure: that of the nonuniformity where it is."""
+        unlit = np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
+        off = np.abs(self.exposure_s[unlit] - self.exposure_s[self.lit][:, None])
+        return unlit[off.argmin(axis=1)]
+
+    def transfer(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the sets under light, by light: photons (L,), and signal (..., L) [DN] and variance
+        [DN^2] less the dark."""
+        lit, dark = self.lit, self.partners
+        mean, variance = self.pairs.mean, self.pairs.variance
+        return self.photons[lit], mean[..., lit] - mean[..., dark], variance[..., lit] - variance[..., dark]
+
+
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """What frames say that were taken alike: same light, same exposure.
+
+    Attributes
+    ----------
+    count, shape
+        of the frames.
+    pair, stack
+        temporal and spatial statistics.
+    variance_error
+        standard error of the temporal variance [DN^2], from how it varies over the pixels.
+    cut
+        parts of all numbers that are 0, and that are the largest code.
+    flicker
+        standard deviation of the frames' means beyond what noise makes [DN].
+    neighbours
+        correlation of the noise of neighbours in a row, and in a column: 0 where electrons are counted.
+    """
+
+    count: int
+    shape: tuple[int, int]
+    pair: Pair
+    stack: Stack
+    variance_error: float
+    cut: tuple[float, float]
+    flicker: float
+    neighbours: tuple[float, float]
+
+    @property
+    def mean_error(self) -> float:
+        """Standard error of the mean that noise makes [DN]."""
+        rows = max(float(self.pair.rows), 0.0)
+        own = max(float(self.pair.variance) - rows, 0.0)
+        return math.sqrt((own / math.prod(self.shape) + rows / self.shape[0]) / self.count)
+
+
+def alike(frames: Iterable[npt.ArrayLike], largest: float = math.inf) -> Alike:
+    """Statistics of ``frames`` (M, N) [DN] that were taken alike; they are looked at one after the other.
+
+    The temporal variance is that of each pixel about its mean, of frames less their own means: free of all that is
+    fixed in space, and of a drift of the light. Of two frames it is <(a - b)^2>/2 - (<a> - <b>)^2/2.
+
+    Parameters
+    ----------
+    frames
+        two or more; ValueError for fewer.
+    largest
+        code of the ADC's end.
+    """
+    means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
+    first = total = squares = last = difference = np.zeros((0, 0))
+    for frame in frames:
+        values = np.asarray(frame, dtype=np.float64)
+        if not means:
+            first, total, squares, last = values, *(np.zeros(values.shape) for _ in range(3))
+        ends += np.count_nonzero(values <= 0), np.count_nonzero(values >= largest)
+        off = values - first  # squares of small numbers keep their digits
+        means.append(float(off.mean()))
+        off -= means[-1]
+        total += off
+        squares += np.square(off)
+        lines.append(off.mean(axis=1))
+        difference, last = off - last, off
+    count, (m, n) = len(means), first.shape
+    if count < 2:
+        raise ValueError(f"alike: {count} frames tell no temporal noise; give 2 or more")
+    own = (squares - np.square(total) / count) / (count - 1)
+    variance = float(own.sum()) / (m * n - 1)
+    shared = (float(np.var(lines, axis=0, ddof=1).sum()) / (m - 1) - variance / n) * n / (n - 1)
+    pair = Pair(*map(np.asarray, (first.mean() + np.mean(means), variance, shared)))
+    about = first + total / count
+    about -= about.mean()
+    parts = np.square(about).sum() / (m * n - 1), *(np.square(about.mean(axis=k)).mean() for k in (1, 0))
+    stack = Stack(
+        pair.mean, *(np.asarray(part - variance / count / k) for part, k in zip(parts, (1, n, m), strict=True))
+    )
+    rows = max(shared, 0.0)
+    # Of the pixels' variances, which rows that share noise move together (see `mitsim.studies.emva_frames`).
+    spread = float(own.var()) + (4 * max(variance - rows, 0.0) * rows + 2 * rows**2 * n) / (count - 1)
+    drift = float(np.var(means, ddof=1)) - (variance - rows) / (m * n) - rows / m
+    return Alike(
+        count, (m, n), pair, stack, math.sqrt(spread / (m * n)), (ends[0] / count / m / n, ends[1] / count / m / n),
+        math.sqrt(max(drift, 0.0)), _neighbours(difference),
+    )  # fmt: skip
+
+
+def _neighbours(noise: FloatArray) -> tuple[float, float]:
+    """Correlation of neighbours in a row, and in a column, of ``noise`` less what rows and columns share."""
+    noise = noise - noise.mean(axis=1, keepdims=True)
+    noise -= noise.mean(axis=0)
+    power = float(np.square(noise).mean())
+    if not power:
+        return 0.0, 0.0
+    return float((noise[:, 1:] * noise[:, :-1]).mean()) / power, float((noise[1:] * noise[:-1]).mean()) / power
 
 
 def pair_of(first: npt.ArrayLike, second: npt.ArrayLike) -> Pair:
-    """Statistics of two frames, ``first`` and ``second`` (M, N) [DN].
-
-    sigma^2 = <(a - b)^2>/2 - (<a> - <b>)^2/2: free of all that is fixed in space, and of a drift of the light.
-    """
-    a, b = (np.asarray(frame, dtype=np.float64) for frame in (first, second))
-    off = a - b
-    off -= off.mean()
-    m, n = off.shape
-    variance = float(np.square(off).sum()) / 2 / (off.size - 1)
-    lines = float(np.square(off.mean(axis=1)).sum()) / 2 / (m - 1)
-    return Pair(
-        np.asarray((a.mean() + b.mean()) / 2), np.asarray(variance), np.asarray((lines - variance / n) * n / (n - 1))
-    )
+    """Temporal statistics of two frames, ``first`` and ``second`` (M, N) [DN]."""
+    return alike((first, second)).pair
 
 
 def pairs_of(pairs: Sequence[Pair]) -> Pair:
@@ -125,63 +238,52 @@ def pairs_of(pairs: Sequence[Pair]) -> Pair:
 
 
 def stack_of(frames: Iterable[npt.ArrayLike]) -> Stack:
-    """Statistics of the mean of ``frames`` (M, N) [DN], two or more; what temporal noise leaves in it is taken off."""
-    count, total, squares = 0, np.zeros(()), np.zeros(())
-    first: FloatArray | None = None
-    for frame in frames:
-        values = np.asarray(frame, dtype=np.float64)
-        first = values if first is None else first
-        # About the first frame: squares of small numbers keep their digits.
-        total = total + (values - first)
-        squares = squares + np.square(values - first)
-        count += 1
-    if count < 2 or first is None:
-        raise ValueError(f"stack_of: {count} frames tell no temporal noise; give 2 or more")
-    m, n = first.shape
-    mean = first + total / count
-    noise = float((squares - np.square(total) / count).mean()) / (count - 1)
-    about = mean - mean.mean()
-    return Stack(
-        mean=np.asarray(mean.mean()),
-        total=np.asarray(np.square(about).sum() / (about.size - 1) - noise / count),
-        rows=np.asarray(np.square(about.mean(axis=1)).mean() - noise / count / n),
-        columns=np.asarray(np.square(about.mean(axis=0)).mean() - noise / count / m),
-    )
+    """Spatial statistics of the mean of ``frames`` (M, N) [DN]; what temporal noise leaves in it is taken off."""
+    return alike(frames).stack
 
 
 def figures(session: Session) -> dict[str, FloatArray]:
     """The figures (...) of a ``session``, by name; variances may come out below zero, where there is nothing to find.
 
     `system_gain` [DN/e-], `quantum_efficiency` [e-/photon], `dark_noise` [e-], `saturation_capacity` (at the largest
-    variance of the ladder) and `full_well` (of overexposed frames) [e-], `linearity_min` and `linearity_max` [1],
-    `dark_current` (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2]
-    and `prnu_PART` [1] for each PART of :data:`SPLIT`.
+    variance) and `full_well` (of the brightest frames) [e-], `linearity_min` and `linearity_max` [1], `dark_current`
+    (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2] and
+    `prnu_PART` [1] for each PART of :data:`SPLIT`. What the frames do not tell is left out: saturation where nothing is
+    saturated, linearity of fewer than three steps, dark current of one exposure.
     """
-    photons, ladder, dark = session.photons, session.ladder, session.dark
-    signal = ladder.mean - dark.mean[..., None]
-    noise = ladder.variance - dark.variance[..., None]
-    peak = ladder.variance.argmax(axis=-1)
-    full = np.take_along_axis(signal, peak[..., None], axis=-1)
-    fitted = (signal <= _FITTED * full) & (photons > 0)
+    photons, signal, noise = session.transfer()
+    variance, unlit = session.pairs.variance, session.unlit
+    dark = Pair(*(getattr(session.pairs, name)[..., session.dark] for name in ("mean", "variance", "rows")))
+    peak = variance[..., session.lit].argmax(axis=-1)
+    full = np.take_along_axis(signal, peak[..., None], axis=-1) if session.saturates else np.full(1, np.inf)
+    fitted = signal <= MOST_FITTED * full
     gain = _slope(signal, noise, fitted)
     efficiency = _slope(np.broadcast_to(photons, signal.shape), signal, fitted) / gain
-    low, high = _linearity(photons, signal, (signal >= _LEAST * full) & (signal <= _MOST * full))
-    still = np.maximum(dark.variance, LEAST_DARK) - QUANTISATION if session.rounded else dark.variance
-    times, series = session.dark_times, session.dark_series
+    times = session.exposure_s[unlit]
     about = times - times.mean()
-    slopes = [(values * about).sum(axis=-1) / np.square(about).sum() for values in (series.mean, series.variance)]
+    slopes = [
+        (values[..., unlit] * about).sum(axis=-1) / max(np.square(about).sum(), 1e-300)
+        for values in (session.pairs.mean, variance)
+    ]
+    still = dark.variance
+    if len(np.unique(session.exposure_s[session.lit])) >= LINE:
+        still = variance[..., unlit].mean(axis=-1) - slopes[1] * times.mean()
+    still = np.maximum(still, LEAST_DARK) - QUANTISATION if session.rounded else np.maximum(still, 0)
     found = {
         "system_gain": gain,
         "quantum_efficiency": efficiency,
         "dark_noise": np.sqrt(still) / gain,
         "row_noise": dark.rows / gain**2,
-        "saturation_capacity": efficiency * photons[peak],
-        "full_well": (session.overexposed - dark.mean) / gain,
-        "linearity_min": low,
-        "linearity_max": high,
-        "dark_current": slopes[0] / gain,
-        "dark_current_by_variance": slopes[1] / gain**2,
     }
+    if session.saturates:
+        found |= {"saturation_capacity": efficiency * photons[peak], "full_well": signal[..., -1] / gain}
+    top = full if session.saturates else signal[..., -1:]
+    used = (signal >= LINEAR[0] * top) & (signal <= (LINEAR[1] if session.saturates else 1) * top)
+    if used.sum(axis=-1).min() >= LINE:
+        low, high = _linearity(photons, signal, used)
+        found |= {"linearity_min": low, "linearity_max": high}
+    if np.ptp(times) > 0:
+        found |= {"dark_current": slopes[0] / gain, "dark_current_by_variance": slopes[1] / gain**2}
     dim, bright = session.dark_stack, session.bright_stack
     contrast = bright.mean - dim.mean
     for name, off, on in zip(SPLIT, dim.parts(session.shape), bright.parts(session.shape), strict=True):

@@ -221,6 +221,7 @@ def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> Non
     small = "--pixels", 32, "--steps", 20, "--frames", 2, "--json", "--quiet", "--variant", "llvm_ad_mono"
     found = call("characterise", "imx477", "-o", tmp_path / "figures", *small).payload
     assert {"camera", "pixels", "steps", "frames", "seed", "exposure_s", "warnings", "output"} <= found.keys()
+    assert {"camera_found", "light", "notes"} <= found.keys()
     keys = {"name", "symbol", "unit", "set", "expected", "found", "standard_error", "deviations", "bias"}
     for figure in found["figures"]:
         assert figure.keys() == keys

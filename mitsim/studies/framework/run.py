@@ -268,7 +268,7 @@ DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 _PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         ALL: (*PAPER, "*.html"),
-        "characterise": ("*.png",),
+        "characterise": ("*.png", "camera.toml"),
         "demo": (*DEMO_FOLDERS, DEMO_PAGE),
         **{name: ("*.png", "*.csv", f"{name}.html") for name in STUDIES},
     }

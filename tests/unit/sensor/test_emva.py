@@ -76,14 +76,18 @@ def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
         rows, columns = each["row"] + pixel / 200, each["column"] + pixel / 100
         return Stack(np.asarray(100 + light), np.asarray(rows + columns + left), np.asarray(rows), np.asarray(columns))
 
+    pairs = Pair(
+        np.concatenate([100 + gain * light, 100 + gain * dark * times]),
+        np.concatenate([variance, still + gain**2 * dark * times]),
+        np.concatenate([np.zeros(50), [rows], np.zeros(5)]),
+    )
     session = Session(
         shape=(100, 200),
-        photons=electrons / efficiency,
-        ladder=Pair(100 + gain * light, variance, np.zeros(50)),
-        dark=Pair(np.asarray(100.0), still[0], rows),
-        overexposed=np.asarray(100 + gain * full),
-        dark_times=times,
-        dark_series=Pair(100 + gain * dark * times, still + gain**2 * dark * times, np.zeros(6)),
+        photons=np.concatenate([electrons / efficiency, np.zeros(6)]),
+        exposure_s=np.concatenate([np.zeros(50), times]),
+        pairs=pairs,
+        dark=50,
+        bright=25,
         dark_stack=stack(0.0),
         bright_stack=stack(2000.0),
     )
@@ -104,12 +108,10 @@ def test_linearity_is_the_least_and_the_largest_relative_deviation() -> None:
     photons = np.linspace(100, 10_000, 50)
     signal = photons * (1 - 0.02 * photons / 10_000)
     variance = np.append(np.linspace(1, 50, 49), 0.0)
-    flat, zero = np.zeros(()), Stack(*(np.ones(()) for _ in range(4)))
-    session = Session(
-        (9, 9), photons, Pair(signal, variance, 0 * signal), Pair(flat, flat, flat), flat,
-        np.arange(3.0), Pair(np.zeros(3), np.zeros(3), np.zeros(3)), zero,
-        Stack(np.full((), 2.0), np.ones(()), np.ones(()), np.ones(())),
-    )  # fmt: skip
+    zero = Stack(*(np.ones(()) for _ in range(4)))
+    sets = [np.append(part, 0.0) for part in (photons, 0 * photons, signal, variance, 0 * signal)]
+    bright = Stack(np.full((), 2.0), np.ones(()), np.ones(()), np.ones(()))
+    session = Session((9, 9), sets[0], sets[1], Pair(*sets[2:]), 50, 25, zero, bright)
     found = figures(session)
     used = (signal >= 0.05 * signal[48]) & (signal <= 0.95 * signal[48])
     line = np.polynomial.polynomial.polyfit(photons[used], signal[used], 1, w=1 / signal[used])

@@ -141,7 +141,7 @@ def test_few_bits_and_clipped_darks_leave_the_predicted_spread(name: str) -> Non
 
 
 def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mitsim.studies import characterise as module
+    from mitsim.studies import emva_frames as module
 
     frames = module.expose
     monkeypatch.setattr(module, "expose", lambda light, *rest: np.rint(60 + 1.2 * (frames(light, *rest) - 60.0)))
@@ -152,12 +152,14 @@ def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.Mo
 def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
     done = characterise(camera("plain"), Procedure(32, 20, 2), tmp_path / "found")
     assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
-        "characterise.json", "dark_current.png", "deviations.png", "linearity.png", "photon_transfer.png",
+        "camera.toml", "characterise.json", "dark_current.png", "deviations.png", "linearity.png",
+        "photon_transfer.png",
     ]  # fmt: skip
     written = json.loads((tmp_path / "found" / "characterise.json").read_text())
     assert written["kind"] == "characterise" and written["pixels"] == 32
     assert [figure["name"] for figure in written["figures"]] == [row.name for row in done.rows]
-    assert done.lines()[-1] == f"JSON and plots: {tmp_path / 'found'}"
+    assert done.lines()[-1] == f"JSON, plots and the camera found, camera.toml: {tmp_path / 'found'}"
+    assert load_sensor(tmp_path / "found" / "camera.toml") == done.found.sensor
 
 
 def test_without_a_quantum_efficiency_light_is_counted_in_electrons() -> None:
@@ -180,7 +182,7 @@ def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
 
 
 def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_what_was_set() -> None:
-    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself, known as a pair's variance and the gain
+    """0.1 DN of noise: rounded, (0.24 - 1/12)^(1/2) DN; not rounded, itself, known as a stack's variance and the gain
     are. (Planted: either of the sessions, drawn and expected, of real numbers as if rounded.)"""
     quiet = {**PLAIN, "read_noise_e": 0.5, "dark_current_e_per_s": 0.0, "gain_dn_per_e": 0.2}
     for bits, expected, limit in ((12, 0.39581 / 0.2, True), (None, 0.5, False)):
@@ -189,7 +191,7 @@ def test_noise_that_rounding_hides_is_the_standard_s_limit_and_of_real_numbers_w
         assert not done.warnings and row.set == 0.5 and (row.expected is not None) == limit
         assert row.found == pytest.approx(expected, abs=5 * row.standard_error)
     gain = next(row for row in done.rows if row.name == "system_gain")
-    alone = math.hypot(1 / math.sqrt(2 * SMALL.pixels**2), gain.standard_error / gain.set)
+    alone = math.hypot(1 / math.sqrt(2 * SMALL.pixels**2 * (SMALL.frames - 1)), gain.standard_error / gain.set)
     assert row.standard_error == pytest.approx(0.5 * alone, rel=0.05)
 
 

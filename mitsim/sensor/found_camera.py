@@ -1,0 +1,427 @@
+"""Lit and dark frames of a camera in, the sensor model that makes such frames out, each number with its standard error.
+
+Gain, noise of reading, black level, dark current, response and linearity are fitted to means and variances
+(`mitsim.sensor.photon_transfer`); offsets, responses, dark currents and defects of pixels are told by mean images.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import validate
+from mitsim.core.errors import MitsimError
+from mitsim.devices.sensor import SensorModel
+from mitsim.sensor.emva import LEAST_DARK
+from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform
+
+_DEAD = 0.5
+"""Response over the median one below which a pixel is dead."""
+_HOT = 8.0
+"""Robust deviations beyond the median dark current from which a pixel is hot: of a normal law none in 1e14, and few of
+the longer tail that dark currents have."""
+_SURE = 4.0
+"""Standard errors from which an effect is put into the camera: one in 3e4 is there by chance."""
+_UNEVEN = 0.01
+"""Part of the light by which it differs over the frame from which a surface is taken off before pixels are compared."""
+_ROBUST = 1.4826
+"""Standard deviation over median absolute deviation, of a normal law."""
+_CUT = 1e-3
+"""Part of dark readings that are 0 from which their spread is not that of offsets."""
+_MOST_RESPONSE = 0.1
+"""Largest relative spread of responses that a camera file states."""
+
+Images = Callable[[int], FloatArray]
+"""Mean image (M, N) [DN] of the set of an index."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What frames do not tell of a camera: its `name`, `pixel_pitch_um`, `source` and `bits`; and whether light is
+    counted in photons."""
+
+    name: str
+    pixel_pitch_um: float
+    source: str
+    bits: int | None
+    photons: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCamera:
+    """The camera that frames show.
+
+    Attributes
+    ----------
+    sensor
+        whose pixels are the frames' elements.
+    errors
+        standard error of each field that was measured, by name.
+    transfer
+        the fit of means and variances.
+    uneven
+        part of the light by which it differs over the frame.
+    notes
+        what the frames do not tell.
+    """
+
+    sensor: SensorModel
+    errors: dict[str, float]
+    transfer: Transfer = field(repr=False)
+    uneven: float
+    notes: tuple[str, ...]
+
+    def toml(self) -> str:
+        """The camera file, with standard errors in comments."""
+        lines = ["# Measured by `mitsim characterise`: numbers with their standard errors.", "#"]
+        lines += [f"# {note}" for note in self.notes]
+        lines.append("")
+        for name, value in self.sensor.model_dump(exclude_defaults=True).items():
+            text = (
+                f'"{_quote(value)}"'
+                if isinstance(value, str)
+                else str([*value])
+                if isinstance(value, tuple)
+                else repr(value)
+            )
+            error = self.errors.get(name)
+            lines.append(f"{name} = {text}" + (f"  # +- {error:.2g}" if error else ""))
+        return "\n".join(lines) + "\n"
+
+
+def _quote(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> FoundCamera:
+    """The camera that explains frames.
+
+    Parameters
+    ----------
+    taken
+        sets of frames that were taken alike: some in the dark, one of them at the exposure of each under light.
+    images
+        their mean images.
+    stated
+        what frames do not tell.
+
+    Raises
+    ------
+    MitsimError
+        where no camera file can state what was found.
+    """
+    maps = _Maps.of(taken, images)
+    dead, offsets = float(maps.dead.mean()), maps.offsets()
+    transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
+    return _Findings(taken, maps, transfer, offsets, dead).camera(stated)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """Spatial variances by pixel, row and column, and their standard errors; in the image's unit squared."""
+
+    values: FloatArray
+    errors: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Maps:
+    """Mean images and what is amiss in them.
+
+    `dark` and `bright` tell nonuniformity, `long` is the longest in the dark; `dead` and `hot` (M, N) are defects,
+    `excess` (M, N) [DN] what is gathered in the dark over `seconds`, `contrast` (M, N) [DN] what light makes.
+    """
+
+    taken: Sequence[Taken]
+    dark: int
+    bright: int
+    short: int
+    long: int
+    offset: FloatArray
+    contrast: FloatArray
+    excess: FloatArray | None
+    dead: npt.NDArray[np.bool_]
+    hot: npt.NDArray[np.bool_]
+    uneven: float
+
+    @classmethod
+    def of(cls, taken: Sequence[Taken], images: Images) -> _Maps:
+        dark, bright = nonuniform(taken)
+        unlit = [index for index, each in enumerate(taken) if not each.light]
+        long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
+        short = max(unlit, key=lambda index: (taken[index].said.count, -taken[index].exposure_s))
+        offset = images(short)
+        contrast = images(bright) - (offset if dark == short else images(dark))
+        middle = float(np.median(contrast))
+        noise = math.sqrt(_noise_left(taken, bright) + _noise_left(taken, dark))
+        dead = contrast < _DEAD * middle if 10 * noise < middle else np.zeros(contrast.shape, bool)
+        hot, excess = np.zeros(contrast.shape, bool), None
+        if taken[long].exposure_s > taken[short].exposure_s:
+            excess = images(long) - offset
+            middle = float(np.median(excess))
+            wide = _ROBUST * float(np.median(np.abs(excess - middle)))
+            # Of few codes most readings are one number: noise is then what is left of it.
+            wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
+            hot = excess > middle + _HOT * wide
+        surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
+        uneven = float(np.ptp(surface) / surface.mean())
+        if uneven > _UNEVEN:
+            contrast = contrast / (surface / surface.mean())
+        return cls(taken, dark, bright, short, long, offset, contrast, excess, dead, hot, uneven)
+
+    def offsets(self) -> _Parts:
+        """Of the offsets [DN^2], dark current's part at that exposure among them."""
+        said = self.taken[self.short].said
+        return _spatial_parts(
+            self.offset, self.dead | self.hot, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count
+        )
+
+    def responses(self) -> _Parts:
+        """Of the responses, over their mean."""
+        noise = _noise_left(self.taken, self.bright) + _noise_left(self.taken, self.dark)
+        rows = sum(
+            float(self.taken[index].said.pair.rows) / self.taken[index].said.count for index in (self.bright, self.dark)
+        )
+        found = _spatial_parts(self.contrast, self.dead | self.hot, noise, rows)
+        mean = float(self.contrast[~(self.dead | self.hot)].mean())
+        return _Parts(found.values / mean**2, found.errors / mean**2)
+
+    @property
+    def offset_spread(self) -> float:
+        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light."""
+        if self.taken[self.short].said.cut[0] < _CUT:
+            return float(self.offsets().values.sum())
+        lit = [each for each in self.taken if each.light and not any(each.said.cut)]
+        if not lit:
+            return float(self.offsets().values.sum())
+        darkest = min(lit, key=lambda each: float(each.said.pair.mean))
+        signal = float(darkest.said.pair.mean) - float(self.taken[self.short].said.pair.mean)
+        dead = float(self.dead.mean())
+        response = float(self.responses().values.sum()) + dead * (1 - dead)
+        return float(darkest.said.stack.total) - response * signal**2
+
+
+def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
+    """Mean of an ``image`` (M, N) ``without`` some pixels (M, N)."""
+    return float(image[~without].mean())
+
+
+def _noise_left(taken: Sequence[Taken], index: int) -> float:
+    """Variance [DN^2] that noise leaves in a pixel of a mean image."""
+    return float(taken[index].said.pair.variance) / taken[index].said.count
+
+
+def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
+    """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
+    m, n = image.shape
+    about = np.where(without, 0.0, image - middle_of(image, without))
+    total = float(np.square(about).sum()) / (max(np.count_nonzero(~without), 2) - 1) - noise
+    row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
+    row -= (noise - rows) / n + rows
+    column -= (noise - rows) / m
+    pixel = m * n / (m * n - m - n) * (total - row - column)
+    values = np.array([pixel, row - pixel / n, column - pixel / m])
+    own = max(pixel, 0.0) + noise - rows
+    errors = np.sqrt(2.0 / np.array([(m - 1) * (n - 1), m - 1, n - 1])) * (
+        own / np.array([1.0, n, m]) + np.maximum([0.0, values[1] + rows, values[2]], 0.0)
+    )
+    return _Parts(values, errors)
+
+
+def _surface(image: FloatArray) -> FloatArray:
+    """The surface of second degree (M, N) nearest to an ``image`` (M, N)."""
+    m, n = image.shape
+    y, x = (np.linspace(-1, 1, side) for side in (m, n))
+    legendre = [np.polynomial.legendre.legvander(each, 2) for each in (y, x)]
+    weights = [np.linalg.pinv(each) for each in legendre]
+    found = weights[0] @ image @ weights[1].T
+    keep = np.add.outer(np.arange(3), np.arange(3)) <= 2
+    return np.asarray(legendre[0] @ (found * keep) @ legendre[1].T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Findings:
+    """All that was measured, as fields of a camera are made of it."""
+
+    taken: Sequence[Taken]
+    maps: _Maps
+    transfer: Transfer
+    offsets: _Parts
+    dead: float
+
+    def camera(self, stated: Stated) -> FoundCamera:
+        """The camera, of what was ``stated`` and measured."""
+        transfer, notes = self.transfer, list[str]()
+        gain, gain_error = transfer["gain"], transfer.error("gain") / transfer["gain"]
+        found: dict[str, tuple[float, float]] = {"gain_dn_per_e": (gain, gain * gain_error)}
+        found |= self._noise(gain, gain_error)
+        found |= self._dark(gain, notes)
+        found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0])
+        found |= self._responses()
+        if stated.photons:
+            response = self._response_error()
+            found["quantum_efficiency"] = transfer["response"], response * transfer["response"]
+            if transfer["response"] > 1 + _SURE * found["quantum_efficiency"][1]:
+                raise MitsimError(
+                    f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
+                    "so correct photons_per_s (photons on one pixel in a second), or leave it out"
+                )
+        found |= self._end(stated, gain_error, notes)
+        bend = [transfer["bend"], transfer["bend_2"]]
+        fields: dict[str, Any] = {name: _short(value) for name, (value, _) in found.items()}
+        if any(bend):
+            fields["linearity"] = tuple(_short(value) for value in bend)
+        if "quantum_efficiency" in fields:
+            fields["quantum_efficiency"] = min(fields["quantum_efficiency"], 1.0)
+        fields |= {
+            "name": stated.name,
+            "pixel_pitch_um": stated.pixel_pitch_um,
+            "source": stated.source,
+            "bits": stated.bits,
+        }
+        wide = max(fields[f"prnu_{part}"] for part in ("pixel", "row", "column"))
+        if wide > _MOST_RESPONSE:
+            raise MitsimError(
+                f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
+                f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
+            )
+        errors = {name: error for name, (_, error) in found.items()}
+        if any(bend):
+            errors["linearity"] = transfer.error("bend")
+        return FoundCamera(
+            validate(SensorModel, fields, "camera found"), errors, transfer, self.maps.uneven, tuple(notes)
+        )
+
+    def _noise(self, gain: float, gain_error: float) -> dict[str, tuple[float, float]]:
+        """Noise of reading, of which rows share a part, and black level."""
+        transfer = self.transfer
+        read, error = transfer["read"], transfer.error("read")
+        if min(float(each.said.pair.variance) for each in self.taken if not each.light) < LEAST_DARK:
+            error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide it: an upper limit is known
+        rows, row_error = self._rows()
+        shared = rows if rows > _SURE * row_error else 0.0
+        own = math.sqrt(max(read**2 - shared, 0.0))
+        lines = (
+            self.offsets.values[1:] / np.array(self.maps.offset.shape),
+            self.offsets.values[0] / self.maps.offset.size,
+        )
+        still = math.sqrt(max(float(lines[0].sum() + lines[1]), 0.0))
+        own_error = math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
+        return {
+            "read_noise_e": (own / gain, own_error / gain),
+            "row_noise_e": (math.sqrt(shared) / gain, _root_error(shared, row_error) / gain),
+            "black_level_dn": (max(transfer["black"], 0.0), math.hypot(transfer.error("black"), still)),
+        }  # fmt: skip
+
+    def _rows(self) -> tuple[float, float]:
+        """Variance of the noise that rows share [DN^2], and its standard error, of all sets in the dark."""
+        m, n = self.maps.offset.shape
+        pairs = [(each.said.pair, each.said.count) for each in self.taken if not each.light]
+        values = np.array([float(pair.rows) for pair, _ in pairs])
+        middle = max(float(np.median(values)), 0.0)
+        errors = np.array([
+            math.sqrt(2 / m / (count - 1)) * ((float(pair.variance) - middle) / n + middle) for pair, count in pairs
+        ])  # fmt: skip
+        weight = 1 / np.maximum(errors, 1e-12) ** 2
+        return float((values * weight).sum() / weight.sum()), float(weight.sum() ** -0.5)
+
+    def _dark(self, gain: float, notes: list[str]) -> dict[str, tuple[float, float]]:
+        """Dark current, its spread, and hot pixels."""
+        maps, taken = self.maps, self.taken
+        mean, error = self.transfer["dark"], self.transfer.error("dark")
+        nothing = (0.0, 0.0)
+        names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
+        if maps.excess is None:
+            notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two or more")
+            return dict.fromkeys(names, nothing)
+        seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
+        unit, count = gain * seconds, maps.excess.size
+        cool, (m, n) = ~maps.hot, maps.excess.shape
+        middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
+        beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
+        both = taken[maps.long], taken[maps.short]
+        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both)
+        # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
+        theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
+        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)
+        even = np.where(cool, maps.excess - middle, 0.0)
+        even -= even.mean(axis=1, keepdims=True)
+        variance = float(np.square(even[cool]).mean()) * n / (n - 1)
+        error_of_noise = math.hypot(math.sqrt(2 / count) * variance, math.sqrt(2 * part / count) * sum(theirs))
+        spread, spread_error = (variance - noise) / unit**2, error_of_noise / unit**2
+        base = mean - part * beyond
+        wide = math.sqrt(spread) if spread > _SURE * spread_error and base > 0 else 0.0
+        hot_error = math.sqrt((variance + sum(theirs)) / max(part * count, 1) + rows / m) / unit
+        base_error = math.hypot(error, wide / math.sqrt(count), part * hot_error)
+        return dict(zip(names, (
+            (max(base, 0.0), base_error), (wide, _root_error(wide**2, spread_error)),
+            (part, math.sqrt(max(part, 1 / count) / count)), (beyond, hot_error if part else 0.0),
+        ), strict=True))  # fmt: skip
+
+    def _offsets(self, gain: float, gain_error: float, spread: float) -> dict[str, tuple[float, float]]:
+        """Offsets by pixel, row and column [e-]."""
+        values, errors = self.offsets.values.copy(), self.offsets.errors
+        values[0] -= (gain * spread * self.taken[self.maps.short].exposure_s) ** 2
+        wider = self.maps.offset_spread / values.sum() if values.sum() > 0 else 1.0
+        scale = wider if self.taken[self.maps.short].said.cut[0] >= _CUT and wider > 1 else 1.0
+        found = {}
+        for name, value, error in zip(("pixel", "row", "column"), values * scale, errors * scale, strict=True):
+            kept = math.sqrt(value) / gain if value > _SURE * error else 0.0
+            found[f"dsnu_{name}_e"] = kept, math.hypot(_root_error(kept**2, error / gain**2), kept * gain_error)
+        return found
+
+    def _responses(self) -> dict[str, tuple[float, float]]:
+        """Responses by pixel, row and column, and dead pixels."""
+        found, (b1, b2), full = self.maps.responses(), self.transfer.values[5:], 1.0
+        if b1 or b2:
+            light = self.transfer["response"] * self.taken[self.maps.bright].light
+            end = self.transfer.saturation_dn or math.inf
+            well = max((end - self.transfer["black"]) / self.transfer["gain"] / (1 + b1 + b2), 1.0)
+            x = light / well
+            full = (1 + 2 * b1 * x + 3 * b2 * x**2) / (1 + b1 * x + b2 * x**2)
+        numbers = {}
+        for name, value, error in zip(("pixel", "row", "column"), found.values, found.errors, strict=True):
+            kept = math.sqrt(value) / full if value > _SURE * error else 0.0
+            numbers[f"prnu_{name}"] = kept, _root_error(kept**2, error / full**2)
+        numbers["dead_pixels"] = self.dead, math.sqrt(max(self.dead, 1 / self.maps.dead.size) / self.maps.dead.size)
+        return numbers
+
+    def _response_error(self) -> float:
+        """Relative standard error of the response to light: that of the fit, and of this specimen's pixels."""
+        m, n = self.maps.contrast.shape
+        pixel, row, column = np.maximum(self.maps.responses().values, 0)
+        return math.hypot(
+            self.transfer.error("response") / self.transfer["response"], math.sqrt(pixel / m / n + row / m + column / n)
+        )
+
+    def _end(self, stated: Stated, gain_error: float, notes: list[str]) -> dict[str, tuple[float, float]]:
+        """Full well: where frames saturate, or where the ADC does."""
+        transfer = self.transfer
+        top = None if stated.bits is None else 2.0**stated.bits - 1
+        end = transfer.saturation_dn if transfer.saturates else top
+        if transfer.saturation_dn is None:
+            what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
+            notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
+        elif not transfer.saturates:
+            notes.append("full well: the ADC's end is reached first, so it may be larger")
+        if end is None:
+            return {"full_well_e": (math.inf, 0.0)}
+        bent = 1 + transfer["bend"] + transfer["bend_2"]
+        full = (end - transfer["black"]) / transfer["gain"] / bent
+        return {"full_well_e": (full, full * math.hypot(gain_error, transfer.error("bend") / 10))}
+
+
+def _root_error(square: float, error: float) -> float:
+    """Standard error of the root of a ``square`` that is known with an ``error``; of 0 what it may be at most."""
+    return error / (2 * max(math.sqrt(max(square, 0.0)), math.sqrt(error))) if error > 0 else 0.0
+
+
+def _short(value: float) -> float:
+    """A number of seven digits: more than any is known to."""
+    return float(f"{value:.7g}")

@@ -1,0 +1,408 @@
+"""Statistics of lit and dark frames at several exposures in, the camera that explains them out, with standard errors.
+
+EMVA 1288 reads gain and noise off straight lines, which readings that are cut at 0 and rounding to few codes bend. Here
+the closed-form moments of the whole chain (`mitsim.sensor.moments`) are fitted to means and variances at once, so
+that cutting, rounding and saturation are part of what is expected. Light of a set may be off by what the lamp varies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.sensor import SensorModel
+from mitsim.sensor.emva import MOST_FITTED, Alike
+from mitsim.sensor.moments import frame_moments
+
+NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
+"""What is fitted: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
+unit of light, and the first two coefficients of linearity."""
+_STEPS = (1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0)
+"""Steps by which slopes are found, as parts of a number: where moments change by some of their errors."""
+_LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
+"""The same in the number's unit, at least: also where it is 0."""
+_STARTS = (0.9, 0.8, 0.7, 0.6, 0.5)
+"""Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
+_DITHERED = 0.64
+"""Variance [DN^2] below which rounding moves it: of 0.8 DN, as `mitsim.sensor.moments` has it."""
+_HALF = 0.5
+"""Codes to which an offset is known whatever the noise hides."""
+_NODES = 9
+"""Offsets in place of all pixels', as Gauss and Hermite have them: exact to the seventeenth power of the spread."""
+_CUT = 1e-4
+"""Part of the numbers at the ADC's end from which a set does not count as below saturation."""
+_STEADY = 1e-5
+"""Least relative scatter that a lamp is taken to have: below what means of a million pixels tell."""
+_FITS = 2.0
+"""Chi-square over its degrees of freedom from which light is off by more than is known."""
+_TELLS = 9.0
+"""By how much less chi-square variances must have before they tell a bent camera from a drifting lamp: three standard
+errors."""
+_SATURATED = 0.05
+"""Part of the largest variance that light makes, below which the brightest frames are saturated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """Frames that were taken alike.
+
+    Attributes
+    ----------
+    light
+        that fell on a pixel, in photons or in any unit; 0 is dark.
+    exposure_s
+        of each.
+    said
+        their statistics.
+    """
+
+    light: float
+    exposure_s: float
+    said: Alike
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """The camera that explains means and variances.
+
+    Attributes
+    ----------
+    values, errors
+        (7,) by :data:`NAMES`, and their standard errors; an error of 0: not fitted.
+    saturation_dn
+        mean of saturated frames; None where no frame is.
+    saturates
+        whether that is the end of the full well and not of the ADC.
+    lamp
+        relative scatter of the light of sets about what their exposures say.
+    lamp_drifts
+        whether means rise with exposure otherwise than variances with means, so that the lamp or the exposures are off.
+    chi_square, freedom
+        of the fit: squares of what is left, and how many are free.
+    off
+        (sets,) by how many errors each set's variance is off; not a number where it was not used.
+    """
+
+    values: FloatArray
+    errors: FloatArray
+    saturation_dn: float | None
+    saturates: bool
+    lamp: float
+    lamp_drifts: bool
+    chi_square: float
+    freedom: int
+    off: FloatArray
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[NAMES.index(name)])
+
+    def error(self, name: str) -> float:
+        """Standard error of the number of that ``name``."""
+        return float(self.errors[NAMES.index(name)])
+
+
+def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
+    """Which set has the largest variance, and which one is saturated: the brightest, if its variance is small; or None.
+
+    The ``taken`` sets are in any order.
+    """
+    mean, variance = (
+        np.array([float(getattr(each.said.pair, name)) for each in taken]) for name in ("mean", "variance")
+    )
+    lit = np.flatnonzero([each.light > 0 for each in taken])
+    still = variance[[not each.light for each in taken]].min()
+    peak, last = lit[variance[lit].argmax()], lit[mean[lit].argmax()]
+    return int(peak), int(last) if variance[last] - still < _SATURATED * (variance[peak] - still) else None
+
+
+def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
+    """Which of the ``taken`` sets tell nonuniformity: one in the dark, and one under light of its exposure.
+
+    Under light that of most frames between three and seven tenths of saturation, or of the brightest; of several the
+    nearest to half.
+    """
+    mean = np.array([float(each.said.pair.mean) for each in taken])
+    dark = [index for index, each in enumerate(taken) if not each.light]
+    lit = [index for index, each in enumerate(taken) if each.light and each.said.cut[1] < _CUT]
+    floor, full = mean[dark].min(), mean[saturation_of(taken)[0]]
+    part = (mean - floor) / max(full - floor, 1e-9)
+    near = [index for index in lit if 0.3 <= part[index] <= MOST_FITTED] or lit
+    bright = max(near, key=lambda index: (taken[index].said.count, -abs(part[index] - 0.5)))
+    time = taken[bright].exposure_s
+    return min(dark, key=lambda index: (abs(taken[index].exposure_s - time), -taken[index].said.count)), bright
+
+
+def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: float = 0.0) -> Transfer:
+    """The camera that explains the ``taken`` sets.
+
+    Parameters
+    ----------
+    taken
+        sets of frames, a dark one among them.
+    bits
+        of the ADC; None: real numbers.
+    dead
+        part of the pixels that do not respond.
+    spread
+        standard deviation of the pixels' offsets [DN].
+    """
+    problem = _Problem.of(taken, bits, dead, spread)
+    steady = problem.begin()
+    if steady.light_chi_square <= _FITS * max(steady.lit - 2, 1) or steady.lit < 4:
+        return steady.transfer(drifts=False)
+    bent = problem.settle(problem.solve(bend=True, lamp=problem.lamp))
+    wide = problem.settle(steady)
+    told = bent.variance_chi_square - wide.variance_chi_square
+    smooth = bent.lamp < wide.lamp / 2
+    if smooth and told < _TELLS:
+        return bent.transfer(drifts=False)
+    return wide.transfer(drifts=smooth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """What a fit came to: parameters, their covariance, and squares of what is left, of variances and of light."""
+
+    problem: _Problem
+    values: FloatArray
+    covariance: FloatArray
+    bend: bool
+    lamp: float
+    scatter: float
+    rest: FloatArray
+    freedom: int
+
+    @property
+    def lit(self) -> int:
+        """Lit sets that were used."""
+        return int(np.count_nonzero(self.problem.light))
+
+    @property
+    def chi_square(self) -> float:
+        """Of all that is left."""
+        return float(np.square(self.rest).sum())
+
+    @property
+    def variance_chi_square(self) -> float:
+        """Of the lit sets' variances."""
+        count = len(self.problem.light)
+        return float(np.square(self.rest[count : 2 * count][self.problem.light > 0]).sum())
+
+    @property
+    def light_chi_square(self) -> float:
+        """Of the lit sets' means, and of how far their light is off."""
+        count = len(self.problem.light)
+        return float(
+            np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
+        )
+
+    def transfer(self, drifts: bool) -> Transfer:
+        problem = self.problem
+        worse = math.sqrt(max(self.chi_square / self.freedom, 1.0)) if self.freedom > 0 else 1.0
+        off = np.full(len(problem.used), np.nan)
+        off[problem.used] = self.rest[len(problem.light) : 2 * len(problem.light)]
+        return Transfer(
+            self.values, np.sqrt(np.diagonal(self.covariance)) * worse, problem.saturation_dn, problem.saturates,
+            self.lamp, drifts, self.chi_square, self.freedom, off,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Sets below saturation, as arrays (count,) each, and where the others say that saturation is."""
+
+    light: FloatArray
+    time: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    mean_error: FloatArray
+    variance_error: FloatArray
+    spread: float
+    dead: float
+    bits: int | None
+    saturation_dn: float | None
+    saturates: bool
+    lamp: float
+    used: np.ndarray
+    start: FloatArray
+
+    @classmethod
+    def of(cls, taken: Sequence[Taken], bits: int | None, dead: float, spread: float) -> _Problem:
+        pairs = [each.said.pair for each in taken]
+        light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
+        mean, variance = (np.array([float(getattr(pair, name)) for pair in pairs]) for name in ("mean", "variance"))
+        dark = float(mean[light == 0].min())
+        peak, last = saturation_of(taken)
+        used = np.array([each.said.cut[1] < _CUT for each in taken]) | (light == 0)
+        if last is not None:
+            used &= (light == 0) | (mean - dark <= MOST_FITTED * (mean[peak] - dark))
+        top = math.inf if bits is None else 2.0**bits - 1
+        saturation = None if last is None else float(mean[last] - dead * dark) / (1 - dead)
+        lamp = [
+            (each.said.flicker / max(float(each.said.pair.mean) - dark, 1e-9)) ** 2 / each.said.count
+            for each, lit in zip(taken, used & (light > 0), strict=True) if lit
+        ]  # fmt: skip
+        errors = np.array([(each.said.mean_error, each.said.variance_error) for each in taken])
+        # A set without any noise, of which few codes leave nothing, is known to a code's rounding.
+        least = 1e-3 if bits is not None else 1e-6 * max(dark, 1.0)
+        # Offsets matter where an end of the ADC or its steps hide part of the noise: elsewhere moments are straight.
+        hidden = bits is not None and (
+            variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100
+        )
+        found = cls(
+            light[used], time[used], mean[used], variance[used], np.maximum(errors[used, 0], least / 10),
+            np.maximum(errors[used, 1], least), spread if hidden else 0.0, dead, bits, saturation,
+            saturation is not None and saturation < top - 1, max(math.sqrt(np.mean(lamp)) if lamp else 0.0, _STEADY),
+            used, np.zeros(len(NAMES)),
+        )  # fmt: skip
+        return replace(found, start=found._start())
+
+    def _start(self) -> FloatArray:
+        """Numbers near enough to begin at: lines through what is not cut."""
+        lit = self.light > 0
+        dark = ~lit
+        first = int(np.argmin(np.where(dark, self.time, np.inf)))
+        signal, noise = self.mean[lit], self.variance[lit]
+        if np.count_nonzero(lit) > 1:
+            gain = float(np.polyfit(signal, noise, 1, w=1 / self.variance_error[lit])[0])
+        else:
+            gain = 0.0
+        if not gain > 0:
+            gain = max(float((noise.sum() - self.variance[first]) / max((signal - self.mean[first]).sum(), 1e-9)), 1e-9)
+        response = (
+            float((self.light[lit] * (signal - self.mean[first])).sum() / np.square(self.light[lit]).sum()) / gain
+        )
+        times, current = self.time[dark], 0.0
+        if np.ptp(times) > 0:
+            current = max(float(np.polyfit(times, self.mean[dark], 1)[0]) / gain, 0.0)
+        read = math.sqrt(max(float(self.variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
+        return np.array([gain, read, self.mean[first], current, max(response, 1e-12), 0.0, 0.0])
+
+    def moments(self, values: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Expected means and variances [DN], averaged over the pixels, of light ``scale`` times that stated."""
+        gain, read, black, current, response, *bends = (float(value) for value in values)
+        gain = max(gain, 1e-12)
+        end = self.saturation_dn if self.saturates else None
+        if end is None and self.bits is not None:
+            end = 2.0**self.bits - 1
+        bends = bends if any(bends) else []
+        full = math.inf if end is None else max((end - black) / gain / (1 + sum(bends)), 1.0)
+        model = _BASE.model_copy(
+            update={
+                "gain_dn_per_e": gain, "read_noise_e": abs(read) / gain, "black_level_dn": black, "bits": self.bits,
+                "full_well_e": full, "linearity": tuple(bends) if math.isfinite(full) else (),
+            }
+        )  # fmt: skip
+        leak = np.maximum(current, 0.0) * self.time
+        lit, noise = self._average(np.maximum(response * self.light * scale, 0.0) + leak, model)
+        if not self.dead:
+            return lit, noise
+        still, rest = self._average(leak, model)
+        return (1 - self.dead) * lit + self.dead * still, (1 - self.dead) * noise + self.dead * rest
+
+    def _average(self, electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
+        """Moments of pixels whose offsets are spread: an offset is another black level."""
+        if not self.spread:
+            return frame_moments(electrons, 0.0, model)
+        places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+        mean, variance = np.zeros_like(electrons), np.zeros_like(electrons)
+        for place, weight in zip(places, weights / weights.sum(), strict=True):
+            moved = model.model_copy(update={"black_level_dn": model.black_level_dn + place * self.spread})
+            first, second = frame_moments(electrons, 0.0, moved)
+            mean += weight * first
+            variance += weight * second
+        return mean, variance
+
+    def begin(self) -> _Solution:
+        """The fit of a linear camera, from other numbers too where the first ones lead nowhere: of few codes, variances
+        rise and fall with the mean."""
+        best = self.solve(bend=False, lamp=self.lamp)
+        for part in _STARTS if self.variance.min() < _DITHERED else ():
+            if best.chi_square <= _FITS * max(best.freedom, 1):
+                break
+            start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
+            best = min(
+                best, replace(self, start=start).solve(bend=False, lamp=self.lamp), key=lambda each: each.chi_square
+            )
+        return best
+
+    def settle(self, solution: _Solution) -> _Solution:
+        """The ``solution`` with the lamp's scatter as large as light is off."""
+        for _ in range(3):
+            if solution.light_chi_square <= _FITS * max(solution.lit - 2, 1):
+                break
+            solution = self.solve(solution.bend, max(solution.scatter, 1.5 * solution.lamp))
+        return solution
+
+    def solve(self, bend: bool, lamp: float) -> _Solution:
+        """Least squares of means, variances, and of how far each set's light is off, of a ``lamp`` of such scatter."""
+        count, lit = len(self.light), self.light > 0
+        lights = int(np.count_nonzero(lit))
+        free = np.array([True, True, True, np.ptp(self.time[~lit]) > 0, lights > 0, bend, bend])
+        fixed = self.start.copy()
+        fixed[3] = fixed[3] if free[3] else 0.0
+
+        def take_apart(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            values, scale = fixed.copy(), np.ones(count)
+            values[free] = x[: free.sum()]
+            scale[lit] += lamp * x[free.sum() :]
+            return values, scale
+
+        def rest(x: FloatArray) -> FloatArray:
+            values, scale = take_apart(x)
+            mean, variance = self.moments(values, scale)
+            return np.concatenate([
+                (self.mean - mean) / self.mean_error, (self.variance - variance) / self.variance_error,
+                x[free.sum() :],
+            ])  # fmt: skip
+
+        def slopes(x: FloatArray) -> FloatArray:
+            here, found = rest(x), np.zeros((2 * count + lights, len(x)))
+            sizes = np.maximum(np.abs(fixed) * _STEPS, _LEAST_STEPS)
+            for column, index in enumerate(np.flatnonzero(free)):
+                step = max(abs(x[column]) * _STEPS[index], _LEAST_STEPS[index], sizes[index] * 1e-3)
+                moved = x.copy()
+                moved[column] += step
+                found[:, column] = (rest(moved) - here) / step
+            # Light of one set moves that set alone, so all are moved at once.
+            moved = x.copy()
+            size = 1e-3 / max(lamp, 1e-3)
+            moved[free.sum() :] += size
+            change = (rest(moved) - here) / size
+            for column, index in enumerate(np.flatnonzero(lit), free.sum()):
+                found[[index, count + index], column] = change[[index, count + index]]
+                found[2 * count + column - free.sum(), column] = 1.0
+            return found
+
+        begin = np.concatenate([fixed[free], np.zeros(lights)])
+        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=60)
+        values, scale = take_apart(solved.x)
+        normal = solved.jac.T @ solved.jac
+        # Of what few codes hide, readings in the dark are known to half a code all the same.
+        span, code = float(np.ptp(self.time[~lit])), max(_HALF, values[1])
+        known = np.zeros((5, len(NAMES)))
+        known[0, [0, 3]] = np.array([values[3], values[0]]) * span / code
+        known[[1, 2, 3, 4], [1, 2, 5, 6]] = 1 / code, 1 / code, 1.0, 1.0
+        normal[: free.sum(), : free.sum()] += known[:, free].T @ known[:, free]
+        size = np.sqrt(np.diagonal(normal))
+        inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size)
+        covariance = np.zeros((len(NAMES), len(NAMES)))
+        covariance[np.ix_(free, free)] = inverse[: free.sum(), : free.sum()]
+        values[1] = abs(values[1])
+        # Means that are off tell of the lamp too: both parts of how far light is off.
+        left = (scale - 1)[lit] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
+            self.mean[lit] - values[2], 1e-9
+        )
+        scatter = float(np.sqrt(np.square(left).sum() / max(lights - 1 - 2 * bend, 1)))
+        freedom = 2 * count - int(free.sum())
+        return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun, freedom)
+
+
+_BASE = SensorModel(
+    name="fitted", pixel_pitch_um=1.0, full_well_e=math.inf, read_noise_e=0.0, gain_dn_per_e=1.0, source="frames"
+)

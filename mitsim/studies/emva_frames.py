@@ -1,0 +1,319 @@
+"""A camera in, which frames a characterisation takes of it out, and what they are expected to say.
+
+The frames are those that a test bench takes: pairs under even light from dark to beyond saturation, pairs in the dark
+over a series of exposures, and stacks in the dark and at half of saturation. Those of a real camera are as its list
+says. Closed-form moments (`mitsim.sensor.moments`) tell what a statistic is expected to be, and how far it may be off.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.job import Job
+from mitsim.core.parallel import in_threads
+from mitsim.core.seeds import stream
+from mitsim.devices.sensor import EXPOSURE_S, SensorModel
+from mitsim.sensor import emva
+from mitsim.sensor.chain import expose
+from mitsim.sensor.emva import Session
+from mitsim.sensor.moments import frame_moments
+from mitsim.sensor.photon_transfer import Taken, nonuniform, saturation_of
+from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
+from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
+
+_TO = 1.15
+"""Light of the brightest step over what saturates: 7 steps of 50 are saturated, so the largest variance is inside."""
+_DARK_STEPS = 6
+"""Exposures of the dark series: the least that EMVA 1288 4.0 takes."""
+_DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
+"""Dark electrons at the longest of them: a part of saturation, or as many as tell the current to a permille."""
+_LONGEST_S = 10.0
+"""Of a camera without dark current [s]."""
+_FILLED_BY_DARK = 0.01
+"""Part of saturation that dark current may fill at the ladder's exposure."""
+_SESSIONS = 1000
+"""Drawn statistics of sessions: they tell a standard error to 2 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Which frames are taken of a camera, in S sets; those of a set alike.
+
+    Attributes
+    ----------
+    sensor
+        of what.
+    shape
+        rows and columns.
+    light
+        (S,) on a pixel, in photons or in any unit; 0 in the dark.
+    electrons
+        (S,) the same in photoelectrons.
+    exposure_s
+        (S,) of each [s].
+    counts
+        (S,) frames of each.
+    dark, bright
+        which sets tell nonuniformity.
+    saturates
+        whether the brightest set is saturated.
+    seed
+        root of every draw.
+    """
+
+    sensor: SensorModel
+    shape: tuple[int, int]
+    light: FloatArray
+    electrons: FloatArray
+    exposure_s: FloatArray
+    counts: npt.NDArray[np.intp]
+    dark: int
+    bright: int
+    saturates: bool = True
+    seed: int = 0
+
+    @classmethod
+    def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> Frames:
+        """Those that a camera is characterised by.
+
+        Parameters
+        ----------
+        sensor, procedure
+            of what, and how.
+        capacity
+            electrons that saturate a pixel.
+        """
+        steps = capacity * _TO * np.arange(1, procedure.steps + 1) / procedure.steps
+        hottest = (
+            sensor.binning**2 * sensor.dark_factor * (sensor.dark_current_e_per_s + sensor.hot_dark_current_e_per_s)
+        )
+        mean = mean_dark_current(sensor)
+        longest = min(_DARK_FILL * capacity / hottest, _DARK_ELECTRONS / mean) if hottest else _LONGEST_S
+        longest = min(max(longest, EXPOSURE_S[0] * _DARK_STEPS), EXPOSURE_S[1])
+        exposure_s = min(0.01, _FILLED_BY_DARK * capacity / hottest) if hottest else 0.01
+        times = longest * np.arange(_DARK_STEPS) / (_DARK_STEPS - 1)
+        beyond = 2 * capacity + 20 * math.sqrt(capacity)
+        electrons = np.concatenate([steps, [beyond, capacity / 2, 0.0], np.zeros(_DARK_STEPS)])
+        exposures = np.concatenate([np.full(procedure.steps + 3, exposure_s), times])
+        counts = np.full(len(electrons), 2)
+        bright = procedure.steps + 1
+        counts[[bright, bright + 1]] = procedure.frames
+        side, light = (procedure.pixels, procedure.pixels), electrons / efficiency_of(sensor, procedure)
+        return cls(sensor, side, light, electrons, exposures, counts, bright + 1, bright, seed=procedure.seed)
+
+    @classmethod
+    def as_taken(cls, taken: list[Taken], sensor: SensorModel, response: float) -> Frames:
+        """Those of a real camera.
+
+        Parameters
+        ----------
+        taken
+            sets of its frames.
+        sensor
+            the camera that was found in them.
+        response
+            its photoelectrons for a unit of light.
+        """
+        light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
+        counts = np.array([each.said.count for each in taken])
+        places = nonuniform(taken)
+        return cls(
+            sensor,
+            taken[0].said.shape,
+            light,
+            response * light,
+            time,
+            counts,
+            *places,
+            saturation_of(taken)[1] is not None,
+        )
+
+    @property
+    def efficiency(self) -> float:
+        """Photoelectrons for a unit of light."""
+        brightest = int(self.light.argmax())
+        return float(self.electrons[brightest] / self.light[brightest])
+
+    @property
+    def ladder_of_exposures(self) -> bool:
+        """Whether light varies by exposure: noise in the dark is then that at no exposure."""
+        return len(np.unique(self.exposure_s[self.light > 0])) >= emva.LINE
+
+    @property
+    def brightest_s(self) -> float:
+        """Exposure of the brightest set [s]."""
+        return float(self.exposure_s[int(self.light.argmax())])
+
+    @property
+    def step(self) -> float:
+        """Electrons between the set nearest to saturation and the one before it."""
+        levels = np.unique(self.electrons)
+        capacity = capacity_of(self.sensor)
+        return float(np.diff(levels)[np.searchsorted(levels[1:-1], capacity)])
+
+    def images(self, index: int) -> Iterator[FloatArray]:
+        """Frames of the set of that ``index``, one after the other."""
+        for number in range(self.counts[index]):
+            shot, read = (stream(self.seed, "characterise", noise, index, number) for noise in ("shot", "read"))
+            light = np.full(self.shape, self.electrons[index])
+            yield np.asarray(expose(light, float(self.exposure_s[index]), self.sensor, shot, read), dtype=np.float64)
+
+    def take(self, job: Job) -> list[Taken]:
+        """What the frames say, of all sets; ``job`` is told how far it is."""
+        largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
+        job.progress("frames", 0.0)
+        with job.clock.stage("frames"):
+            said = in_threads(lambda index: emva.alike(self.images(index), largest), range(len(self.light)))
+        return [
+            Taken(float(light), float(time), each)
+            for light, time, each in zip(self.light, self.exposure_s, said, strict=True)
+        ]
+
+    def session(self, taken: list[Taken]) -> Session:
+        """The statistics of sets that were ``taken``, for figures."""
+        return self._session(
+            emva.pairs_of([each.said.pair for each in taken]),
+            taken[self.dark].said.stack,
+            taken[self.bright].said.stack,
+        )
+
+    def expect(self) -> Session:
+        """The same statistics as closed forms expect them of all specimens; nonuniformity as it was set."""
+        pairs = emva.pairs_of([self._expected_pair(index) for index in range(len(self.light))])
+        stacks = (self._expected_stack(pairs.mean[index], index) for index in (self.dark, self.bright))
+        return self._session(pairs, *stacks)
+
+    def _session(self, pairs: emva.Pair, dark: emva.Stack, bright: emva.Stack) -> Session:
+        rounded = self.sensor.bits is not None
+        return Session(
+            self.shape,
+            self.light,
+            self.exposure_s,
+            pairs,
+            self.dark,
+            self.bright,
+            dark,
+            bright,
+            self.saturates,
+            rounded,
+        )
+
+    def _expected_pair(self, index: int) -> emva.Pair:
+        time, light = float(self.exposure_s[index]), np.array([self.electrons[index], 0.0])
+        mean, variance = frame_moments(light, time, self.alike)
+        dead = self.sensor.dead_pixels
+        rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
+        lit = [np.asarray((1 - dead) * part[0] + dead * part[1]) for part in (mean, variance)]
+        return emva.Pair(*lit, np.minimum(rows, lit[1]))
+
+    def _expected_stack(self, mean: FloatArray, index: int) -> emva.Stack:
+        rows, columns, pixel = (self.slope(self.electrons[index]) ** 2 * part for part in self.parts(index))
+        m, n = self.shape
+        parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
+        return emva.Stack(mean, *(np.asarray(part) for part in parts))
+
+    @property
+    def alike(self) -> SensorModel:
+        """The sensor with pixels that are all alike, of the same mean dark current, lit evenly."""
+        names = (
+            *(f"dsnu_{part}_e" for part in emva.SPLIT[1:]),
+            *(f"prnu_{part}" for part in emva.SPLIT[1:]),
+            *("dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk"),
+        )
+        mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
+        return self.sensor.model_copy(update={**dict.fromkeys(names, 0.0), "dark_current_e_per_s": mean})
+
+    def slope(self, electrons: float) -> float:
+        """Digital numbers for another electron, around so many ``electrons``."""
+        if not self.sensor.linearity:
+            return self.sensor.gain_dn_per_e
+        around = np.array([electrons * 0.999, electrons * 1.001 + 1])
+        mean, _ = frame_moments(around, float(self.exposure_s[self.dark]), self.alike)
+        return float(np.diff(mean)[0] / np.diff(around)[0])
+
+    def parts(self, index: int) -> tuple[float, float, float]:
+        """Set spatial variances by row, column and pixel [e-^2] in the set of that ``index``."""
+        pixel, row, column = (part**2 for part in self.sensor.offset_parts)
+        dark = dark_current_variance(self.sensor) * float(self.exposure_s[index]) ** 2
+        _, row_response, column_response = (part**2 for part in self.sensor.response_parts)
+        own = response_variance(self.sensor) - row_response - column_response
+        light = float(self.electrons[index]) ** 2
+        return row + row_response * light, column + column_response * light, pixel + dark + own * light
+
+
+def draw_sessions(frames: Frames, expected: Session) -> Session:
+    """Statistics of :data:`_SESSIONS` sessions, each as far off the ``expected`` ones of ``frames`` as noise and
+    specimen make them.
+
+    A variance of n pixels in L frames whose rows share v_r of v has the variance (2 v_o^2/(L-1) + k_4/L)/n + (4 v_o
+    v_r/n + 2 v_r^2/M)/(L-1), v_o = v - v_r, k_4 = K^4 mu the fourth cumulant of the counts, dark ones among them.
+    """
+    sensor, rng = frames.sensor, stream(frames.seed, "characterise", "sessions")
+    m, n = frames.shape
+    gain, (pixel, row, column) = sensor.gain_dn_per_e, sensor.response_parts
+    response = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(row**2 / m + column**2 / n + pixel**2 / m / n)
+    leak = rng.standard_normal((_SESSIONS, 1)) * math.sqrt(dark_current_variance(sensor) / m / n)
+    mean, variance, rows = (part[None, :] for part in vars(expected.pairs).values())
+    own, count, more = variance - rows, frames.counts, frames.counts - 1
+    z = rng.standard_normal((4, _SESSIONS, mean.shape[1]))
+    specimen = gain * (frames.electrons * response + frames.exposure_s * leak) * (own > 0)
+    fourth = gain**4 * (frames.electrons + mean_dark_current(sensor) * frames.exposure_s) / count
+    spread = (2 * own**2 / more + fourth + 4 * own * rows / more) / m / n
+    shared = np.sqrt(2.0 / m / more) * rows * z[2]
+    alone = np.sqrt(2.0 / m / more) * own / n * z[3]
+    pairs = emva.Pair(
+        mean + specimen + z[0] * np.sqrt((own / m / n + rows / m) / count),
+        variance + np.sqrt(spread) * z[1] + shared,
+        rows + shared + alone,
+    )
+    return replace(expected, pairs=pairs, **_drawn_stacks(frames, expected, rng))
+
+
+def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> dict[str, emva.Stack]:
+    """Dark and bright stacks as they may come out: sums of squares of offsets, responses and what is left of noise.
+
+    By row, column and pixel these are independent; of f degrees of freedom, squares are chi-square and products of two
+    parts normal. Offsets are the same in both stacks.
+    """
+    m, n = frames.shape
+    places = frames.dark, frames.bright
+    noise, counts = expected.pairs.variance[[*places]], frames.counts[[*places]]
+    shared = min(float(expected.pairs.rows[frames.dark]), *noise)
+    sizes = {"row": (m - 1, n), "column": (n - 1, m), "pixel": ((m - 1) * (n - 1), 1)}
+    squares: dict[str, list[FloatArray]] = {}
+    dark, bright = (frames.parts(index) for index in places)
+    slope = frames.slope(float(frames.electrons[frames.bright]))
+    for index, (name, (freedom, averaged)) in enumerate(sizes.items()):
+        of_pixel = dark[2] / averaged if averaged > 1 else 0.0
+        offset = (dark[index] + of_pixel) * frames.slope(0.0) ** 2
+        light = bright[index] - dark[index] + ((bright[2] - dark[2]) / averaged if averaged > 1 else 0.0)
+        light *= slope**2
+        left = ((noise - shared) / averaged + (shared if name == "row" else 0.0)) / counts
+        parts = np.sqrt([offset, light, *left])
+        products = _products(freedom, len(parts), rng)
+        squares[name] = [
+            freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
+            for used in ([0, 2], [0, 1, 3])
+        ]
+    stacks = {}
+    for side, name in enumerate(("dark_stack", "bright_stack")):
+        row, column, pixel = (squares[part][side] for part in ("row", "column", "pixel"))
+        total = (row * n + column * m + pixel) / (m * n - 1)
+        mean = np.full(_SESSIONS, float(getattr(expected, name).mean))
+        taken = noise[side] / counts[side]
+        stacks[name] = emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m)
+    return stacks
+
+
+def _products(freedom: int, count: int, rng: np.random.Generator) -> FloatArray:
+    """(count, count, sessions) mean products of as many independent normal samples of some degrees of ``freedom``."""
+    products = rng.standard_normal((count, count, _SESSIONS)) / math.sqrt(freedom)
+    products = (products + products.transpose(1, 0, 2)) / math.sqrt(2)
+    products[np.arange(count), np.arange(count)] = rng.chisquare(freedom, (count, _SESSIONS)) / freedom
+    return np.asarray(products)

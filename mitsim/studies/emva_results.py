@@ -1,0 +1,344 @@
+"""What a characterisation found: figures of EMVA 1288 beside those set, and the camera that explains the frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.sensor import SensorModel
+from mitsim.report.pages import round_to_error
+from mitsim.sensor import emva
+from mitsim.sensor.emva import Session
+from mitsim.sensor.found_camera import FoundCamera
+from mitsim.sensor.specimen import mean_dark_current
+from mitsim.studies.emva_frames import Frames
+from mitsim.studies.emva_options import capacity_of
+from mitsim.studies.framework.page import text_table
+
+UNITS: Mapping[str, tuple[str, str]] = {
+    "system_gain": ("K", "DN/e-"),
+    "quantum_efficiency": ("eta", "e-/photon"),
+    "dark_noise": ("sigma_d", "e-"),
+    "row_noise": ("sigma_row", "e-"),
+    "saturation_capacity": ("mu_e.sat", "e-"),
+    "full_well": ("F", "e-"),
+    "linearity_min": ("LE_min", "%"),
+    "linearity_max": ("LE_max", "%"),
+    "dark_current": ("mu_I.mean", "e-/s"),
+    "dark_current_by_variance": ("mu_I.var", "e-/s"),
+    **{f"dsnu_{part}": (f"DSNU1288.{part}", "e-") for part in emva.SPLIT},
+    **{f"prnu_{part}": (f"PRNU1288.{part}", "%") for part in emva.SPLIT},
+}
+"""Symbol of the standard, and unit, of each figure in the order in which they are shown."""
+_SQUARES = ("row_noise", "dsnu", "prnu")
+"""Figures that are found as variances, which may be below zero, and shown as their roots."""
+FIELDS: Mapping[str, str] = {
+    "gain_dn_per_e": "DN/e-",
+    "quantum_efficiency": "e-/photon",
+    "read_noise_e": "e-",
+    "row_noise_e": "e-",
+    "black_level_dn": "DN",
+    "full_well_e": "e-",
+    "dark_current_e_per_s": "e-/s",
+    "dark_current_spread_e_per_s": "e-/s",
+    **{f"dsnu_{part}_e": "e-" for part in emva.SPLIT[1:]},
+    **{f"prnu_{part}": "1" for part in emva.SPLIT[1:]},
+    "hot_pixels": "1",
+    "hot_dark_current_e_per_s": "e-/s",
+    "dead_pixels": "1",
+}
+"""Fields of a camera file that are measured, and their units."""
+_BIASED, _MISLEADS = 0.5, 1.0
+"""Standard errors by which the procedure's own bias by the ADC moves a figure, from which it is held against what is
+expected of it, and from which it is flagged: with less, 98 of 100 found figures are still within three standard errors
+of the value set."""
+_DITHERED = 0.8
+"""Noise of reading [DN] below which rounding is named as the cause: above, it is white to 1e-5."""
+_CUT = 1e-3
+"""Part of the dark readings that are 0 from which these are named as the cause."""
+_BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
+"""Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
+MOST_OFF = 5.0
+"""Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure: what was set, what the procedure is expected to find where that differs (otherwise None), what it
+    found, its predicted standard error, by how many of these it is off, and by how many the ADC's ends and steps move
+    what is expected from what was set (0 where those are not at fault)."""
+
+    name: str
+    symbol: str
+    unit: str
+    set: float
+    expected: float | None
+    found: float
+    standard_error: float
+    deviations: float
+    bias: float = 0.0
+
+
+@dataclass(frozen=True)
+class FieldRow:
+    """One field of the camera that explains the frames: what a file sets, where there is one, what was found, its
+    standard error, and by how many of these it is off."""
+
+    name: str
+    unit: str
+    set: float | None
+    found: float
+    standard_error: float
+    deviations: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Characterisation:
+    """A camera's figures.
+
+    Attributes
+    ----------
+    camera
+        the camera's name.
+    frames
+        what was characterised, and in which frames; of a real camera it is the one that was found in them.
+    session, expected
+        what the frames said, and what closed forms expect of them.
+    rows
+        the figures.
+    found, fields
+        the camera that explains the frames, and its fields.
+    asked
+        what the request said, for JSON.
+    real
+        whether the frames are of a real camera.
+    about
+        what was noticed in the frames, and what is to be mended.
+    output
+        folder of JSON, plots and the camera file; None where none was asked for.
+    """
+
+    camera: str
+    frames: Frames
+    session: Session = field(repr=False)
+    expected: Session = field(repr=False)
+    rows: tuple[Row, ...]
+    found: FoundCamera
+    fields: tuple[FieldRow, ...]
+    asked: Mapping[str, Any]
+    real: bool = False
+    about: tuple[str, ...] = ()
+    output: str | None = None
+
+    @property
+    def sensor(self) -> SensorModel:
+        """What was characterised."""
+        return self.frames.sensor
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was noticed in real frames, figures that are off by more than five standard errors, and those that the
+        procedure cannot find."""
+        biased = [row for row in self.rows if abs(row.bias) > _MISLEADS]
+        off = [
+            f"{row.name}: found {row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off "
+            f"{row.set if row.expected is None else row.expected:.5g}; the procedure does not fit this camera"
+            for row in self.rows
+            if not abs(row.deviations) <= MOST_OFF
+        ]
+        off += [
+            f"{row.name} of the camera found: {row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors "
+            f"off {row.set:.5g}, which is set"
+            for row in self.fields
+            if row.deviations is not None and not abs(row.deviations) <= MOST_OFF
+        ]
+        if biased:
+            of = "the camera" if self.real else "what is set"
+            found = ", ".join(f"{row.name} {row.expected:.5g} {row.unit} for {row.set:.5g}" for row in biased)
+            off.insert(0, f"the procedure does not find {of}, but {found}: {self._cause}")
+        return (*self.about, *off)
+
+    @property
+    def _cause(self) -> str:
+        """Why the procedure's figures are biased, and what to do."""
+        sensor = self.frames.sensor
+        noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
+        cut = math.erfc((sensor.superpixel_black_level_dn - 0.5) / (noise * math.sqrt(2))) / 2 if noise else 0.0
+        if cut > _CUT:
+            return f"{cut:.2g} of all dark readings are 0 DN, which hides their noise; raise black_level_dn"
+        if noise < _DITHERED:
+            return (
+                f"rounding to whole DN is no noise of 1/12 DN^2 beside {noise:.2g} DN in the dark; raise gain_dn_per_e"
+            )
+        return "the ADC's ends or steps hide part of the noise; raise black_level_dn or lower gain_dn_per_e"
+
+    def payload(self) -> dict[str, Any]:
+        """What the command line reports as JSON."""
+        transfer = self.found.transfer
+        return {
+            "camera": self.camera,
+            **self.asked,
+            "exposure_s": float(self.frames.exposure_s[self.frames.dark]),
+            "figures": [asdict(row) for row in self.rows],
+            "camera_found": [asdict(row) for row in self.fields],
+            "light": {
+                "uneven": self.found.uneven, "scatter": transfer.lamp, "drifts": transfer.lamp_drifts,
+                "chi_square": transfer.chi_square, "freedom": transfer.freedom,
+            },
+            "notes": list(self.found.notes),
+            "warnings": list(self.warnings),
+            "output": self.output,
+        }  # fmt: skip
+
+    def lines(self) -> list[str]:
+        """For people."""
+        head = (
+            "figure",
+            "symbol",
+            "unit",
+            "camera" if self.real else "set",
+            "expected",
+            "found",
+            "std. error",
+            "off by",
+        )
+        rows = [
+            (
+                row.name, row.symbol, row.unit, f"{row.set:.5g}",
+                "" if row.expected is None else f"{row.expected:.5g}",
+                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
+                f"{row.deviations:.1f}",
+            )
+            for row in self.rows
+        ]  # fmt: skip
+        counts = self.frames.shape, len(self.session.lit), len(self.session.unlit)
+        (m, n), lit, unlit = counts
+        lines = [f"{self.camera}: {m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"]
+        lines += text_table(head, rows)
+        if any(row.expected is not None for row in self.rows):
+            figure = "the camera has" if self.real else "the one set"
+            lines.append(f"expected: where the procedure finds another figure than {figure}, at these steps and frames")
+        fields = [
+            (
+                row.name, row.unit, *(() if self.real else (f"{row.set:.5g}" if row.set is not None else "",)),
+                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
+                *(() if self.real else ("" if row.deviations is None else f"{row.deviations:.1f}",)),
+            )
+            for row in self.fields
+        ]  # fmt: skip
+        beside = ("set",) if not self.real else ()
+        head = ("camera found", "unit", *beside, "found", "std. error", *(("off by",) if beside else ()))
+        lines += ["", *text_table(head, fields), *self.found.notes]
+        if self.output:
+            lines.append(f"JSON, plots and the camera found, camera.toml: {self.output}")
+        return lines
+
+
+def _set(frames: Frames, name: str) -> float:
+    """What the camera's file sets of a figure ``name``; squares of those that are found as variances."""
+    sensor, time = frames.sensor, float(frames.exposure_s[frames.dark])
+    kind, _, part = name.partition("_")
+    if kind in ("dsnu", "prnu"):
+        row, column, pixel = frames.parts(frames.dark)
+        if kind == "prnu":
+            lit = frames.parts(frames.bright)
+            alive = float(frames.electrons[frames.bright]) * (1 - sensor.dead_pixels)
+            row, column, pixel = ((on - off) / alive**2 for on, off in zip(lit, (row, column, pixel), strict=True))
+        return {"total": row + column + pixel, "row": row, "column": column, "pixel": pixel}[part]
+    dark = mean_dark_current(sensor)
+    return {
+        "system_gain": sensor.gain_dn_per_e,
+        "quantum_efficiency": frames.efficiency * (1 - sensor.dead_pixels),
+        "dark_noise": math.sqrt(
+            sensor.superpixel_reading_noise_e**2 + (0.0 if frames.ladder_of_exposures else dark * time)
+        ),
+        "row_noise": sensor.superpixel_row_noise_e**2,
+        "saturation_capacity": capacity_of(sensor),
+        "full_well": (capacity_of(sensor) - dark * frames.brightest_s) * (1 - sensor.dead_pixels),
+        "linearity_min": 0.0,
+        "linearity_max": 0.0,
+        "dark_current": dark,
+        "dark_current_by_variance": dark,
+    }[name]
+
+
+def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> Row:
+    """A figure as it is shown.
+
+    Parameters
+    ----------
+    frames
+        that it was found in.
+    name
+        of the figure.
+    found
+        the figure.
+    sessions
+        (count,) the same of drawn sessions, which tell its error.
+    """
+    sensor = frames.sensor
+    value, spread, centre = float(found), float(sessions.std()), float(sessions.mean())
+    given = _set(frames, name)
+    # What the linear method makes of a camera that is not linear, and of rows that share noise, is not what is set.
+    method = name in _BY_METHOD or bool(sensor.linearity)
+    method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
+    bias = 0.0 if method or not spread or sensor.bits is None else (centre - given) / spread
+    method |= abs(bias) > _BIASED
+    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
+        bias = 0.0  # it is found as the standard's limit, as it should be
+    if name == "saturation_capacity":
+        spread = math.hypot(spread, frames.step / math.sqrt(12))
+    against = centre if method else given
+    off = (value - against) / spread if spread else 0.0 if value == against else math.inf
+    symbol, unit = UNITS[name]
+    scale = 100.0 if unit == "%" else 1.0
+    if name.startswith(_SQUARES):
+        root = math.sqrt(max(against, 0.0))
+        spread = spread / (2 * max(root, math.sqrt(spread))) if spread else 0.0
+        given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
+    expected = scale * centre if method else None
+    return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off, bias)
+
+
+def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, ...]:
+    """The fields of a camera that was ``found``, beside those of the ``model`` that took frames; None: not known."""
+    rows = []
+    for name, unit in FIELDS.items():
+        value, error = getattr(found.sensor, name), found.errors.get(name, 0.0)
+        if value is None or not math.isfinite(value):
+            continue
+        given = None if model is None else _set_field(model, name)
+        off = None if given is None or not error else (value - given) / error
+        rows.append(FieldRow(name, unit, given, value, error, off))
+    bends = zip(found.sensor.linearity, ("bend", "bend_2"), strict=False)
+    for power, (value, name) in enumerate(bends):
+        given = None if model is None else ([*model.linearity, 0.0, 0.0][power])
+        error = found.transfer.error(name)
+        rows.append(
+            FieldRow(f"linearity.{power}", "1", given, value, error, None if given is None else (value - given) / error)
+        )
+    return tuple(rows)
+
+
+def _set_field(model: SensorModel, name: str) -> float | None:
+    """What a ``model`` sets of a field of the camera whose pixels its superpixels are; None: no number."""
+    pixel, row, column = model.offset_parts
+    of_pixel, of_row, of_column = model.response_parts
+    defects = {kind: getattr(model, kind) for kind in ("hot_pixels", "dead_pixels", "hot_dark_current_e_per_s")}
+    known: dict[str, float | None] = {
+        "gain_dn_per_e": model.gain_dn_per_e,
+        "quantum_efficiency": model.quantum_efficiency,
+        "read_noise_e": model.superpixel_read_noise_e,
+        "row_noise_e": model.superpixel_row_noise_e,
+        "black_level_dn": model.superpixel_black_level_dn,
+        "full_well_e": capacity_of(model),
+        "dark_current_e_per_s": model.superpixel_dark_current_e_per_s,
+        "dark_current_spread_e_per_s": model.binning * model.dark_factor * model.dark_current_spread_e_per_s,
+        **dict(zip((f"dsnu_{part}_e" for part in emva.SPLIT[1:]), (row, column, pixel), strict=True)),
+        **dict(zip((f"prnu_{part}" for part in emva.SPLIT[1:]), (of_row, of_column, of_pixel), strict=True)),
+        **({} if model.binning > 1 else defects),
+    }
+    return known.get(name)
