@@ -241,8 +241,8 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     part = (means[peak] - min(means)) / (max(means) - min(means))
     if part < _PEAK:
         lines.append(
-            f"variances do not rise with means as those of counted electrons: the largest is at {100 * part:.0f} % of the "
-            "brightest signal; a gamma curve or compression does that, and no figure is the camera's"
+            f"variances do not rise with means as those of counted electrons: the largest is at {100 * part:.0f} % of "
+            "the brightest signal; a gamma curve or compression does that, and no figure is the camera's"
         )
     if transfer.lamp_drifts:
         lines.append(
