@@ -107,20 +107,20 @@ class Session:
     def lit(self) -> npt.NDArray[np.intp]:
         """Sets under light, by light."""
         order = np.argsort(self.photons, kind="stable")
-        return order[self.photons[order] > 0]
+        return np.asarray(order[self.photons[order] > 0])
 
     @property
     def unlit(self) -> npt.NDArray[np.intp]:
         """Sets in the dark, by exposure."""
         order = np.argsort(self.exposure_s, kind="stable")
-        return order[self.photons[order] == 0]
+        return np.asarray(order[self.photons[order] == 0])
 
     @property
     def partners(self) -> npt.NDArray[np.intp]:
         """For each set under light, one in the dark of its exposure: that of the nonuniformity where it is."""
         unlit = np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
         off = np.abs(self.exposure_s[unlit] - self.exposure_s[self.lit][:, None])
-        return unlit[off.argmin(axis=1)]
+        return np.asarray(unlit[off.argmin(axis=1)])
 
     def transfer(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the sets under light, by light: photons (L,), and signal (..., L) [DN] and variance
@@ -181,7 +181,8 @@ def alike(frames: Iterable[npt.ArrayLike], largest: float = math.inf) -> Alike:
         code of the ADC's end.
     """
     means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
-    first = total = squares = last = difference = np.zeros((0, 0))
+    first: FloatArray = np.zeros((0, 0))
+    total = squares = last = difference = first
     for frame in frames:
         values = np.asarray(frame, dtype=np.float64)
         if not means:

@@ -221,7 +221,7 @@ def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: flo
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
     about = np.where(without, 0.0, image - middle_of(image, without))
-    total = float(np.square(about).sum()) / (max(np.count_nonzero(~without), 2) - 1) - noise
+    total = float(np.square(about).sum()) / (max(int(np.count_nonzero(~without)), 2) - 1) - noise
     row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
     row -= (noise - rows) / n + rows
     column -= (noise - rows) / m

@@ -380,7 +380,7 @@ class _Problem:
             return found
 
         begin = np.concatenate([fixed[free], np.zeros(lights)])
-        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=60)
+        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=25)
         values, scale = take_apart(solved.x)
         normal = solved.jac.T @ solved.jac
         # Of what few codes hide, readings in the dark are known to half a code all the same.

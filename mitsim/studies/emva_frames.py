@@ -210,7 +210,7 @@ class Frames:
         dead = self.sensor.dead_pixels
         rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
         lit = [np.asarray((1 - dead) * part[0] + dead * part[1]) for part in (mean, variance)]
-        return emva.Pair(*lit, np.minimum(rows, lit[1]))
+        return emva.Pair(lit[0], lit[1], np.minimum(rows, lit[1]))
 
     def _expected_stack(self, mean: FloatArray, index: int) -> emva.Stack:
         rows, columns, pixel = (self.slope(self.electrons[index]) ** 2 * part for part in self.parts(index))
@@ -272,10 +272,11 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
         variance + np.sqrt(spread) * z[1] + shared,
         rows + shared + alone,
     )
-    return replace(expected, pairs=pairs, **_drawn_stacks(frames, expected, rng))
+    dark, bright = _drawn_stacks(frames, expected, rng)
+    return replace(expected, pairs=pairs, dark_stack=dark, bright_stack=bright)
 
 
-def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> dict[str, emva.Stack]:
+def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> list[emva.Stack]:
     """Dark and bright stacks as they may come out: sums of squares of offsets, responses and what is left of noise.
 
     By row, column and pixel these are independent; of f degrees of freedom, squares are chi-square and products of two
@@ -301,13 +302,13 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
             freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
             for used in ([0, 2], [0, 1, 3])
         ]
-    stacks = {}
+    stacks = []
     for side, name in enumerate(("dark_stack", "bright_stack")):
         row, column, pixel = (squares[part][side] for part in ("row", "column", "pixel"))
         total = (row * n + column * m + pixel) / (m * n - 1)
         mean = np.full(_SESSIONS, float(getattr(expected, name).mean))
         taken = noise[side] / counts[side]
-        stacks[name] = emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m)
+        stacks.append(emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
     return stacks
 
 

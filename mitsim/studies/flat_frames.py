@@ -39,6 +39,9 @@ _STEADY = 0.01
 """Part of the light by which sets may be off what their exposures say before it is said."""
 _STRAIGHT = 0.05
 """Part of a variance by which it may be off what the camera explains before it is said."""
+_PEAK = 0.6
+"""Part of the brightest signal at which a camera's variance is largest at least: cameras reach it at 0.8 or later, and
+charge that is held at a soft full well somewhat before."""
 _FLOATS = 9
 """Arrays of the frame's size in double precision that are held for a set; counted."""
 
@@ -232,6 +235,14 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
             f"{100 * part:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are "
             "widened by "
             f"{math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1)):.2g}"
+        )
+    peak, _ = saturation_of([each.taken for each in sets])
+    means = [float(each.taken.said.pair.mean) for each in sets]
+    part = (means[peak] - min(means)) / (max(means) - min(means))
+    if part < _PEAK:
+        lines.append(
+            f"variances do not rise with means as those of counted electrons: the largest is at {100 * part:.0f} % of "
+            "the brightest signal; a gamma curve or compression does that, and no figure is the camera's"
         )
     if transfer.lamp_drifts:
         lines.append(
