@@ -228,19 +228,9 @@ def _neighbours(noise: FloatArray) -> tuple[float, float]:
     return float((noise[:, 1:] * noise[:, :-1]).mean()) / power, float((noise[1:] * noise[:-1]).mean()) / power
 
 
-def pair_of(first: npt.ArrayLike, second: npt.ArrayLike) -> Pair:
-    """Temporal statistics of two frames, ``first`` and ``second`` (M, N) [DN]."""
-    return alike((first, second)).pair
-
-
 def pairs_of(pairs: Sequence[Pair]) -> Pair:
     """``pairs`` side by side, (count,) each."""
     return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
-
-
-def stack_of(frames: Iterable[npt.ArrayLike]) -> Stack:
-    """Spatial statistics of the mean of ``frames`` (M, N) [DN]; what temporal noise leaves in it is taken off."""
-    return alike(frames).stack
 
 
 def figures(session: Session) -> dict[str, FloatArray]:

@@ -67,11 +67,8 @@ class FlatSet:
 
     def mean_image(self) -> FloatArray:
         """Mean of its frames (M, N) [DN]; they are read again."""
-        total: FloatArray | None = None
-        for _, values in _numbers(self.flats, self.listed):
-            total = values.astype(np.float64) if total is None else total + values
-        assert total is not None
-        return total / len(self.listed.files)
+        total = 0.0 + sum(values.astype(np.float64) for _, values in _numbers(self.flats, self.listed))
+        return np.asarray(total / len(self.listed.files))
 
     @property
     def name(self) -> str:

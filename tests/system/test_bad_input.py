@@ -105,7 +105,7 @@ def test_render_refuses(refused: Refused, lab: Any, options: list[str], fragment
         (["--lambda", "nan"], ["--lambda nan"]),
         (["--lambda", "inf"], ["--lambda inf"]),
         (["--lambda", "small"], ["'small'", "auto"]),
-        (["--method", "wiener"], ["'wiener'", "markov or tv"]),
+        (["--method", "wiener"], ["'wiener'", "tikhonov, markov, nonnegative or tv"]),
         (["--method", "tv", "--lambda", "-1"], ["--lambda -1"]),
         (["--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
     ],

@@ -17,7 +17,7 @@ from tests.exchanged import frame_of
 from tests.system.refusals import mentions
 
 EXPORTED = {"format", "frames", "calibration", "notes", "output"}
-IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "warnings"}
+IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "notes", "warnings"}
 
 
 def image(call: Callable[..., Any], run: Path, calibration: Path, to: Path) -> np.ndarray:
@@ -42,7 +42,11 @@ def test_pictures_and_frames_again(call: Callable[..., Any], lab: Any, tmp_path:
     line = out.payload["notes"][0].split("mitsim ")[1]
     names = {"NAME": lab.camera, "CAL": lab.calibration, "RUN": tmp_path / "run"}
     back = call(*(names.get(word, word) for word in line.split()), "--json")
-    assert back.code == 0 and back.payload.keys() == {*IMPORTED, "shape"} and back.payload["shape"] == [64, 64]
+    assert (
+        back.code == 0
+        and back.payload.keys() == {*IMPORTED, "shape", "divided_by", "planes"}
+        and back.payload["shape"] == [64, 64]
+    )
     assert "truth" in back.payload["left_out"]
     again = image(call, tmp_path / "run", lab.calibration, tmp_path / "b")
     assert np.array_equal(again, image(call, lab.run, lab.calibration, tmp_path / "a"))

@@ -194,7 +194,7 @@ def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
-        ((), ["give a scene, or --frames DIR"]),
+        ((), ["give a scene, --frames DIR with the frames of a real session, or --known LIST"]),
         (("photograph", "--frames", "frames"), ["--frames frames", "leave out SCENE"]),
         (("--frames", "frames", "--seed", "0"), ["leave out --seed"]),
         (("--frames", "frames", "-D", "mask=open"), ["leave out -D"]),
