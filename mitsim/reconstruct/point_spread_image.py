@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -123,7 +123,10 @@ def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
     """(k, k') of sum 1, or as it was given where that was an array."""
     if isinstance(psf, (str, Path)):
         return load_psf(psf, reduce)
-    light = np.asarray(psf, np.float64)
+    light = np.asarray(psf)
+    if light.dtype.kind not in "uif":
+        raise ArgumentError("psf", f"{cut(repr(psf))}: give rows x columns of real numbers, or a picture's path")
+    light = light.astype(np.float64)
     if light.ndim != 2 or min(light.shape) < reduce:
         raise ArgumentError("psf", f"shape {light.shape}: give rows x columns, at least {reduce} a side")
     return reduce_frame(light, reduce)

@@ -412,7 +412,7 @@ def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Call
     """Right arguments for those parameters of ``called`` that have no default."""
     given = {"scene": bench.loaded.path, "shots": shots, "factors": factors, "bench": bench, "psnr": 30.0}
     given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
-    given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed"), "new")
+    given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed", "psf"), "new")
     given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
     given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
     parameters = inspect.signature(called).parameters.values()

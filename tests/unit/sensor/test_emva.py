@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.seeds import stream
-from mitsim.sensor.emva import Pair, Session, Stack, figures, pair_of, stack_of
+from mitsim.sensor.emva import Pair, Session, Stack, alike, figures
 
 
 def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
@@ -12,7 +12,7 @@ def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
     rng = stream(1, "pair")
     fixed = rng.normal(0, 50, (200, 300))
     first, second = (fixed + drift + rng.normal(0, 2, fixed.shape) for drift in (0.0, 3.0))
-    pair = pair_of(first, second)
+    pair = alike((first, second)).pair
     assert pair.variance == pytest.approx(4, rel=5 * np.sqrt(2 / fixed.size))
     assert pair.rows == pytest.approx(0, abs=5 * 4 / 300 * np.sqrt(2 / 200))
     assert pair.mean == pytest.approx((first.mean() + second.mean()) / 2)
@@ -21,7 +21,7 @@ def test_a_pair_s_variance_is_free_of_what_is_fixed_and_of_drift() -> None:
 def test_noise_that_rows_share_is_told_from_the_pixels_own() -> None:
     rng = stream(2, "rows")
     frames = [rng.normal(0, 3, (400, 1)) + rng.normal(0, 2, (400, 100)) for _ in range(2)]
-    assert pair_of(*frames).rows == pytest.approx(9, rel=5 * np.sqrt(2 / 400))
+    assert alike(frames).pair.rows == pytest.approx(9, rel=5 * np.sqrt(2 / 400))
 
 
 def test_a_stack_tells_rows_columns_and_pixels_apart_and_takes_off_what_noise_is_left() -> None:
@@ -31,11 +31,11 @@ def test_a_stack_tells_rows_columns_and_pixels_apart_and_takes_off_what_noise_is
     pixels -= pixels.mean(axis=0)
     pixels -= pixels.mean(axis=1, keepdims=True)
     image = rows + columns + pixels
-    still = stack_of([image, image]).parts((60, 80))
+    still = alike([image, image]).stack.parts((60, 80))
     exact = rows.var() + columns.var() + pixels.var(), rows.var(), columns.var(), pixels.var()
     # Made without means, pixels have none in rows, where as many of random ones would leave 1/N of their variance.
     np.testing.assert_allclose(still, exact, rtol=0.06)
-    noisy = stack_of(image + rng.normal(0, 20, image.shape) for _ in range(50))
+    noisy = alike(image + rng.normal(0, 20, image.shape) for _ in range(50)).stack
     left = 20**2 / 50
     assert noisy.total == pytest.approx(exact[0], abs=5 * np.sqrt((2 * left**2 + 4 * left * exact[0]) / image.size))
 
@@ -47,7 +47,7 @@ def test_what_noise_leaves_in_the_mean_of_a_stack_is_taken_off_all_its_parts() -
     rows' part N^2 times as large; any one of the three not taken off.)
     """
     rng, shape, count = stream(4, "noise"), (400, 300), 4
-    found = stack_of(rng.normal(0, 3, shape) for _ in range(count))
+    found = alike(rng.normal(0, 3, shape) for _ in range(count)).stack
     left = 9 / count
     for name, part, size in (("total", 1, 400 * 300), ("rows", 300, 400), ("columns", 400, 300)):
         assert getattr(found, name) == pytest.approx(0, abs=5 * left / part * np.sqrt(2 / size)), name
@@ -55,7 +55,7 @@ def test_what_noise_leaves_in_the_mean_of_a_stack_is_taken_off_all_its_parts() -
 
 def test_a_stack_needs_two_frames() -> None:
     with pytest.raises(ValueError, match="1 frames tell no temporal noise"):
-        stack_of([np.zeros((4, 4))])
+        alike([np.zeros((4, 4))])
 
 
 def test_figures_of_an_ideal_camera_are_its_numbers() -> None:
