@@ -11,12 +11,11 @@ from typing import Annotated
 
 from pydantic import FailFast, Field
 
-from mitsim.core.configuration import Configuration, Positive, read_toml, validate
+from mitsim.core.configuration import Configuration, Positive, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import read_json
 from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import FileName
-from mitsim.devices.framelist import LISTS
+from mitsim.devices.framelist import read_list
 
 _MOST_SETS, _MOST_FRAMES = 4096, 10_000
 """Of a list, and frames of a set: ten times what EMVA 1288's longest procedures take."""
@@ -91,17 +90,10 @@ def load_flats(folder: Path | str) -> FlatFrames:
     MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or alone.
     """
     folder = Path(folder)
-    lists = [folder / name for name in LISTS if (folder / name).is_file()]
-    if len(lists) != 1:
-        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
-        raise MitsimError(
-            f"frames {folder}: {found} {' and '.join(LISTS) if lists else ' nor '.join(LISTS)}; give one, with name, "
-            "pixel_pitch_um, bits, and sets lit and dark of files and exposure_s"
-        )
-    data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
+    place, data = read_list(folder, "name, pixel_pitch_um, bits, and sets lit and dark of files and exposure_s")
     if not isinstance(data, dict):
-        raise MitsimError(f"frames {lists[0]}: holds no table; give name, pixel_pitch_um, bits, lit and dark")
-    flats = FlatFrames(folder, validate(FlatList, data, f"frames {lists[0]}"))
+        raise MitsimError(f"frames {place}: holds no table; give name, pixel_pitch_um, bits, lit and dark")
+    flats = FlatFrames(folder, validate(FlatList, data, f"frames {place}"))
     _check_sets(flats)
     return flats
 

@@ -206,21 +206,24 @@ class SessionFrames:
         return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]
 
 
+def read_list(folder: Path, fields: str) -> tuple[Path, Any]:
+    """The list in a ``folder``, and what it says; MitsimError, which names its ``fields``, unless there is one."""
+    lists = [folder / name for name in LISTS if (folder / name).is_file()]
+    if len(lists) != 1:
+        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
+        names = (" and " if lists else " nor ").join(LISTS)
+        raise MitsimError(f"frames {folder}: {found} {names}; give one, with {fields}")
+    return lists[0], read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
+
+
 def load_frames(folder: Path | str) -> SessionFrames:
     """Which file of the ``folder`` shows what.
 
     MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or there twice.
     """
     folder = Path(folder)
-    lists = [folder / name for name in LISTS if (folder / name).is_file()]
-    if len(lists) != 1:
-        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
-        raise MitsimError(
-            f"frames {folder}: {found} {' nor '.join(LISTS) if not lists else ' and '.join(LISTS)}; give one, with "
-            "camera, n, signed_capture and digital"
-        )
-    data = read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
-    listed = validate(FrameList, data, f"frames {lists[0]}")
+    place, data = read_list(folder, "camera, n, signed_capture and digital")
+    listed = validate(FrameList, data, f"frames {place}")
     wanted = [*_keys_of_session(listed)]
     if listed.frames:
         frames, dark = listed.frames, listed.dark
@@ -233,7 +236,7 @@ def load_frames(folder: Path | str) -> SessionFrames:
                 f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
                 f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
                 f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
-                f"frame in {lists[0].name}{_not_counted(folder, names)}"
+                f"frame in {place.name}{_not_counted(folder, names)}"
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)

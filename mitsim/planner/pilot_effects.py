@@ -150,7 +150,8 @@ class EffectRuns:
         """Whether so little light is indirect that one coarse cell a pixel, and one layer, serve."""
         direct = sum(float(light.value.sum()) for light in self.direct) / (REPLICATES * self.sample.direct)
         part = self.received / (direct + self.received) if self.received else 0.0
-        return part > 0 and _AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
+        # Direct light that lies in its cells tells nothing of indirect light.
+        return 0 < _AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
 
     @property
     def coarse(self) -> tuple[float, float]:

@@ -469,7 +469,7 @@ def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) ->
     direct = sum(float(light.value.sum()) for light in followed.direct) / (REPLICATES * sample.direct)
     part = followed.received / (direct + followed.received)
     enough = pilot_samples.GOOD_ENOUGH * 1e-2 / (15 * part)
-    for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True)):
+    for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True), (0.0, True)):
         found = EffectRuns(bench, everything, sample, 5, (), 1e-2, partial(tuple, (left / 2, left)))
         assert bool(found._coarse) == looked_at
         assert found.sample_cost("indirect").noise.error
