@@ -38,10 +38,7 @@ def off_by(done: Characterisation, name: str) -> dict[str, float]:
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CAMERAS]
 )
 def test_frames_of_a_camera_characterise_to_that_camera(name: str, tmp_path: Path) -> None:
-    """Every field within five standard errors, of some fifteen a camera; and its file is a camera's.
-
-    (Planted: cut readings left out of the moments; a pair's variance not halved; hot pixels kept in the offsets.)
-    """
+    """Every field within five standard errors, of some fifteen a camera; and its file is a camera's."""
     done = characterise_frames(load_flats(write_flats(tmp_path / "frames", camera(name), stack=8)), tmp_path / "out")
     off = off_by(done, name)
     assert len(off) >= 14 and all(abs(value) < 5 for value in off.values()), off
@@ -92,7 +89,6 @@ AMISS: dict[str, tuple[dict[str, Any], str]] = {
     "name", [pytest.param(name, marks=[pytest.mark.slow] if "JPEG" in name else []) for name in AMISS]
 )
 def test_what_is_amiss_with_frames_is_said_once(name: str, tmp_path: Path) -> None:
-    """(Planted: each remark's bound ten times as high.)"""
     changes, words = AMISS[name]
     done = characterise_frames(load_flats(write_flats(tmp_path / "frames", camera("plain"), **changes)))
     assert any(words in line for line in done.about), done.about

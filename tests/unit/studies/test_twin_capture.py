@@ -47,8 +47,7 @@ def made(seed: int, codes: tuple[Code, Code], noise: float = 1.0) -> Measured:
 
 
 def test_codes_are_learned_from_known_scenes_and_predict_another_frame() -> None:
-    """From four frames without noise; of a random start, on the third turn. (Planted: factors whose columns keep their
-    means; the window of a code one pixel off.)"""
+    """From four frames without noise; of a random start, on the third turn."""
     codes = made_codes()
     found = learn_codes([made(seed, codes, 0.0) for seed in range(4)], SCALES)
     held = made(9, codes, 0.0)
@@ -58,7 +57,7 @@ def test_codes_are_learned_from_known_scenes_and_predict_another_frame() -> None
 
 @pytest.mark.parametrize("reverse", [False, True])
 def test_a_code_is_read_from_a_factor(reverse: bool) -> None:
-    """Scale to a hundredth of a pixel over the scene, whichever way the scene runs. (Planted: the peak's sign.)"""
+    """Scale to a hundredth of a pixel over the scene, whichever way the scene runs."""
     code = made_codes()[0]
     found, flipped, rest = read_code(code.factor[:, ::-1] if reverse else code.factor)
     assert flipped is reverse and rest < 1e-4
@@ -72,8 +71,7 @@ def test_a_factor_without_shifts_is_refused() -> None:
 
 
 def test_noise_of_planes_is_that_of_their_photons() -> None:
-    """Of electrons by Poisson's law, and reading: gain to 5 %, over blocks whose light differs threefold. (Planted:
-    first differences in place of second; their norm left out.)"""
+    """Of electrons by Poisson's law, and reading: gain to 5 %, over blocks whose light differs threefold."""
     draws = np.random.default_rng(0)
     light = np.linspace(200, 700, 400)[:, None] * np.ones(400) / GAIN
     planes = [GAIN * (draws.poisson(light * part) + 20 * draws.standard_normal(light.shape)) for part in (0.5, 1.0)]
@@ -110,7 +108,7 @@ def cause_of(measured: Measured, codes: tuple[Code, Code], monkeypatch: pytest.M
 
 def test_causes_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame of the model with noise alone has no other cause; a smooth field, another scale and another code are
-    found as such. (Planted: noise that a fit takes left out; the field's polynomials without their gains.)"""
+    found as such. (Planted: noise that a fit takes left out.)"""
     codes = made_codes()
     held = made(5, codes, 0.0)
     draws = np.random.default_rng(8)

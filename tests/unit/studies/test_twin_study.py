@@ -33,7 +33,7 @@ from tests.unit.studies.test_twin_capture import made, made_codes
 
 def test_a_spread_of_light_by_hand() -> None:
     """Of one bright pixel in 400: contrast sqrt(399), all light in the brightest twentieth; a wave's power is in its
-    band. (Planted: the window's norm left out.)"""
+    band."""
     point = np.zeros((20, 20))
     point[3, 4] = 1
     assert spread_of(point).contrast == pytest.approx(399**0.5)
@@ -46,7 +46,7 @@ def test_a_spread_of_light_by_hand() -> None:
 
 
 def test_numbers_of_a_spectrum_are_found_again() -> None:
-    """One on the grid, blurred and with an even part, is found as that. (Planted: power damped as amplitude.)"""
+    """One on the grid, blurred and with an even part, is found as that."""
     draws = np.random.default_rng(1)
     grid = np.exp(draws.standard_normal((3, 4, len(frequencies()))))
     blur, haze = float(_BLURS[3]), float(_HAZES[4])
@@ -56,8 +56,7 @@ def test_numbers_of_a_spectrum_are_found_again() -> None:
 
 def test_rays_of_a_weak_relief_fall_as_its_curvature_says() -> None:
     """Light over its mean is 1 - move (h_xx + h_yy) to first order: correlation of both, noise of rays
-    smoothed. (Planted: slopes of x and y
-    exchanged.)"""
+    smoothed."""
     relief, count, move = random_relief(6.0, 0.8, 0.1, 4), 128, 0.02
     light = ndimage.gaussian_filter(_land(relief, move, count, 0), 3)
     spread = np.gradient(relief.slope_x, axis=0) + np.gradient(relief.slope_y, axis=1)
