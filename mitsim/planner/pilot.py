@@ -30,8 +30,9 @@ from mitsim.light.settings import (
     Settings,
 )
 from mitsim.light.simulation import Simulation
+from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
 from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
-from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
+from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
 from mitsim.scene.darkness import why_dark
 from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours

@@ -23,8 +23,9 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, PilotResult, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_direct, pilot_effects, pilot_samples
-from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
+from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_effects, pilot_samples
+from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
+from mitsim.planner.pilot_effects import EffectRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
@@ -98,7 +99,7 @@ def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
         coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
         assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
     widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_effects.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
     assert 0 < pilot_result.forming.product < 1e-6
     assert (
@@ -201,7 +202,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_effects,
+        pilot_anchors,
         "_AT_ONCE",
         2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
     )
@@ -405,7 +406,7 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
     (Planted: the part of the mean, not of what is beyond it.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
     cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1 / (15 * pilot_effects.norm(runs.anchored._beyond_mean()))
+    enough = 1 / (15 * pilot_samples.norm(runs.anchored._beyond_mean()))
     for coarse, looked_at in (
         ((0.9 * enough, 0.9 * enough), set()),
         ((1.1 * enough, 0.9 * enough), {cells}),
@@ -438,11 +439,11 @@ def test_more_anchors_see_a_faint_camera_part_as_few_do(bench: Bench, monkeypatc
     """Then it is not traced again, and nothing of it is lost. (Planted: frames without it; those of one anchor.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
     others = runs.samples["followed"], math.inf, 3, runs.fine.judging
-    whole = pilot_effects.FollowedRuns(bench, runs._everything, *others)
-    monkeypatch.setattr(pilot_effects, "_FAINT", 0.0)
+    whole = pilot_anchors.FollowedRuns(bench, runs._everything, *others)
+    monkeypatch.setattr(pilot_anchors, "_FAINT", 0.0)
     apart = whole._frames(3)
-    monkeypatch.setattr(pilot_effects, "_FAINT", 0.6)
-    faint = pilot_effects.FollowedRuns(bench, runs._everything, *others)
+    monkeypatch.setattr(pilot_anchors, "_FAINT", 0.6)
+    faint = pilot_anchors.FollowedRuns(bench, runs._everything, *others)
     traced = list[str]()
     replicates = Tracer.replicates
 
@@ -497,7 +498,7 @@ def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
     runs.refine("followed")
     closer = runs.followed
     others = first.tolerance, 3, runs.fine.judging
-    whole = pilot_effects.FollowedRuns(bench, runs._everything, closer.sample, *others)
+    whole = pilot_anchors.FollowedRuns(bench, runs._everything, closer.sample, *others)
     assert (closer._first, closer._samples, whole._samples) == (first._samples, 3 * first._samples, 4 * first._samples)
     size = float(np.abs(whole._frames(1)).max())
     for anchors in (1, 2, 3):
