@@ -2,8 +2,8 @@
 
     python captures/reduce.py DATA OUT
 
-FlatCam: of each plane of its mosaic rows 2 to 509 and columns 2 to 637, the mean of 4 x 4 pixels, rounded, put back into
-a mosaic in the high bits of 16; its authors' images, the mean of 4 x 4 pixels. DiffuserCam: the mean of 8 x 8 pixels.
+FlatCam: of each plane of its mosaic rows 2 to 509 and columns 2 to 637, the mean of 4 x 4 pixels, rounded, put back
+into a mosaic in the high bits of 16; its authors' images, the mean of 4 x 4 pixels. DiffuserCam: the mean of 8 x 8.
 """
 
 from __future__ import annotations

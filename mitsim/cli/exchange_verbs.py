@@ -132,7 +132,7 @@ def import_(
         payload = _import_frames(context, source, output, frames)
     lines = []
     if payload["output"]:
-        lines.append(f"{payload['frames']} frames: {payload['output']}")
+        lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
     if payload["calibration_output"]:
         lines.append(f"calibration: {payload['calibration_output']}")
     elif "calibration" in payload["holds"]:

@@ -115,7 +115,13 @@ def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageReque
         as for :func:`reconstruct_psf_request`.
     """
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
-    asked = {"run": shots.fingerprint, POINT_SPREAD: digest, "reduce": reduce, "lambda": request.lam, "method": request.method}
+    asked = {
+        "run": shots.fingerprint,
+        POINT_SPREAD: digest,
+        "reduce": reduce,
+        "lambda": request.lam,
+        "method": request.method,
+    }
     return asked if request.bounds is None else {**asked, "bounds": plain_bounds(request.bounds)}
 
 

@@ -99,7 +99,7 @@ class Reconstruction(Solution):
 
     @property
     def white(self) -> float:
-        """Number of the image that pictures show as white: 1; by a point spread function, whose image has no board to be
+        """Number of the image that pictures show as white: 1; by a point spread function, whose image no board is
         compared with, its largest."""
         largest = float(self.image.max()) if POINT_SPREAD in self.inputs else 0.0
         return largest if largest > 0 else 1.0
