@@ -26,7 +26,7 @@ from mitsim.core.imagelist import Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
-from mitsim.core.prepare import LEAST_RESPONSE, PLAIN, Preparer, factor_of
+from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.exchange.capture_list import Electronics, RealCapture
@@ -219,7 +219,7 @@ class _Scan:
         self.files, self._camera = files, camera
         self.places: list[tuple[Path, int]] = []
         self._numbers: list[_Numbers] = []
-        self._factor, self._differ = 0, set[float]()
+        self._common = CommonFactor()
         for path in files:
             for number, frame in enumerate(read_images(path, known.wanted)):
                 if not self.places:
@@ -232,9 +232,7 @@ class _Scan:
                 self.places.append((path, number))
                 whole = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame))
                 self._numbers.append(_Numbers(path, float(frame.min()), float(frame.max()), whole, frame.dtype))
-                self._factor = factor_of(frame, self._factor)
-                if len(self._differ) < PLAIN:
-                    self._differ.update(np.unique(frame)[:PLAIN].tolist())
+                self._common.add(frame)
 
     def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
         """What all numbers are divided by, what is said of it, and what is doubtful.
@@ -249,25 +247,21 @@ class _Scan:
         MitsimError
             for a stated one that they do not have.
         """
-        largest, found = self._camera.largest, self._factor
+        found, largest = self._common.factor, self._camera.largest
         if stated is not None:
             if found % stated:
                 raise ArgumentError("divide_by", f"{stated}: the numbers' common factor is {found}; give that, or 1")
             return stated, [], []
-        high = max(each.high for each in self._numbers)
-        chance = len(self._differ) < PLAIN
-        if largest is not None and high > largest and found > 1:
-            bits = 8 * self._numbers[0].kind.itemsize - largest.bit_length()
-            shifted = 2 ** max(bits, 0)
-            factor = shifted if found % shifted == 0 else found
-            if high / factor <= largest and (factor == shifted or not chance):
-                kind = f" ({largest.bit_length()} bits in the high bits of {self._numbers[0].kind.itemsize * 8})"
-                all_are = f"numbers are divided by {factor}, which all are multiples of"
-                return factor, [all_are + (kind if factor == shifted else "")], []
-        if found > 1 and not chance:
+        factor, doubtful = self._common.choose(largest)
+        if factor > 1:
+            of = ""
+            if factor == self._common.shift(largest) and largest is not None:
+                of = f" ({largest.bit_length()} bits in the high bits of {8 * self.first.itemsize})"
+            return factor, [f"numbers are divided by {factor}, which all are multiples of{of}"], []
+        if doubtful > 1:
             doubt = (
                 f"all numbers are multiples of {found}, and are taken as they are: if the camera's numbers were "
-                f"shifted or scaled, give --divide {found}, else --divide 1"
+                f"shifted or scaled, give --divide {doubtful}, else --divide 1"
             )
             return 1, [], [doubt]
         return 1, [], []
