@@ -362,7 +362,7 @@ def correlations(folder: Path) -> dict[str, float]:
 
     from mitsim.core.exr import read_frame
 
-    theirs = np.array(Image.open(ROOT / "captures" / "flatcam" / "rec_7.png"), float)
+    theirs = np.array(Image.open(folder / "captures" / "flatcam" / "rec_7.png"), float)
     found = {}
     for name, colour in {"r": 0, "gb": 1, "gr": 1, "b": 2}.items():
         ours = read_frame(folder / "run7" / "reconstruction" / name / "image.exr")[0]["reflectance"]

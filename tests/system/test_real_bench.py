@@ -20,6 +20,8 @@ from tests.test_docs import blocks, examples, figures
 PAGE = "docs/bench.md"
 WHOLE = Path(__file__).resolve().parents[3] / "shared" / "data"
 """The captures as they are published, too large for the project."""
+OF_COPIES = ("--crop", "1,2,125,155", "--projector-pixels", "64")
+"""What the page's commands say of the reduced copies of FlatCam's captures."""
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -81,7 +83,7 @@ def test_a_flatcams_captures_lead_to_the_image_of_its_authors(
     """Of a capture that was not learned from, in colour, no darker and no brighter. (Planted: planes of another
     mosaic; the image turned by a half.)"""
     monkeypatch.chdir(tmp_path)
-    walk(call, "## 2. A FlatCam")
+    walk(call, figures.WALKS[0])
     for name, stated in figures.correlations(tmp_path).items():
         assert stated == pytest.approx(figures.read()["walks"][f"correlation_{name}"], abs=0.01), name
     ours = np.array(Image.open("run7/reconstruction/image.png")) / 255
@@ -96,7 +98,7 @@ def test_a_diffusercams_capture_leads_to_a_hand(
     """Where one division by the spectrum of the light has it, too, and dark around it. (Planted: the image turned by a
     half.)"""
     monkeypatch.chdir(tmp_path)
-    walk(call, "## 3. A DiffuserCam")
+    walk(call, figures.WALKS[1])
     image = read_frame(Path("hand/reconstruction/image.exr"))[0]["reflectance"]
     light, frame = (
         np.array(Image.open(f"captures/diffusercam/{name}.tif"), float)
@@ -111,3 +113,31 @@ def test_a_diffusercams_capture_leads_to_a_hand(
     assert np.corrcoef(middle.ravel(), image.ravel())[0, 1] > 0.8, "0.89 of the other solver's"
     shown = np.array(Image.open("hand/reconstruction/image.png"))
     assert shown.max() == 255 and np.median(shown) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not WHOLE.is_dir(), reason="published captures are not here")
+def test_whole_captures_lead_to_the_same_images(
+    call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the walks' commands without what is of reduced copies: a FlatCam's planes as the page has them, and a hand that
+    is, with 4 x 4 pixels averaged, that of the copy."""
+    monkeypatch.chdir(tmp_path)
+    Path("captures").symlink_to(WHOLE)
+    for heading in figures.WALKS:
+        figures.put_inputs(heading, Path())
+        for example in examples(PAGE, heading):
+            words = [word for word in example.arguments if word not in OF_COPIES]
+            if "--psf" in words:
+                words += ["--reduce", "4"]
+            assert call(*words, "--quiet").code == example.status, words
+    found = figures.correlations(tmp_path)
+    for name, least in {"r": 0.97, "gb": 0.96, "gr": 0.95, "b": 0.92}.items():
+        assert found[name] > least, found
+    whole = read_frame(Path("hand/reconstruction/image.exr"))[0]["reflectance"]
+    shutil.rmtree("hand")
+    Path("captures").unlink()
+    walk(call, figures.WALKS[1])
+    small = read_frame(Path("hand/reconstruction/image.exr"))[0]["reflectance"]
+    halved = whole.reshape(small.shape[0], 2, small.shape[1], 2).mean(axis=(1, 3))
+    assert np.corrcoef(halved.ravel(), small.ravel())[0, 1] > 0.99
