@@ -120,7 +120,7 @@ def test_a_diffusercams_capture_leads_to_a_hand(
 def test_whole_captures_lead_to_the_same_images(
     call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the walks' commands without what is of reduced copies: a FlatCam's planes as the page has them, and a hand that
+    """By the walks' commands, but for what is of copies: a FlatCam's planes as the page has them, and a hand that
     is, with 4 x 4 pixels averaged, that of the copy."""
     monkeypatch.chdir(tmp_path)
     Path("captures").symlink_to(WHOLE)
