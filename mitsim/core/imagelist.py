@@ -34,6 +34,8 @@ calibration/ov5647.toml."""
 _Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 BGGR = "BGGR"
 """The mosaic of cameras that do not state theirs: FlatCam's."""
+CORRECTIONS = "dark", "flat", "flat_dark"
+"""Fields of a preparation that are paths of frames."""
 TO_FILE = "file"
 """The orientation that a file states."""
 _LARGEST_TURN = 45.0

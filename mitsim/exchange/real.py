@@ -22,7 +22,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
 from mitsim.core.files import read_json, whole_folder
-from mitsim.core.imagelist import Preparation, image_files
+from mitsim.core.imagelist import CORRECTIONS, Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
@@ -136,7 +136,7 @@ def _run_of(
     scan
         of all frames.
     """
-    preparer = Preparer.of(how, camera.digital, known.wanted, known.base)
+    preparer = Preparer.of(how, camera.digital, known.wanted)
     shots = _Shots(known, preparer, fit, scan.places, camera.largest is not None)
     shape = shots.frame(scan.places[0][0], scan.first).shape
     ambient = None if known.ambient is None else _ambient(known, camera, preparer, fit, shape)
@@ -188,16 +188,15 @@ class _Fit:
     @classmethod
     def of(cls, known: RealCapture, line: str = "") -> _Fit:
         """Of a ``line`` of the calibration; of the whole one by ""."""
+        n = known.listed.n
         if known.calibration is None:
-            if known.n is None:
+            if n is None:
                 raise AssertionError  # refused by RealCapture.check
-            return cls(None, None, (known.n, known.n))
+            return cls(None, None, (n, n))
         calibration: Packed[CalibrationManifest] = pack_calibration(known.calibration / line)
         left, right = (calibration.read(name)[0]["factor"].shape for name in FACTORS)
-        if known.n is not None and (known.n, known.n) != (left[1], right[1]):
-            raise ArgumentError(
-                "projector_pixels", f"{known.n}: the calibration has {left[1]} x {right[1]}; leave it out"
-            )
+        if n is not None and (n, n) != (left[1], right[1]):
+            raise ArgumentError("projector_pixels", f"{n}: the calibration has {left[1]} x {right[1]}; leave it out")
         return cls(dict(calibration.manifest.camera), (left[0], right[0]), (left[1], right[1]))
 
 
@@ -382,11 +381,10 @@ def _ambient(
             if part.shape != shape:
                 raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
             total, count = total + part, count + 1
-    if known.ambient_shots is not None and count != 1:
-        raise ArgumentError(
-            "ambient_shots", f"{known.ambient_shots}: {known.ambient} holds {count} frames; leave it out"
-        )
-    return (total / count).astype(np.float32), known.ambient_shots or count
+    stated = known.listed.ambient_shots
+    if stated is not None and count != 1:
+        raise ArgumentError("ambient_shots", f"{stated}: {known.ambient} holds {count} frames; leave it out")
+    return (total / count).astype(np.float32), stated or count
 
 
 def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
@@ -404,7 +402,7 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
         named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
         patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
     else:
-        left, right = (parse_patterns(known.patterns, side, known.seed) for side in scene)
+        left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
         family = PatternFamily(known.patterns, left.left, right.right)
         patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     sides = tuple(len(matrix) for matrix in patterns.matrices)
@@ -421,8 +419,8 @@ def _configuration(
     """All that decides the frames: whose files, and as what they are read."""
     more = () if known.ambient is None else image_files(known.ambient, known.wanted)
     corrected = {
-        name: {path.name: checksum(path) for path in image_files(known.base / place, known.wanted)}
-        for name in ("dark", "flat", "flat_dark")
+        name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
+        for name in CORRECTIONS
         if (place := getattr(how, name)) is not None
     }
     return {
@@ -434,7 +432,7 @@ def _configuration(
         "black_level_dn": known.black_level_dn,
         "channel": how.channel,
         "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
-        "seed": known.seed,
+        "seed": known.listed.seed,
     }
 
 

@@ -34,7 +34,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.devices.framelist import load_frames
-from mitsim.exchange.capture_list import RealCapture, load_capture_list
+from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.real import import_frames
 from mitsim.reconstruct.captured_session import calibrate_frames
@@ -245,7 +245,7 @@ def test_few_numbers_of_a_dark_frame_tell_a_shift(
     factor by chance. (Planted: sixteen numbers needed for any factor; the whole factor doubted.)"""
     dark = np.random.default_rng(2).choice(list(numbers), (40, 36)).astype(np.uint16)
     np.save(tmp_path / "dark.npy", dark * times)
-    about = RealCapture("uniform", twelve(tmp_path), 0.02, n=4, black_level_dn=10.0)
+    about = RealCapture(CaptureList(patterns="uniform", n=4), twelve(tmp_path), 0.02, black_level_dn=10.0)
     (*warning,) = import_frames(tmp_path / "dark.npy", tmp_path / "run", about)["warnings"]
     assert len(warning) == (doubted > 1) and all(f"give --divide {doubted}, else" in each for each in warning)
 
@@ -619,8 +619,8 @@ def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
     path, output = tmp_path / name, tmp_path / "run"
     content = HOSTILE[name][0] if name in HOSTILE else GOOD[name]
     path.write_bytes(content)
-    how = Preparation(orientation="file")
-    about = RealCapture("uniform", twelve(tmp_path), 0.02, n=4, black_level_dn=40.0, prepare=how)
+    listed = CaptureList(patterns="uniform", n=4, prepare=Preparation(orientation="file"))
+    about = RealCapture(listed, twelve(tmp_path), 0.02, black_level_dn=40.0)
     if name in HOSTILE:
         with pytest.raises(MitsimError, match=re.escape(HOSTILE[name][1])):
             import_frames(path, output, about)
