@@ -84,36 +84,26 @@ class Preparer:
             for dark or flat frames that cannot be read, are of several sizes, or without light.
         """
         end = digital.saturation_dn if end is None else end
-        plain = cls(how, digital, end)
-        dark = None if how.dark is None else plain.mean(base / how.dark, wanted)
-        if how.flat is None:
-            return plain if dark is None else plain.with_correction(dark, None, 0)
-        under = dark if how.flat_dark is None else plain.mean(base / how.flat_dark, wanted)
-        flat = plain.mean(base / how.flat, wanted)
-        for name, other in (("dark", dark), ("flat_dark", under)):
-            if other is not None and other.shape != flat.shape:
-                raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
-        light = flat - (plain.level if under is None else under)
-        whole = plain.plane(light)
-        if not whole.mean() > 0:
-            raise MitsimError(f"{base / how.flat}: has no more light than its dark frames; give a lit one")
-        response = light / whole.mean()
-        unlit = plain.plane(response) < LEAST_RESPONSE
-        return plain.with_correction(dark, np.where(response < LEAST_RESPONSE, 1.0, response), int(unlit.sum()))
-
-    def with_correction(self, dark: FloatArray | None, response: FloatArray | None, unlit: int) -> Preparer:
-        """The same with dark and flat frames.
-
-        Parameters
-        ----------
-        dark, response, unlit
-            as the class has them.
-        """
-        digital = self.digital
-        if self.end is not None:
-            top = (self.end - (self.level if dark is None else dark)) / (1.0 if response is None else response)
-            digital = digital.model_copy(update={"saturation_dn": float(np.max(top)) + self.level})
-        return Preparer(self.how, digital, self.end, dark, response, unlit)
+        plain, response, unlit = cls(how, digital, end), None, 0
+        dark, under = (
+            None if path is None else plain.mean(base / path, wanted) for path in (how.dark, how.flat_dark or how.dark)
+        )
+        if how.flat is not None:
+            flat = plain.mean(base / how.flat, wanted)
+            for name, other in (("dark", dark), ("flat_dark", under)):
+                if other is not None and other.shape != flat.shape:
+                    raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
+            light = flat - (plain.level if under is None else under)
+            mean = plain.plane(light).mean()
+            if not mean > 0:
+                raise MitsimError(f"{base / how.flat}: has no more light than its dark frames; give a lit one")
+            response = light / mean
+            unlit = int((plain.plane(response) < LEAST_RESPONSE).sum())
+            response[response < LEAST_RESPONSE] = 1.0
+        if end is not None and (dark is not None or response is not None):
+            top = (end - (plain.level if dark is None else dark)) / (1.0 if response is None else response)
+            digital = digital.model_copy(update={"saturation_dn": float(np.max(top)) + plain.level})
+        return cls(how, digital, end, dark, response, unlit)
 
     @property
     def level(self) -> float:
