@@ -1,5 +1,5 @@
-"""What a list or a command line says of pictures: which are read, how, and what is done to their numbers before they are
-frames. A folder in, its files in the order of their numbers out.
+"""What a list or a command line says of pictures: which are read, how, and what is done to their numbers before they
+are frames. A folder in, its files in the order of their numbers out.
 
 None is opened here, and numpy is not imported, so that a mistake is told at once. `mitsim.core.images` reads numbers,
 `mitsim.core.prepare` makes frames of them.
