@@ -34,6 +34,8 @@ from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
+_MOST_STAMPED = 1e-3
+"""Of a picture's numbers, that are not light: of the public DiffuserCam capture two, chosen beyond a line of text."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
@@ -202,13 +204,31 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What the numbers of one frame are: smallest and largest, whether all are whole, and the type of their file."""
+    """What the numbers of one frame are: smallest and largest, whether all are whole, the type of their file, and what
+    else is seen of numbers that a camera does not count to."""
 
     path: Path
     low: float
     high: float
     whole: bool
     kind: np.dtype[Any]
+    cause: str
+
+    @classmethod
+    def of(cls, path: Path, frame: Numbers, camera: Electronics) -> _Numbers:
+        """Of a ``frame`` (rows, columns) in the file ``path``."""
+        whole, high = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame)), float(frame.max())
+        cause = "they were scaled, or the camera is another; save them as they are, or give the right camera file"
+        if camera.largest is not None and high > camera.largest:
+            bits = 8 * frame.itemsize
+            shift = 1 << max(bits - camera.largest.bit_length(), 0)
+            others = np.count_nonzero(frame % shift)
+            if 0 < others <= frame.size * _MOST_STAMPED:
+                cause = (
+                    f"but for {others} all are multiples of {shift}: the camera writes more than light into pictures; "
+                )
+                cause += f"switch that off, or give a camera file of {bits} bits"
+        return cls(path, float(frame.min()), high, whole, frame.dtype, cause)
 
 
 class _Scan:
@@ -229,8 +249,7 @@ class _Scan:
                         "give frames of one size"
                     )
                 self.places.append((path, number))
-                whole = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame))
-                self._numbers.append(_Numbers(path, float(frame.min()), float(frame.max()), whole, frame.dtype))
+                self._numbers.append(_Numbers.of(path, frame, camera))
                 self._common.add(frame)
 
     def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
@@ -357,7 +376,7 @@ def check_numbers(path: Path, numbers: _Numbers, camera: Electronics, factor: in
     if high > largest or (low < 0 and not mean):
         raise MitsimError(
             f"{path}: has the number {low if low < 0 else high:g}, but camera {camera.name} counts 0 to {largest}: "
-            "they were scaled, or the camera is another; save them as they are, or give the right camera file"
+            f"{numbers.cause}"
         )
     if not mean and numbers.kind.kind != "f" and np.iinfo(numbers.kind).max < largest:
         raise MitsimError(
@@ -375,8 +394,7 @@ def _ambient(
     total, count = np.zeros(shape), 0
     for path in image_files(known.ambient, known.wanted):
         for frame in read_images(path, known.wanted):
-            numbers = _Numbers(path, float(frame.min()), float(frame.max()), True, frame.dtype)
-            check_numbers(path, numbers, camera, preparer.how.divide_by or 1, mean=True)
+            check_numbers(path, _Numbers.of(path, frame, camera), camera, preparer.how.divide_by or 1, mean=True)
             part = part_of(path, preparer.frame(path, frame, mean=True), preparer.how, fit.shape)
             if part.shape != shape:
                 raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
