@@ -213,9 +213,11 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     odd[:, 0, :2] = 24123, 36053
     written(tmp_path / "stamped", "png", odd)
     refused("but for 2 all are multiples of 16: the camera writes", tmp_path, tmp_path / "stamped", about)
-    odd[:, 1] += 1
-    written(tmp_path / "odder", "png", odd)
-    refused("they were scaled", tmp_path, tmp_path / "odder", about)
+    for frames in (slice(-1, None), slice(None)):
+        odd = dn * 16
+        odd[frames, 1] += 1
+        written(tmp_path / f"odd {frames.start}", "png", odd)
+        refused("they were scaled", tmp_path, tmp_path / f"odd {frames.start}", about)
     eight = tmp_path / "eight.toml"
     eight.write_text(ELECTRONICS.replace("bits = 16", "bits = 8"))
     written(tmp_path / "b", "png", dn // 16 * 257)
@@ -278,7 +280,8 @@ def test_all_planes_are_a_coloured_run_with_one_colour_image(tmp_path: Path) -> 
     written(tmp_path / "frames", "png", mosaic)
     (tmp_path / "camera.toml").write_text(ELECTRONICS)
     (tmp_path / "list.toml").write_text(
-        '\ufeffpatterns = "dots:2x3"\n[prepare]\nchannel = "all"\nmosaic = "GRBG"\nwavelengths_nm = [610.0, 550.0, 450.0]\n'
+        '\ufeffpatterns = "dots:2x3"\n[prepare]\nchannel = "all"\nmosaic = "GRBG"\n'
+        "wavelengths_nm = [610.0, 550.0, 450.0]\n"
     )
     words = f"import {tmp_path / 'frames'} -o {tmp_path / 'run'} --list {tmp_path / 'list.toml'} --exposure 0.0213"
     words += f" --camera {tmp_path / 'camera.toml'} --calibration {calibration} --json"
