@@ -60,7 +60,7 @@ class Raw(Configuration):
 
     @classmethod
     def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
-        """From what the command line says.
+        """From what the command line says; MitsimError for what is none.
 
         Parameters
         ----------
@@ -68,11 +68,6 @@ class Raw(Configuration):
             ROWSxCOLUMNS.
         bits, byte_order
             as the class has them.
-
-        Raises
-        ------
-        MitsimError
-            for what is none.
         """
         sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
         if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
@@ -81,9 +76,7 @@ class Raw(Configuration):
             raise ArgumentError("bits", f"{bits}: give the bits of a number in such a file, 1 to 32")
         if byte_order not in ("little", "big"):
             raise ArgumentError("byte_order", f"{byte_order!r}: use little or big")
-        return cls(
-            shape=(int(sides[1]), int(sides[2])), bits=bits, byte_order="big" if byte_order == "big" else "little"
-        )
+        return validate(cls, {"shape": [int(sides[1]), int(sides[2])], "bits": bits, "byte_order": byte_order}, "raw")
 
     @property
     def kind(self) -> np.dtype[Any]:

@@ -82,12 +82,12 @@ def load_capture_list(name: Path | str) -> CaptureList:
         if name_of_field in data:
             raise MitsimError(f"list {path}: is {kind}")
     listed = validate(CaptureList, data, f"list {path}")
-    prepare = listed.prepare.model_copy(update=_placed(listed.prepare, path.parent, *CORRECTIONS))
+    prepare = listed.prepare.model_copy(update=_from_folder(listed.prepare, path.parent, *CORRECTIONS))
     in_file = ("patterns",) if listed.patterns is not None and listed.patterns.endswith(".json") else ()
-    return listed.model_copy(update={"prepare": prepare, **_placed(listed, path.parent, "ambient", *in_file)})
+    return listed.model_copy(update={"prepare": prepare, **_from_folder(listed, path.parent, "ambient", *in_file)})
 
 
-def _placed(holder: Configuration, folder: Path, *names: str) -> dict[str, str]:
+def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, str]:
     """Those of the fields ``names`` that hold a path, from ``folder`` on."""
     return {name: str(folder / path) for name in names if (path := getattr(holder, name)) is not None}
 

@@ -201,6 +201,19 @@ class _Fit:
             raise ArgumentError("projector_pixels", f"{n}: the calibration has {left[1]} x {right[1]}; leave it out")
         return cls(dict(calibration.manifest.camera), (left[0], right[0]), (left[1], right[1]))
 
+    def part(self, path: Path, frame: Channel, how: Preparation) -> Channel:
+        """Of a ``frame`` of the file ``path`` the part that the calibration is of: all of it, or the middle of a plane
+        of which nobody states a crop. MitsimError for another size."""
+        if self.shape is None:
+            return frame
+        if how.channel is not None and how.crop is None:
+            row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, self.shape, strict=True))
+            if min(row, column) >= 0:  # as FlatCam's loader cuts it
+                frame = frame[row : row + self.shape[0], column : column + self.shape[1]]
+        if frame.shape != self.shape:
+            raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(self.shape)}")
+        return frame
+
 
 @dataclass(frozen=True)
 class _Numbers:
@@ -230,6 +243,24 @@ class _Numbers:
                 cause += f"switch that off, or give a camera file of {bits} bits"
         return cls(path, float(frame.min()), high, whole, frame.dtype, cause)
 
+    def check(self, camera: Electronics, factor: int, mean: bool = False) -> None:
+        """MitsimError for numbers that, divided by a ``factor``, a ``camera`` does not give; a ``mean`` need not be
+        whole."""
+        largest, low, high = camera.largest, self.low / factor, self.high / factor
+        if largest is None:
+            return
+        counts = f"camera {camera.name} counts"
+        if not mean and not self.whole:
+            raise MitsimError(f"{self.path}: holds fractions, but {counts} whole numbers; give single shots")
+        if high > largest or (low < 0 and not mean):
+            number = low if low < 0 else high
+            raise MitsimError(f"{self.path}: has the number {number:g}, but {counts} 0 to {largest}: {self.cause}")
+        if not mean and self.kind.kind != "f" and np.iinfo(self.kind).max < largest:
+            raise MitsimError(
+                f"{self.path}: holds numbers of {8 * self.kind.itemsize} bits, but {counts} to {largest}: they were "
+                "made smaller; save them as they are, or give a camera file of these numbers"
+            )
+
 
 class _Scan:
     """All frames, looked at once: where they are, their size and numbers."""
@@ -253,18 +284,8 @@ class _Scan:
                 self._common.add(frame)
 
     def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
-        """What all numbers are divided by, what is said of it, and what is doubtful.
-
-        Parameters
-        ----------
-        stated
-            factor that somebody states; None: numbers beyond the camera's range are divided by the one that they have.
-
-        Raises
-        ------
-        MitsimError
-            for a stated one that they do not have.
-        """
+        """What all numbers are divided by, what is said of it, and what is doubtful; it is the factor that somebody
+        ``stated``, if not None. MitsimError for one that they do not have."""
         found, largest = self._common.factor, self._camera.largest
         if stated is not None:
             if found % stated:
@@ -287,7 +308,7 @@ class _Scan:
     def check(self, factor: int) -> None:
         """MitsimError for numbers that, divided by a ``factor``, this camera does not give."""
         for each in self._numbers:
-            check_numbers(each.path, each, self._camera, factor)
+            each.check(self._camera, factor)
 
 
 class _Shots:
@@ -313,76 +334,8 @@ class _Shots:
 
     def frame(self, path: Path, values: Numbers) -> Channel:
         """The frame of ``values`` (rows, columns) of the file ``path``."""
-        made = part_of(path, self._preparer.frame(path, values), self._preparer.how, self._fit.shape)
-        return cast(Channel, made.astype(self._kind, copy=False))
-
-
-def part_of(path: Path, frame: Channel, how: Preparation, shape: tuple[int, int] | None) -> Channel:
-    """Of a frame of a plane the middle that a calibration is of, where nobody states another part.
-
-    Parameters
-    ----------
-    path
-        of the frame, for messages.
-    frame
-        (rows, columns).
-    how
-        what was done to it.
-    shape
-        of the calibration's frames; None: no calibration. Without a plane, or with a part stated, it must be the
-        frame's.
-
-    Raises
-    ------
-    MitsimError
-        for a frame of another size.
-    """
-    if how.channel is not None and how.crop is None and shape is not None:
-        row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, shape, strict=True))
-        if min(row, column) >= 0:  # as FlatCam's loader cuts it
-            frame = frame[row : row + shape[0], column : column + shape[1]]
-    if shape is not None and frame.shape != shape:
-        raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(shape)}")
-    return frame.copy()
-
-
-def check_numbers(path: Path, numbers: _Numbers, camera: Electronics, factor: int = 1, mean: bool = False) -> None:
-    """Whether a camera gives such numbers.
-
-    Parameters
-    ----------
-    path
-        of the file, for messages.
-    numbers
-        of a frame.
-    camera
-        whose they are to be.
-    factor
-        that they are divided by.
-    mean
-        whether this is a mean of frames, which need not be whole.
-
-    Raises
-    ------
-    MitsimError
-        for numbers that this camera does not give.
-    """
-    largest = camera.largest
-    if largest is None:
-        return
-    low, high = numbers.low / factor, numbers.high / factor
-    if not mean and not numbers.whole:
-        raise MitsimError(f"{path}: holds fractions, but camera {camera.name} counts whole numbers; give single shots")
-    if high > largest or (low < 0 and not mean):
-        raise MitsimError(
-            f"{path}: has the number {low if low < 0 else high:g}, but camera {camera.name} counts 0 to {largest}: "
-            f"{numbers.cause}"
-        )
-    if not mean and numbers.kind.kind != "f" and np.iinfo(numbers.kind).max < largest:
-        raise MitsimError(
-            f"{path}: holds numbers of {8 * numbers.kind.itemsize} bits, but camera {camera.name} counts to {largest}: "
-            "they were made smaller; save them as they are, or give a camera file of these numbers"
-        )
+        made = self._fit.part(path, self._preparer.frame(path, values), self._preparer.how)
+        return cast(Channel, np.array(made, self._kind))  # whole pictures are not kept for their parts
 
 
 def _ambient(
@@ -394,8 +347,8 @@ def _ambient(
     total, count = np.zeros(shape), 0
     for path in image_files(known.ambient, known.wanted):
         for frame in read_images(path, known.wanted):
-            check_numbers(path, _Numbers.of(path, frame, camera), camera, preparer.how.divide_by or 1, mean=True)
-            part = part_of(path, preparer.frame(path, frame, mean=True), preparer.how, fit.shape)
+            _Numbers.of(path, frame, camera).check(camera, preparer.how.divide_by or 1, mean=True)
+            part = fit.part(path, preparer.frame(path, frame, mean=True), preparer.how)
             if part.shape != shape:
                 raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
             total, count = total + part, count + 1
