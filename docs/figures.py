@@ -1,10 +1,11 @@
 """Figures that the pages state: the commands and formulas that give them in, docs/figures.json and the pages out.
 
-    python docs/figures.py [closed] [plan] [tour] [pictures]        all, unless some are named; `make figures`
+    python docs/figures.py [closed] [plan] [tour] [walks] [pictures]    all, unless some are named; `make figures`
 
 *closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, and
-their outputs. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory in README stay: they
-are an idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
+their outputs. *walks*: the commands of docs/bench.md through captures, half a minute, their outputs and pictures.
+*pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory on a page stay: they are an idle
+machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
 """
 
 from __future__ import annotations
@@ -57,6 +58,10 @@ PHYSICS, IMAGES_PAGE, BENCH, STUDIES = "docs/physics.md", "docs/reconstruction.m
 STATED = (
     Stated("README.md", "# {}, as above", "tour.psnr_db", ".2f"),
     Stated(BENCH, "captures and calibrates itself it is {} dB", "tour.psnr_db", ".1f"),
+    Stated(BENCH, "correlate with theirs at {} (red)", "walks.correlation_r", ".2f"),
+    Stated(BENCH, "(red), {} and", "walks.correlation_gb", ".2f"),
+    Stated(BENCH, "and {} (green)", "walks.correlation_gr", ".2f"),
+    Stated(BENCH, "(green) and {} (blue)", "walks.correlation_b", ".2f"),
     Stated(STUDIES, "`, {} dB under 49 dots, seed 0", "tour.psnr_db", ".2f"),
     Stated(PHYSICS, "off by a Delta E of {} in the mean", "closed.delta_e_floor", ".2f"),
     Stated(PHYSICS, "in the mean, {} at most", "closed.delta_e_floor_most", ".1f"),
@@ -301,6 +306,87 @@ def plan(work: Path) -> dict[str, float]:
     }
 
 
+# ---- walks of docs/bench.md through captures -------------------------------------------------------------------------
+
+WALKS = "## 2. A FlatCam", "## 3. A DiffuserCam"
+_EXAMPLE = re.compile(r"^    \$ mitsim (.*)\n((?:    (?!\$ ).*\n)*)", flags=re.M)
+LEFT_OUT = "..."
+"""What a page prints in the place of words that it leaves out."""
+
+
+def section(page: str, heading: str) -> str:
+    """What stands on a ``page`` under a ``heading`` of the second level."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return text.partition(f"\n{heading}\n")[2].partition("\n## ")[0]
+
+
+def examples(text: str) -> list[tuple[str, str]]:
+    """Commands after `mitsim` in a ``text``, and the output under each."""
+    return _EXAMPLE.findall(text)
+
+
+def put_inputs(heading: str, folder: Path) -> None:
+    """What the commands of a walk read: the captures and the walk's list, in ``folder``."""
+    if not (folder / "captures").exists():
+        (folder / "captures").symlink_to(ROOT / "captures")
+    for listed in re.findall(r"^```toml\n(.*?)^```", section(BENCH, heading), flags=re.M | re.S):
+        (folder / "known.toml").write_text(listed, encoding="utf-8")
+
+
+def walked(heading: str, folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Each command of a walk, the output under it, and what it prints now in ``folder``."""
+    put_inputs(heading, folder)
+    for command, reported in examples(section(BENCH, heading)):
+        program = [sys.executable, "-m", "mitsim", *shlex.split(command), "--quiet"]
+        done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
+        yield command, reported, done.stdout + done.stderr
+
+
+def pairs(reported: str, now: str) -> list[tuple[str, str]]:
+    """Each figure of an output that a page has, and the same of the output ``now``; seconds are the machine's.
+
+    ValueError where other words are printed, but for those that the page leaves out.
+    """
+    texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (reported, now)]
+    words = re.escape(_NUMBER.sub("#", texts[0])).replace(re.escape("#"), f"({_NUMBER.pattern})")
+    found = re.fullmatch(words.replace(re.escape(LEFT_OUT), ".*?"), texts[1])
+    if not found:
+        raise ValueError(f"a page has\n{texts[0]}\nand its command prints\n{texts[1]}")
+    return list(zip(_NUMBER.findall(texts[0]), found.groups(), strict=True))
+
+
+def correlations(folder: Path) -> dict[str, float]:
+    """Of the planes of capture 7's image in ``folder`` with its authors' image."""
+    import numpy as np
+    from PIL import Image
+
+    from mitsim.core.exr import read_frame
+
+    theirs = np.array(Image.open(folder / "captures" / "flatcam" / "rec_7.png"), float)
+    found = {}
+    for name, colour in {"r": 0, "gb": 1, "gr": 1, "b": 2}.items():
+        ours = read_frame(folder / "run7" / "reconstruction" / name / "image.exr")[0]["reflectance"]
+        found[name] = float(np.corrcoef(ours.ravel(), theirs[..., colour].ravel())[0, 1])
+    return found
+
+
+def walks(work: Path) -> dict[str, float]:
+    """The walks' commands run in ``work``; their figures stand in bench.md then, and their pictures are drawn."""
+    page = ROOT / BENCH
+    for heading in WALKS:
+        for command, reported, now in walked(heading, work):
+            new = iter([figure for _, figure in pairs(reported, now)])
+            words = re.sub(
+                f"({_MACHINE.pattern})|{_NUMBER.pattern}",
+                lambda found, new=new: found[0] if found[1] else next(new),
+                reported,
+            )
+            text = page.read_text(encoding="utf-8")
+            page.write_text(text.replace(f"{command}\n{reported}", f"{command}\n{words}"), encoding="utf-8")
+    subprocess.run([sys.executable, str(IMAGES / "make.py"), str(work), "flatcam", "diffusercam"], check=True)
+    return {f"correlation_{name}": value for name, value in correlations(work).items()}
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
@@ -325,7 +411,7 @@ def pictures(work: Path) -> dict[str, float]:
     return picture_figures()
 
 
-WAYS = {"closed": lambda _: closed(), "plan": plan, "tour": tour, "pictures": pictures}
+WAYS = {"closed": lambda _: closed(), "plan": plan, "tour": tour, "walks": walks, "pictures": pictures}
 
 
 def main() -> None:

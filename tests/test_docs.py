@@ -56,6 +56,19 @@ ACCURACY = "0.02"
 """For examples that name none: how the verbs fit together does not depend on it, and they take a tenth of the time."""
 
 
+def script(name: str) -> Any:
+    """A script of docs, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+figures = script("figures")
+
+
 def text_of(page: str) -> str:
     return (ROOT / page).read_text(encoding="utf-8")
 
@@ -68,18 +81,19 @@ def prose_of(page: str) -> str:
 
 @dataclass(frozen=True)
 class Example:
-    """A command of a page: its arguments after `mitsim`, and the exit status that the output under it tells."""
+    """A command of a page: its arguments after `mitsim`, the output under it, and the exit status that this tells."""
 
     arguments: list[str]
     status: int
+    output: str
 
 
-def examples(page: str) -> list[Example]:
+def examples(page: str, heading: str = "") -> list[Example]:
+    """Of a page, or of what stands under one ``heading`` of it."""
     found = []
-    for match in re.finditer(r"^    \$ mitsim (.*)\n((?:    (?!\$ ).*\n)*)", text_of(page), flags=re.M):
-        output = match[2]
+    for line, output in figures.examples(figures.section(page, heading) if heading else text_of(page)):
         status = 1 if "mitsim: warning" in output else 2 if "mitsim: " in output else 0
-        found.append(Example(shlex.split(match[1], comments=True), status))
+        found.append(Example(shlex.split(line, comments=True), status, output))
     return found
 
 
@@ -221,19 +235,6 @@ def test_the_json_of_a_page_is_json(page: str) -> None:
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
-
-
-def script(name: str) -> Any:
-    """A script of docs, as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-figures = script("figures")
 
 
 @pytest.mark.slow

@@ -1,9 +1,10 @@
-"""The pictures of the README, from nothing but mitsim's own commands: a demo, and a scene of many depths.
+"""The pictures of README and docs/bench.md, from nothing but mitsim's own commands.
 
-    python docs/images/make.py WORK [demo] [depth]
+    python docs/images/make.py WORK [demo] [depth] [bench]
+    python docs/images/make.py WORK flatcam diffusercam
 
-Both, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are
-used again.
+All of the first line, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call
+found there are used again. Those of the second are of what the walks of docs/bench.md left in WORK.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
@@ -25,16 +27,18 @@ COMMANDS = {
     "run-uniform": ("capture", "photograph", "--patterns", "uniform"),
     "cal": ("calibrate", "photograph"),
     "bag": ("capture", "cookie_bag", "--patterns", "dots:7x16"),
+    "dots": ("patterns", "dots:7"),
+    "stripes": ("patterns", "stripes", "--camera", "imx249", "--exposure", "0.006"),
 }
 Panel = tuple[str, np.ndarray]
-"""Title, and image (n, n) as it is shown: numbers in 0..1 in grey, anything else is a depth [mm]."""
+"""Title, and image (n, n) as it is shown: numbers in 0..1 in grey or of red, green and blue, else a depth [mm]."""
 
 
 def main() -> None:
     work, names = Path(sys.argv[1]), sys.argv[2:]
     work.mkdir(exist_ok=True)
-    for picture in (demo, depth):
-        if not names or picture.__name__ in names:
+    for picture in (demo, depth, bench, flatcam, diffusercam):
+        if picture.__name__ in (names or ("demo", "depth", "bench")):
             draw(picture.__name__, *picture(work))
 
 
@@ -63,6 +67,51 @@ def depth(work: Path) -> list[Panel]:
     ]
 
 
+def bench(work: Path) -> list[Panel]:
+    """What a projector shows, what a camera records, and what comes of it."""
+    made(work, "run", "cal", "dots", "stripes")
+    frame, found = image(work, "run/frame_00024.exr", "DN"), psnr(work, "run")
+    return [
+        ("On the board: pattern 13 of 512", lit(work / "stripes/patterns/pattern_00012.png")),
+        ("On the object: pattern 25 of 49", lit(work / "dots/patterns/pattern_00024.png")),
+        ("The frame under it", frame / frame.max()),
+        (f"The image of all 49 frames: {found:.1f} dB", lightness(image(work, "run-image/image.exr"))),
+    ]
+
+
+def flatcam(work: Path) -> list[Panel]:
+    """A raw capture, and its images by factors that another capture told and by its authors' calibration."""
+    raw = picture(work / "captures/flatcam/fc_7.png")[::2, 1::2]  # as a mosaic it would be a grid of dots
+    return [
+        ("Green plane of the raw capture", (raw - raw.min()) / (raw.max() - raw.min())),
+        ("Image by what another capture told", picture(work / "run7/reconstruction/image.png")),
+        ("The authors' image", lightness(picture(work / "captures/flatcam/rec_7.png"))),
+    ]
+
+
+def diffusercam(work: Path) -> list[Panel]:
+    """The light of a point, a raw capture and the image."""
+    light, raw = (picture(work / f"captures/diffusercam/{name}.tif") for name in ("psf_sample", "rawdata_hand_sample"))
+    return [
+        ("Light of one point", light / light.max()),
+        ("Raw capture", raw / raw.max()),
+        ("Image", picture(work / "hand/reconstruction/image.png")),
+    ]
+
+
+def lit(path: Path) -> np.ndarray:
+    """A number for each cell of a projector's picture: of the part that `white.png` beside it lights."""
+    rows, columns = (np.flatnonzero(picture(path.with_name("white.png")).any(axis=axis)) for axis in (1, 0))
+    cells = (side[side.size // 256 :: side.size // 128] for side in (rows, columns))  # the middle of each of 128
+    return picture(path)[np.ix_(*cells)]
+
+
+def picture(path: Path) -> np.ndarray:
+    """Numbers of a picture of 8 or 16 bits over the largest that it may hold."""
+    values = np.array(Image.open(path))
+    return values / np.iinfo(values.dtype).max
+
+
 def made(work: Path, *folders: str) -> None:
     """Run the commands of the ``folders`` that are not there yet."""
     for folder in folders:
@@ -83,8 +132,8 @@ def image(work: Path, path: str, channel: str = "reflectance") -> np.ndarray:
 
 
 def draw(name: str, *panels: Panel) -> None:
-    """The picture ``name`` of four ``panels``, their titles as text in the file too."""
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    """The picture ``name`` of some ``panels``, their titles as text in the file too."""
+    figure = Figure(figsize=(3 * len(panels), 3.4), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (title, values) in zip(figure.subplots(1, len(panels)), panels, strict=True):
         if values.max() <= 1:

@@ -132,7 +132,7 @@ def import_(
         payload = _import_frames(context, source, output, frames)
     lines = []
     if payload["output"]:
-        lines.append(f"{payload['frames']} frames: {payload['output']}")
+        lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
     if payload["calibration_output"]:
         lines.append(f"calibration: {payload['calibration_output']}")
     elif "calibration" in payload["holds"]:
@@ -147,38 +147,32 @@ def _import_frames(context: typer.Context, source: Path, output: Path, frames: F
     from mitsim.core.imagelist import BARE, Raw
     from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 
-    listed, base = (CaptureList(), Path()) if frames.list is None else load_capture_list(frames.list)
-    patterns = frames.patterns or listed.patterns
-    if patterns is None:
-        raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
-    if frames.patterns is None and patterns.endswith(".json"):
-        patterns = str(base / patterns)
+    listed = CaptureList() if frames.list is None else load_capture_list(frames.list)
     bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
     if frames.shape is None or not bare:
         refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
-    if not takes_seed(patterns):
-        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
-    ambient, raw = frames.ambient_frame, listed.raw
+    said: dict[str, Any] = {"prepare": _preparation(frames, listed.prepare)}
+    if frames.patterns is not None:
+        said["patterns"] = frames.patterns
+    if frames.ambient_frame is not None:
+        said |= {"ambient": str(frames.ambient_frame), "ambient_shots": frames.ambient_shots}
+    elif listed.ambient_shots is None:
+        said["ambient_shots"] = frames.ambient_shots
+    if frames.projector_pixels is not None or frames.calibration is not None:
+        said["n"] = frames.projector_pixels
     if frames.shape is not None:
-        raw = Raw.of(frames.shape, frames.bits, frames.byte_order)
-    if ambient is None and listed.ambient is not None:
-        ambient = base / listed.ambient
-    n = frames.projector_pixels
+        said["raw"] = Raw.of(frames.shape, frames.bits, frames.byte_order)
+    if is_given(context, "seed"):
+        said["seed"] = frames.seed
     known = RealCapture(
-        patterns,
+        listed.model_copy(update=said),
         frames.camera,
         frames.exposure,
         calibration=frames.calibration,
-        n=listed.n if n is None and frames.calibration is None else n,
         black_level_dn=frames.black_level,
-        ambient=ambient,
-        ambient_shots=frames.ambient_shots if frames.ambient_frame else listed.ambient_shots or frames.ambient_shots,
-        raw=raw,
-        seed=frames.seed if is_given(context, "seed") else listed.seed,
-        prepare=_preparation(frames, listed.prepare),
-        base=base,
-        listed=listed,
     )
+    if not takes_seed(known.patterns):
+        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
     known.check(source)  # refused before numpy is imported
     from mitsim.exchange.real import import_frames
 
@@ -192,8 +186,7 @@ def _preparation(frames: Frames, listed: Preparation) -> Preparation:
     paths = {"dark": frames.dark_frame, "flat": frames.flat_frame, "flat_dark": frames.flat_dark_frame}
     stated = {"channel": frames.channel, "mosaic": frames.mosaic, "divide_by": frames.divide, "turn_deg": frames.turn}
     given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-    # Of where the command runs, not of the list's folder.
-    given.update({name: str(Path(path).absolute()) for name, path in paths.items() if path is not None})
+    given.update({name: path for name, path in paths.items() if path is not None})
     if frames.channel is not None:
         check_channel(frames.channel)
     if frames.orientation is not None:

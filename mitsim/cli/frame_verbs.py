@@ -182,6 +182,7 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Common) -> in
         payload["status"],
         *([] if result.quality is None else [str(result.quality)]),
         f"lambda {payload['lambda']:.3g}, {rank}residual {payload['residual']:.1e}: {payload['output']}",
+        *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
         *([] if result.reconstruction.focus is None else [str(result.reconstruction.focus)]),
         *result.reconstruction.trust,
     ]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import pydantic
 
 from mitsim.core.errors import MitsimError, cut, near_name
-from mitsim.core.files import read_text
+from mitsim.core.files import BYTE_ORDER_MARK, read_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,7 +53,7 @@ def shipped_path(*parts: str) -> Path:
 def read_toml(path: Path | str) -> dict[str, Any]:
     """The table in the TOML file ``path`` of at most 64 KiB. MitsimError when it cannot be read or is not TOML."""
     try:
-        text = read_text(path, _MOST_BYTES)
+        text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
         if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
             raise ValueError(f"a line with over {_MOST_DOTS} dots")

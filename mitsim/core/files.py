@@ -329,11 +329,15 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return unique
 
 
+BYTE_ORDER_MARK = "\ufeff"
+"""Which editors of Windows begin a file with."""
+
+
 def read_json(path: Path | str) -> Any:
     """The object in the JSON file ``path`` of at most 32 MiB. MitsimError when it cannot be read, is not JSON, or has a
     key twice."""
     try:
-        return parse_json(read_text(path, MOST_BYTES))
+        return parse_json(read_text(path, MOST_BYTES).removeprefix(BYTE_ORDER_MARK))
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid JSON ({error}); write or copy it again") from error
 

@@ -1,5 +1,9 @@
-"""Which pictures are read, how, and what is done to their numbers before they are frames: a folder in, its files in the
-order of their numbers out; none is opened."""
+"""What a list or a command line says of pictures: which are read, how, and what is done to their numbers before they
+are frames. A folder in, its files in the order of their numbers out.
+
+None is opened here, and numpy is not imported, so that a mistake is told at once. `mitsim.core.images` reads numbers,
+`mitsim.core.prepare` makes frames of them.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +38,8 @@ calibration/ov5647.toml."""
 _Wavelength = Annotated[float, Field(ge=1, le=1e6)]
 BGGR = "BGGR"
 """The mosaic of cameras that do not state theirs: FlatCam's."""
+CORRECTIONS = "dark", "flat", "flat_dark"
+"""Fields of a preparation that are paths of frames."""
 TO_FILE = "file"
 """The orientation that a file states."""
 _LARGEST_TURN = 45.0
@@ -54,7 +60,7 @@ class Raw(Configuration):
 
     @classmethod
     def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
-        """From what the command line says.
+        """From what the command line says; MitsimError for what is none.
 
         Parameters
         ----------
@@ -62,11 +68,6 @@ class Raw(Configuration):
             ROWSxCOLUMNS.
         bits, byte_order
             as the class has them.
-
-        Raises
-        ------
-        MitsimError
-            for what is none.
         """
         sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
         if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
@@ -75,9 +76,7 @@ class Raw(Configuration):
             raise ArgumentError("bits", f"{bits}: give the bits of a number in such a file, 1 to 32")
         if byte_order not in ("little", "big"):
             raise ArgumentError("byte_order", f"{byte_order!r}: use little or big")
-        return cls(
-            shape=(int(sides[1]), int(sides[2])), bits=bits, byte_order="big" if byte_order == "big" else "little"
-        )
+        return validate(cls, {"shape": [int(sides[1]), int(sides[2])], "bits": bits, "byte_order": byte_order}, "raw")
 
     @property
     def kind(self) -> np.dtype[Any]:

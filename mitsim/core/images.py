@@ -38,6 +38,8 @@ Numbers = npt.NDArray[Any]
 """(rows, columns) numbers of a picture: whole, or real; where colours are wanted, (rows, columns, 3 or 4)."""
 _PNG_BITS = {"1": 1, "L;2": 2, "L;4": 4, "L": 8, "I;16B": 16}
 """Of a grey number in a PNG, by Pillow's name of how it is stored."""
+_COLOURS_A_PIXEL = 3, 4
+"""Numbers of a pixel in colour, without and with transparency: pages of so few columns are none of a camera."""
 _COLOURS = "RGB", "RGBA"
 """The same of numbers of 8 bits of red, green and blue."""
 _BITS, _COMPRESSION, _PHOTOMETRIC, _SAMPLES = 258, 259, 262, 339
@@ -50,6 +52,8 @@ _DNG_VERSION = 50706
 """Tag that every DNG has in its first page (Digital Negative Specification 1.4)."""
 _PLAIN = 1
 """Compression of a TIFF that has none."""
+_LOSSY = (6, 7)
+"""Compressions of TIFF by JPEG (TIFF 6.0; its technical note 2)."""
 _PAGE_KIND, _ORIENTATION, _TILES, _PARTS = 254, 274, (322, 323), 330
 """Tags of TIFF 6.0: NewSubfileType, Orientation, TileWidth and TileLength; SubIFDs of TIFF/EP, where raw files keep
 the picture itself."""
@@ -326,6 +330,8 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
     grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
     if not grey and not (wanted.colour and photometric == _RGB and set(bits) == {8}):
         raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
+    if grey and tags.get(_COMPRESSION, _PLAIN) in _LOSSY:
+        raise wanted.refusal(path, "is compressed by JPEG, which changes numbers; save it without, or by deflate")
     if tags.get(_PAGE_KIND, 0) & _NO_PAGE or _PARTS in tags:
         raise wanted.refusal(path, "holds previews, masks or parts beside the picture; save the picture alone")
     if tags.get(_ORIENTATION, _UPRIGHT) != _UPRIGHT:
@@ -342,6 +348,10 @@ def _npy(path: Path, wanted: Wanted) -> _Header:
     if len(array.shape) not in (2, 3) or array.dtype.kind not in kinds:
         payload = f"{array.dtype} of shape {array.shape}"
         raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
+    if len(array.shape) == 3 and sides[1] in _COLOURS_A_PIXEL:
+        rows, columns, colours = array.shape
+        kind = f"{rows} x {columns} pixels of {colours} numbers, as of red, green and blue"
+        raise wanted.refusal(path, f"holds {kind}; save one number a pixel, raw and not demosaiced")
     pages = array.shape[0] if len(array.shape) == 3 else 1
     # Columns first, a page is scattered over the whole file.
     at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)
@@ -442,7 +452,10 @@ def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
     numbers = [str(count) for count in bits]
     colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
     zero = " whose zero is black" if kind == "TIFF" else ""
-    return f"grey {kind} of {', '.join(numbers[:-1])} or {numbers[-1]} bits{zero}{colours}; save one number a pixel"
+    raw = "" if wanted.colour else ", raw and not demosaiced"
+    return (
+        f"grey {kind} of {', '.join(numbers[:-1])} or {numbers[-1]} bits{zero}{colours}; save one number a pixel{raw}"
+    )
 
 
 @contextmanager
@@ -479,7 +492,7 @@ def _open_picture(
             file.seek(0)
             if file.read(4) not in _BEGINNINGS:
                 raise ValueError(f"its header is none of a {kind}") from None
-            unread = "such as real numbers of 16 or 64 bits, or transparency"
+            unread = "such as real numbers of 16 or 64 bits, transparency, or a mosaic by its tags"
             raise MitsimError(
                 f"file {path}: its pixels are of a kind that is not read, {unread}; save it anew"
             ) from None

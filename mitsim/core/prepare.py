@@ -8,7 +8,7 @@ What is saturated in a file stays so: such pixels, and those that turning makes 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,11 @@ from mitsim.core.manifests import Digital
 LEAST_RESPONSE = 0.1
 """Of a pixel to even light, over the mean one, below which it is not corrected: it is defective or dark, and what
 divides it would multiply its noise by ten."""
-PLAIN = 16
-"""Numbers that differ, from which a common factor is no chance: of so many whole numbers all are even once in 2^16
-times."""
+_MOST_DIFFERENT = 16
+"""Numbers that differ, that are counted: no factor that so many have is a chance."""
+_NO_CHANCE = 1 << 15
+"""Once in so many times k whole numbers share some factor of this over k - 1 (its root): 16 even ones, 5 multiples of
+16."""
 _EDGE = 1e-9
 """Pixels beyond the last one that rounding of a sine and cosine leaves."""
 
@@ -82,36 +84,26 @@ class Preparer:
             for dark or flat frames that cannot be read, are of several sizes, or without light.
         """
         end = digital.saturation_dn if end is None else end
-        plain = cls(how, digital, end)
-        dark = None if how.dark is None else plain.mean(base / how.dark, wanted)
-        if how.flat is None:
-            return plain if dark is None else plain.with_correction(dark, None, 0)
-        under = dark if how.flat_dark is None else plain.mean(base / how.flat_dark, wanted)
-        flat = plain.mean(base / how.flat, wanted)
-        for name, other in (("dark", dark), ("flat_dark", under)):
-            if other is not None and other.shape != flat.shape:
-                raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
-        light = flat - (plain.level if under is None else under)
-        whole = plain.plane(light)
-        if not whole.mean() > 0:
-            raise MitsimError(f"{base / how.flat}: has no more light than its dark frames; give a lit one")
-        response = light / whole.mean()
-        unlit = plain.plane(response) < LEAST_RESPONSE
-        return plain.with_correction(dark, np.where(response < LEAST_RESPONSE, 1.0, response), int(unlit.sum()))
-
-    def with_correction(self, dark: FloatArray | None, response: FloatArray | None, unlit: int) -> Preparer:
-        """The same with dark and flat frames.
-
-        Parameters
-        ----------
-        dark, response, unlit
-            as the class has them.
-        """
-        digital = self.digital
-        if self.end is not None:
-            top = (self.end - (self.level if dark is None else dark)) / (1.0 if response is None else response)
-            digital = digital.model_copy(update={"saturation_dn": float(np.max(top)) + self.level})
-        return Preparer(self.how, digital, self.end, dark, response, unlit)
+        plain, response, unlit = cls(how, digital, end), None, 0
+        dark, under = (
+            None if path is None else plain.mean(base / path, wanted) for path in (how.dark, how.flat_dark or how.dark)
+        )
+        if how.flat is not None:
+            flat = plain.mean(base / how.flat, wanted)
+            for name, other in (("dark", dark), ("flat_dark", under)):
+                if other is not None and other.shape != flat.shape:
+                    raise MitsimError(f"{base / how.flat}: is {_size(flat)}, but {name} {_size(other)}; give one size")
+            light = flat - (plain.level if under is None else under)
+            mean = plain.plane(light).mean()
+            if not mean > 0:
+                raise MitsimError(f"{base / how.flat}: has no more light than its dark frames; give a lit one")
+            response = light / mean
+            unlit = int((plain.plane(response) < LEAST_RESPONSE).sum())
+            response[response < LEAST_RESPONSE] = 1.0
+        if end is not None and (dark is not None or response is not None):
+            top = (end - (plain.level if dark is None else dark)) / (1.0 if response is None else response)
+            digital = digital.model_copy(update={"saturation_dn": float(np.max(top)) + plain.level})
+        return cls(how, digital, end, dark, response, unlit)
 
     @property
     def level(self) -> float:
@@ -242,16 +234,60 @@ def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[i
     return (crop.row, crop.column), end
 
 
-def factor_of(values: Numbers, known: int = 0) -> int:
-    """Largest whole number that divides all of the ``values`` and the ``known`` one; 0 of zeros alone."""
-    if values.dtype.kind not in "ui" and not np.array_equal(values, np.rint(values)):
-        return 1
-    found = known
-    for row in values:  # of noisy numbers the first row tells
-        found = int(np.gcd.reduce(np.append(row.astype(np.int64), found)))
-        if found == 1:
-            break
-    return found
+@dataclass
+class CommonFactor:
+    """What all numbers of some files are multiples of.
+
+    Attributes
+    ----------
+    factor
+        largest whole number that divides all; 0 of zeros alone.
+    high
+        largest number.
+    """
+
+    factor: int = 0
+    high: float = 0.0
+    _bits: int = 0
+    _different: set[float] = field(default_factory=set)
+
+    def add(self, values: Numbers) -> None:
+        """Count a frame's ``values`` (rows, columns)."""
+        self.high, self._bits = max(self.high, float(values.max())), 8 * values.dtype.itemsize
+        if len(self._different) < _MOST_DIFFERENT:
+            self._different.update(np.unique(values)[:_MOST_DIFFERENT].tolist())
+        if values.dtype.kind not in "ui" and not np.array_equal(values, np.rint(values)):
+            self.factor = 1
+        for row in values:  # of noisy numbers the first row tells
+            if self.factor == 1:
+                break
+            self.factor = int(np.gcd.reduce(np.append(row.astype(np.int64), self.factor)))
+
+    def shift(self, end: float | None) -> int:
+        """What the numbers of a camera that counts to ``end`` are multiplied by in the high bits of these files, where
+        these are multiples of it; else 1."""
+        shift = 1 if end is None else 1 << max(self._bits - int(end).bit_length(), 0)
+        return shift if self.factor % shift == 0 else 1
+
+    def choose(self, end: float | None) -> tuple[int, int]:
+        """What to divide by, and what to divide by if the numbers were shifted or scaled all the same.
+
+        Parameters
+        ----------
+        end
+            largest number that the camera counts to; None: not known.
+
+        Returns
+        -------
+        int, int
+            factor of numbers beyond the camera's range, else 1; factor that is doubtful, else 1.
+        """
+        chance = self.factor ** (len(self._different) - 1) < _NO_CHANCE
+        shift = self.shift(end)
+        likely = shift if shift > 1 else self.factor
+        if end is not None and self.high > end >= self.high / max(likely, 1) and (shift > 1 or not chance):
+            return likely, 1
+        return 1, 1 if chance else likely
 
 
 def _size(values: npt.NDArray[np.generic]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from mitsim.core.configuration import Configuration, locate, read_toml, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain, read_json
-from mitsim.core.imagelist import ALL, Preparation, Raw, Wanted, image_files
+from mitsim.core.imagelist import ALL, CORRECTIONS, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
@@ -69,8 +69,8 @@ class CaptureList(Configuration):
         return self
 
 
-def load_capture_list(name: Path | str) -> tuple[CaptureList, Path]:
-    """The list of a ``name``, shipped, or in a TOML or JSON file; and the folder that paths in it begin in.
+def load_capture_list(name: Path | str) -> CaptureList:
+    """The list of a ``name``, shipped, or in a TOML or JSON file; its paths begin where the command runs.
 
     MitsimError when there is none, or it breaks a rule.
     """
@@ -81,7 +81,15 @@ def load_capture_list(name: Path | str) -> tuple[CaptureList, Path]:
     for name_of_field, kind in _OTHERS.items():
         if name_of_field in data:
             raise MitsimError(f"list {path}: is {kind}")
-    return validate(CaptureList, data, f"list {path}"), path.parent
+    listed = validate(CaptureList, data, f"list {path}")
+    prepare = listed.prepare.model_copy(update=_from_folder(listed.prepare, path.parent, *CORRECTIONS))
+    in_file = ("patterns",) if listed.patterns is not None and listed.patterns.endswith(".json") else ()
+    return listed.model_copy(update={"prepare": prepare, **_from_folder(listed, path.parent, "ambient", *in_file)})
+
+
+def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, str]:
+    """Those of the fields ``names`` that hold a path, from ``folder`` on."""
+    return {name: str(folder / path) for name in names if (path := getattr(holder, name)) is not None}
 
 
 @dataclass(frozen=True)
@@ -115,8 +123,8 @@ class RealCapture:
 
     Attributes
     ----------
-    patterns
-        name of the family, or `patterns.json` of `mitsim export --format png`.
+    listed
+        what a list says, or options in the place of it.
     camera
         electronics: name of a shipped file, or a TOML file; None: as ``listed`` says.
     exposure_s
@@ -124,44 +132,37 @@ class RealCapture:
     calibration
         CAL folder of the same camera, which tells its identity and the projector's pixels; of all planes a coloured
         one.
-    n
-        projector pixels a side, without a calibration.
     black_level_dn
         digital number of a (binned) pixel without charge, where it is another than the camera's.
-    ambient
-        frame, or folder of frames, with the projector off.
-    ambient_shots
-        that the single frame is the mean of.
-    raw
-        how files without a header are read.
-    seed
-        of patterns of a `random` family.
-    prepare
-        what is done to the files' numbers.
-    base
-        folder that paths of ``prepare`` begin in.
-    listed
-        list that says the rest.
     """
 
-    patterns: str
-    camera: str | None
-    exposure_s: float | None
+    listed: CaptureList
+    camera: str | None = None
+    exposure_s: float | None = None
     calibration: Path | None = None
-    n: int | None = None
     black_level_dn: float | None = None
-    ambient: Path | None = None
-    ambient_shots: int | None = None
-    raw: Raw | None = None
-    seed: int = 0
-    prepare: Preparation = field(default_factory=Preparation)
-    base: Path = Path()
-    listed: CaptureList = field(default_factory=CaptureList)
+
+    @property
+    def patterns(self) -> str:
+        """Name of the family, or file of `mitsim export --format png`. ArgumentError where nobody says it."""
+        if self.listed.patterns is None:
+            raise ArgumentError("patterns", "is not given, and frames do not say it; give it")
+        return self.listed.patterns
+
+    @property
+    def prepare(self) -> Preparation:
+        """What is done to the files' numbers."""
+        return self.listed.prepare
+
+    @property
+    def ambient(self) -> Path | None:
+        """Frame, or folder of frames, with the projector off."""
+        return None if self.listed.ambient is None else Path(self.listed.ambient)
 
     @property
     def wanted(self) -> Wanted:
         """How its files are read."""
-        return Wanted.of(self.raw, self.prepare)
+        return Wanted.of(self.listed.raw, self.prepare)
 
     @property
     def in_file(self) -> bool:
@@ -206,25 +207,26 @@ class RealCapture:
 
     def check(self, source: Path) -> None:
         """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
-        check_root(self.seed)
-        if self.n is not None and self.n < 1:
-            raise ArgumentError("projector_pixels", f"{self.n}: give 1 or more, those a side")
-        if self.ambient_shots is not None and (self.ambient is None or self.ambient_shots < 1):
-            raise ArgumentError("ambient_shots", f"{self.ambient_shots}: give 1 or more, of an ambient frame")
+        listed = self.listed
+        check_root(listed.seed)
+        if listed.n is not None and listed.n < 1:
+            raise ArgumentError("projector_pixels", f"{listed.n}: give 1 or more, those a side")
+        if listed.ambient_shots is not None and (listed.ambient is None or listed.ambient_shots < 1):
+            raise ArgumentError("ambient_shots", f"{listed.ambient_shots}: give 1 or more, of an ambient frame")
         self.electronics()
         if self.calibration is not None:
             self._check_calibration(self.calibration)
-        elif self.n is None:
+        elif listed.n is None:
             raise ArgumentError(
                 "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
             )
         if self.in_file:
             check_plain(self.patterns)
         else:
-            read_name(self.patterns, self.n)
-        for name in ("dark", "flat", "flat_dark"):
+            read_name(self.patterns, listed.n)
+        for name in CORRECTIONS:
             if (path := getattr(self.prepare, name)) is not None:
-                image_files(self.base / path, self.wanted)
+                image_files(Path(path), self.wanted)
         image_files(source, self.wanted)
 
     def _check_calibration(self, folder: Path) -> None:

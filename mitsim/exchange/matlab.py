@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -559,15 +560,22 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
     Raises
     ------
     MitsimError
-        for a file without that plane.
+        for a file without that plane, and for one whose rows and columns are exchanged.
     """
     check_channel(channel)
     file = MatFile(path, {"angle": [[0.0]], **variables_in(path)})
     angle = float(file.matrix("angle")[0, 0])
+    size = tuple(map(int, file.matrix("cSize").ravel())) if "cSize" in file else ()
 
     def part(plane: str) -> Packed[CalibrationManifest]:
         """Of one plane."""
         sides = {name: file.image(f"{stem}{plane}") for name, stem in zip(FACTORS, ("P1", "Q1"), strict=True)}
+        pixels, scene = zip(*(side.shape for side in sides.values()), strict=True)
+        if size != pixels and all(map(operator.lt, pixels, scene)):
+            raise MitsimError(
+                f"{path}: P1{plane} and Q1{plane} have {pixels[0]} and {pixels[1]} pixels for {scene[0]} and "
+                f"{scene[1]} of the scene: rows and columns are exchanged; a file of version 7.3 holds columns first"
+            )
         manifest = CalibrationManifest(
             camera={"name": path.stem, "channel": plane},
             centre=True,

@@ -22,11 +22,11 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
 from mitsim.core.files import read_json, whole_folder
-from mitsim.core.imagelist import Preparation, image_files
+from mitsim.core.imagelist import CORRECTIONS, Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
-from mitsim.core.prepare import LEAST_RESPONSE, PLAIN, Preparer, factor_of
+from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.exchange.capture_list import Electronics, RealCapture
@@ -34,6 +34,8 @@ from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
 _SECONDS_PER_PIXEL = 1e-7
 """Of an import, which reads every frame twice and writes it once: some 30 s for 256 megapixels on a slow disk."""
+_MOST_STAMPED = 1e-3
+"""Of a picture's numbers, that are not light: of the public DiffuserCam capture two, chosen beyond a line of text."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
@@ -136,7 +138,7 @@ def _run_of(
     scan
         of all frames.
     """
-    preparer = Preparer.of(how, camera.digital, known.wanted, known.base)
+    preparer = Preparer.of(how, camera.digital, known.wanted)
     shots = _Shots(known, preparer, fit, scan.places, camera.largest is not None)
     shape = shots.frame(scan.places[0][0], scan.first).shape
     ambient = None if known.ambient is None else _ambient(known, camera, preparer, fit, shape)
@@ -188,28 +190,76 @@ class _Fit:
     @classmethod
     def of(cls, known: RealCapture, line: str = "") -> _Fit:
         """Of a ``line`` of the calibration; of the whole one by ""."""
+        n = known.listed.n
         if known.calibration is None:
-            if known.n is None:
+            if n is None:
                 raise AssertionError  # refused by RealCapture.check
-            return cls(None, None, (known.n, known.n))
+            return cls(None, None, (n, n))
         calibration: Packed[CalibrationManifest] = pack_calibration(known.calibration / line)
         left, right = (calibration.read(name)[0]["factor"].shape for name in FACTORS)
-        if known.n is not None and (known.n, known.n) != (left[1], right[1]):
-            raise ArgumentError(
-                "projector_pixels", f"{known.n}: the calibration has {left[1]} x {right[1]}; leave it out"
-            )
+        if n is not None and (n, n) != (left[1], right[1]):
+            raise ArgumentError("projector_pixels", f"{n}: the calibration has {left[1]} x {right[1]}; leave it out")
         return cls(dict(calibration.manifest.camera), (left[0], right[0]), (left[1], right[1]))
+
+    def part(self, path: Path, frame: Channel, how: Preparation) -> Channel:
+        """Of a ``frame`` of the file ``path`` the part that the calibration is of: all of it, or the middle of a plane
+        of which nobody states a crop. MitsimError for another size."""
+        if self.shape is None:
+            return frame
+        if how.channel is not None and how.crop is None:
+            row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, self.shape, strict=True))
+            if min(row, column) >= 0:  # as FlatCam's loader cuts it
+                frame = frame[row : row + self.shape[0], column : column + self.shape[1]]
+        if frame.shape != self.shape:
+            raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(self.shape)}")
+        return frame
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What the numbers of one frame are: smallest and largest, whether all are whole, and the type of their file."""
+    """What the numbers of one frame are: smallest and largest, whether all are whole, the type of their file, and what
+    else is seen of numbers that a camera does not count to."""
 
     path: Path
     low: float
     high: float
     whole: bool
     kind: np.dtype[Any]
+    cause: str
+
+    @classmethod
+    def of(cls, path: Path, frame: Numbers, camera: Electronics) -> _Numbers:
+        """Of a ``frame`` (rows, columns) in the file ``path``."""
+        whole, high = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame)), float(frame.max())
+        cause = "they were scaled, or the camera is another; save them as they are, or give the right camera file"
+        if camera.largest is not None and high > camera.largest:
+            bits = 8 * frame.itemsize
+            shift = 1 << max(bits - camera.largest.bit_length(), 0)
+            others = np.count_nonzero(frame % shift)
+            if 0 < others <= frame.size * _MOST_STAMPED:
+                cause = (
+                    f"but for {others} all are multiples of {shift}: the camera writes more than light into pictures; "
+                )
+                cause += f"switch that off, or give a camera file of {bits} bits"
+        return cls(path, float(frame.min()), high, whole, frame.dtype, cause)
+
+    def check(self, camera: Electronics, factor: int, mean: bool = False) -> None:
+        """MitsimError for numbers that, divided by a ``factor``, a ``camera`` does not give; a ``mean`` need not be
+        whole."""
+        largest, low, high = camera.largest, self.low / factor, self.high / factor
+        if largest is None:
+            return
+        counts = f"camera {camera.name} counts"
+        if not mean and not self.whole:
+            raise MitsimError(f"{self.path}: holds fractions, but {counts} whole numbers; give single shots")
+        if high > largest or (low < 0 and not mean):
+            number = low if low < 0 else high
+            raise MitsimError(f"{self.path}: has the number {number:g}, but {counts} 0 to {largest}: {self.cause}")
+        if not mean and self.kind.kind != "f" and np.iinfo(self.kind).max < largest:
+            raise MitsimError(
+                f"{self.path}: holds numbers of {8 * self.kind.itemsize} bits, but {counts} to {largest}: they were "
+                "made smaller; save them as they are, or give a camera file of these numbers"
+            )
 
 
 class _Scan:
@@ -219,7 +269,7 @@ class _Scan:
         self.files, self._camera = files, camera
         self.places: list[tuple[Path, int]] = []
         self._numbers: list[_Numbers] = []
-        self._factor, self._differ = 0, set[float]()
+        self._common = CommonFactor()
         for path in files:
             for number, frame in enumerate(read_images(path, known.wanted)):
                 if not self.places:
@@ -230,44 +280,27 @@ class _Scan:
                         "give frames of one size"
                     )
                 self.places.append((path, number))
-                whole = frame.dtype.kind != "f" or np.array_equal(frame, np.rint(frame))
-                self._numbers.append(_Numbers(path, float(frame.min()), float(frame.max()), whole, frame.dtype))
-                self._factor = factor_of(frame, self._factor)
-                if len(self._differ) < PLAIN:
-                    self._differ.update(np.unique(frame)[:PLAIN].tolist())
+                self._numbers.append(_Numbers.of(path, frame, camera))
+                self._common.add(frame)
 
     def factor(self, stated: int | None) -> tuple[int, list[str], list[str]]:
-        """What all numbers are divided by, what is said of it, and what is doubtful.
-
-        Parameters
-        ----------
-        stated
-            factor that somebody states; None: numbers beyond the camera's range are divided by the one that they have.
-
-        Raises
-        ------
-        MitsimError
-            for a stated one that they do not have.
-        """
-        largest, found = self._camera.largest, self._factor
+        """What all numbers are divided by, what is said of it, and what is doubtful; it is the factor that somebody
+        ``stated``, if not None. MitsimError for one that they do not have."""
+        found, largest = self._common.factor, self._camera.largest
         if stated is not None:
             if found % stated:
                 raise ArgumentError("divide_by", f"{stated}: the numbers' common factor is {found}; give that, or 1")
             return stated, [], []
-        high = max(each.high for each in self._numbers)
-        chance = len(self._differ) < PLAIN
-        if largest is not None and high > largest and found > 1:
-            bits = 8 * self._numbers[0].kind.itemsize - largest.bit_length()
-            shifted = 2 ** max(bits, 0)
-            factor = shifted if found % shifted == 0 else found
-            if high / factor <= largest and (factor == shifted or not chance):
-                kind = f" ({largest.bit_length()} bits in the high bits of {self._numbers[0].kind.itemsize * 8})"
-                all_are = f"numbers are divided by {factor}, which all are multiples of"
-                return factor, [all_are + (kind if factor == shifted else "")], []
-        if found > 1 and not chance:
+        factor, doubtful = self._common.choose(largest)
+        if factor > 1:
+            of = ""
+            if factor == self._common.shift(largest) and largest is not None:
+                of = f" ({largest.bit_length()} bits in the high bits of {8 * self.first.itemsize})"
+            return factor, [f"numbers are divided by {factor}, which all are multiples of{of}"], []
+        if doubtful > 1:
             doubt = (
                 f"all numbers are multiples of {found}, and are taken as they are: if the camera's numbers were "
-                f"shifted or scaled, give --divide {found}, else --divide 1"
+                f"shifted or scaled, give --divide {doubtful}, else --divide 1"
             )
             return 1, [], [doubt]
         return 1, [], []
@@ -275,7 +308,7 @@ class _Scan:
     def check(self, factor: int) -> None:
         """MitsimError for numbers that, divided by a ``factor``, this camera does not give."""
         for each in self._numbers:
-            check_numbers(each.path, each, self._camera, factor)
+            each.check(self._camera, factor)
 
 
 class _Shots:
@@ -301,76 +334,8 @@ class _Shots:
 
     def frame(self, path: Path, values: Numbers) -> Channel:
         """The frame of ``values`` (rows, columns) of the file ``path``."""
-        made = part_of(path, self._preparer.frame(path, values), self._preparer.how, self._fit.shape)
-        return cast(Channel, made.astype(self._kind, copy=False))
-
-
-def part_of(path: Path, frame: Channel, how: Preparation, shape: tuple[int, int] | None) -> Channel:
-    """Of a frame of a plane the middle that a calibration is of, where nobody states another part.
-
-    Parameters
-    ----------
-    path
-        of the frame, for messages.
-    frame
-        (rows, columns).
-    how
-        what was done to it.
-    shape
-        of the calibration's frames; None: no calibration. Without a plane, or with a part stated, it must be the
-        frame's.
-
-    Raises
-    ------
-    MitsimError
-        for a frame of another size.
-    """
-    if how.channel is not None and how.crop is None and shape is not None:
-        row, column = ((side - wanted) // 2 for side, wanted in zip(frame.shape, shape, strict=True))
-        if min(row, column) >= 0:  # as FlatCam's loader cuts it
-            frame = frame[row : row + shape[0], column : column + shape[1]]
-    if shape is not None and frame.shape != shape:
-        raise MitsimError(f"{path}: is {_size(frame.shape)}, but the calibration's frames are {_size(shape)}")
-    return frame.copy()
-
-
-def check_numbers(path: Path, numbers: _Numbers, camera: Electronics, factor: int = 1, mean: bool = False) -> None:
-    """Whether a camera gives such numbers.
-
-    Parameters
-    ----------
-    path
-        of the file, for messages.
-    numbers
-        of a frame.
-    camera
-        whose they are to be.
-    factor
-        that they are divided by.
-    mean
-        whether this is a mean of frames, which need not be whole.
-
-    Raises
-    ------
-    MitsimError
-        for numbers that this camera does not give.
-    """
-    largest = camera.largest
-    if largest is None:
-        return
-    low, high = numbers.low / factor, numbers.high / factor
-    if not mean and not numbers.whole:
-        raise MitsimError(f"{path}: holds fractions, but camera {camera.name} counts whole numbers; give single shots")
-    if high > largest or (low < 0 and not mean):
-        raise MitsimError(
-            f"{path}: has the number {low if low < 0 else high:g}, but camera {camera.name} counts 0 to {largest}: "
-            "they were scaled, or the camera is another; save them as they are, or give the right camera file"
-        )
-    if not mean and numbers.kind.kind != "f" and np.iinfo(numbers.kind).max < largest:
-        raise MitsimError(
-            f"{path}: holds numbers of {8 * numbers.kind.itemsize} bits, but camera {camera.name} counts to {largest}: "
-            "they were made smaller; save them as they are, or give a camera file of these numbers"
-        )
+        made = self._fit.part(path, self._preparer.frame(path, values), self._preparer.how)
+        return cast(Channel, np.array(made, self._kind))  # whole pictures are not kept for their parts
 
 
 def _ambient(
@@ -382,17 +347,15 @@ def _ambient(
     total, count = np.zeros(shape), 0
     for path in image_files(known.ambient, known.wanted):
         for frame in read_images(path, known.wanted):
-            numbers = _Numbers(path, float(frame.min()), float(frame.max()), True, frame.dtype)
-            check_numbers(path, numbers, camera, preparer.how.divide_by or 1, mean=True)
-            part = part_of(path, preparer.frame(path, frame, mean=True), preparer.how, fit.shape)
+            _Numbers.of(path, frame, camera).check(camera, preparer.how.divide_by or 1, mean=True)
+            part = fit.part(path, preparer.frame(path, frame, mean=True), preparer.how)
             if part.shape != shape:
                 raise MitsimError(f"{path}: is {_size(part.shape)}, but others are {_size(shape)}")
             total, count = total + part, count + 1
-    if known.ambient_shots is not None and count != 1:
-        raise ArgumentError(
-            "ambient_shots", f"{known.ambient_shots}: {known.ambient} holds {count} frames; leave it out"
-        )
-    return (total / count).astype(np.float32), known.ambient_shots or count
+    stated = known.listed.ambient_shots
+    if stated is not None and count != 1:
+        raise ArgumentError("ambient_shots", f"{stated}: {known.ambient} holds {count} frames; leave it out")
+    return (total / count).astype(np.float32), stated or count
 
 
 def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
@@ -410,7 +373,7 @@ def _patterns(known: RealCapture, scene: tuple[int, int]) -> Patterns:
         named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
         patterns = validate(Patterns, {**named, "captures": captures}, known.patterns)
     else:
-        left, right = (parse_patterns(known.patterns, side, known.seed) for side in scene)
+        left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
         family = PatternFamily(known.patterns, left.left, right.right)
         patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     sides = tuple(len(matrix) for matrix in patterns.matrices)
@@ -427,8 +390,8 @@ def _configuration(
     """All that decides the frames: whose files, and as what they are read."""
     more = () if known.ambient is None else image_files(known.ambient, known.wanted)
     corrected = {
-        name: {path.name: checksum(path) for path in image_files(known.base / place, known.wanted)}
-        for name in ("dark", "flat", "flat_dark")
+        name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
+        for name in CORRECTIONS
         if (place := getattr(how, name)) is not None
     }
     return {
@@ -440,7 +403,7 @@ def _configuration(
         "black_level_dn": known.black_level_dn,
         "channel": how.channel,
         "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
-        "seed": known.seed,
+        "seed": known.listed.seed,
     }
 
 

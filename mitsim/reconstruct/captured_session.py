@@ -31,7 +31,7 @@ from mitsim.core.images import image_size, own_end, read_image
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, Digital
 from mitsim.core.parallel import in_threads, single_threaded_blas
-from mitsim.core.prepare import PLAIN, factor_of
+from mitsim.core.prepare import CommonFactor
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.core.worker import workers
 from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
@@ -248,15 +248,16 @@ def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, .
     """
     prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
     if prepare.divide_by is None:
-        ends = [read_image(session.folder / name, session.wanted) for name in (session.files[0], session.files[-1])]
-        found = factor_of(ends[1], factor_of(ends[0]))
-        high = max(float(values.max()) for values in ends)
-        if found > 1 and len(np.unique(ends[0])) >= PLAIN:
-            if end is None or high <= end:
-                doubt = f"frames: all numbers of {session.files[0]} are multiples of {found}, and are taken as they are"
-                remedy = f"state prepare.divide_by = {found} if they were shifted or scaled, else 1"
-                return session.with_preparer(), (f"{doubt}; {remedy}",)
-            prepare = prepare.model_copy(update={"divide_by": found})
+        common = CommonFactor()
+        for name in (session.files[0], session.files[-1]):
+            common.add(read_image(session.folder / name, session.wanted))
+        factor, doubtful = common.choose(end)
+        if doubtful > 1:
+            are = f"are multiples of {common.factor}, and are taken as they are"
+            remedy = f"state prepare.divide_by = {doubtful} if they were shifted or scaled, else 1"
+            return session.with_preparer(), (f"frames: all numbers of {session.files[0]} {are}; {remedy}",)
+        if factor > 1:
+            prepare = prepare.model_copy(update={"divide_by": factor})
             session = replace(session, listed=session.listed.model_copy(update={"prepare": prepare}))
     return session.with_preparer(), ()
 

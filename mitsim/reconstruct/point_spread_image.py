@@ -16,7 +16,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
 from mitsim.reconstruct.point_spread import ShiftedLight, reduce_frame, solve_point_spread
-from mitsim.reconstruct.reconstruct import Reconstruction
+from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.reconstruct.request import TIKHONOV, Bounds, ImageRequest, plain_bounds
 
 _NUMBERS = 24
@@ -115,7 +115,13 @@ def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageReque
         as for :func:`reconstruct_psf_request`.
     """
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
-    asked = {"run": shots.fingerprint, "psf": digest, "reduce": reduce, "lambda": request.lam, "method": request.method}
+    asked = {
+        "run": shots.fingerprint,
+        POINT_SPREAD: digest,
+        "reduce": reduce,
+        "lambda": request.lam,
+        "method": request.method,
+    }
     return asked if request.bounds is None else {**asked, "bounds": plain_bounds(request.bounds)}
 
 

@@ -39,12 +39,14 @@ from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertai
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
+POINT_SPREAD = "psf"
+"""Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction(Solution):
-    """An image and how far to trust it: reflectance, 1 = the calibration's board. Its status counts misfit, and flags
-    of the capture and of the calibration.
+    """An image and how far to trust it: reflectance, 1 = the calibration's board; by a point spread function
+    electrons/s. Its status counts misfit, and flags of the capture and of the calibration.
 
     Attributes
     ----------
@@ -96,6 +98,13 @@ class Reconstruction(Solution):
         return self.uncertainties.total if self.uncertainties else None
 
     @property
+    def white(self) -> float:
+        """Number of the image that pictures show as white: 1; by a point spread function, whose image no board is
+        compared with, its largest."""
+        largest = float(self.image.max()) if POINT_SPREAD in self.inputs else 0.0
+        return largest if largest > 0 else 1.0
+
+    @property
     def trust(self) -> tuple[str, ...]:
         """A line on the misfit, and one on the uncertainty by source, where these are known."""
         return tuple(str(known) for known in (self.misfit, self.uncertainties) if known)
@@ -109,6 +118,7 @@ class Reconstruction(Solution):
             "condition": self.condition,
             "condition_whole": self.condition_whole,
             "condition_sides": self.condition_sides,
+            "white": self.white,
             "residual": self.residual,
             "iterations": self.iterations,
             "objective": self.objective,
@@ -166,7 +176,7 @@ class Reconstruction(Solution):
         if self.depths:
             write_frame(folder / DEPTH_FILE, self.depths.channels(), {"method": self.inputs["method"]})
         with whole_file(folder / "image.png") as part:
-            part.write_bytes(png(self.image))
+            part.write_bytes(png(self.image / self.white))
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
         return folder
 
@@ -176,7 +186,8 @@ class Reconstruction(Solution):
 
     def _repr_html_(self) -> str:
         facts = f"lambda {self.lam:.3g}, residual {self.residual:.1e} of the frames"
-        pictures = {"reflectance 0 to 1": self.image}
+        unit = "electrons/s" if POINT_SPREAD in self.inputs else "reflectance"
+        pictures = {f"{unit} 0 to {self.white:.3g}": self.image / self.white}
         if self.uncertainty is not None:
             caption = f"standard uncertainty of each pixel\n{span(self.uncertainty, 'of reflectance')}"
             pictures[caption] = normalise(self.uncertainty)

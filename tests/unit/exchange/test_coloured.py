@@ -16,7 +16,7 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.capture_list import RealCapture
+from mitsim.exchange.capture_list import CaptureList, RealCapture
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.exchange.real import import_frames
@@ -246,10 +246,10 @@ def test_pictures_of_every_line_are_read_again(coloured: Coloured, tmp_path: Pat
         words = note.split("mitsim import ")[1].split()
         options = dict(zip(words[1::2], words[2::2], strict=True))
         assert options["-o"] == f"RUN/{name}" and options["--calibration"] == f"CAL/{name}"
-        ambient = {"ambient": Path(options["--ambient-frame"])} if "--ambient-frame" in options else {}
+        ambient = {"ambient": options["--ambient-frame"], "ambient_shots": 5} if "--ambient-frame" in options else {}
         about = RealCapture(
-            options["--patterns"], str(coloured.run / "camera.toml"), float(options["--exposure"]),
-            coloured.calibration / name, ambient_shots=5 if ambient else None, **ambient,
+            CaptureList(patterns=options["--patterns"], **ambient), str(coloured.run / "camera.toml"),
+            float(options["--exposure"]), coloured.calibration / name,
         )  # fmt: skip
         import_frames(Path(words[0]), tmp_path / "run 2" / name, about)
         first, again = ms.load_run(coloured.run / name), ms.load_run(tmp_path / "run 2" / name)

@@ -11,6 +11,7 @@ import io
 import json
 import re
 import struct
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.devices.framelist import load_frames
-from mitsim.exchange.capture_list import RealCapture, load_capture_list
+from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 from mitsim.exchange.formats import export_run, import_file
 from mitsim.exchange.real import import_frames
 from mitsim.reconstruct.captured_session import calibrate_frames
@@ -191,8 +192,9 @@ def twelve(folder: Path) -> str:
 
 
 def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
-    """12 bits in 16, 8 bits spread over 16 (times 257), in frames and the ambient frame. (Planted: the factor of the
-    first frame alone.)"""
+    """12 bits in 16, 8 bits spread over 16 (times 257), in frames and the ambient frame. What a camera writes into the
+    first pixels, as DiffuserCam's does, is named. (Planted: the factor of the first frame alone; any number of others
+    taken for a stamp.)"""
     bench = made(tmp_path)
     dn = np.minimum(ms.load_run(bench.run).dn, 4095)
     about = replace(known(bench), camera=twelve(tmp_path))
@@ -208,9 +210,14 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     assert "divided by 16, which all are multiples of (12 bits in the high bits of 16)" in result["notes"][0]
     assert np.allclose(again.read("ambient.exr")[0]["DN"], dn[0] / 3)
     odd = dn * 16
-    odd[-1, -1, -1] += 1
-    written(tmp_path / "odd", "png", odd)
-    refused("they were scaled", tmp_path, tmp_path / "odd", about)
+    odd[:, 0, :2] = 24123, 36053
+    written(tmp_path / "stamped", "png", odd)
+    refused("but for 2 all are multiples of 16: the camera writes", tmp_path, tmp_path / "stamped", about)
+    for frames in (slice(-1, None), slice(None)):
+        odd = dn * 16
+        odd[frames, 1] += 1
+        written(tmp_path / f"odd {frames.start}", "png", odd)
+        refused("they were scaled", tmp_path, tmp_path / f"odd {frames.start}", about)
     eight = tmp_path / "eight.toml"
     eight.write_text(ELECTRONICS.replace("bits = 16", "bits = 8"))
     written(tmp_path / "b", "png", dn // 16 * 257)
@@ -233,6 +240,22 @@ def test_a_factor_within_the_cameras_range_is_doubted_unless_it_is_stated(tmp_pa
     refused("the numbers' common factor is 4", tmp_path, tmp_path / "a", known(bench, prepare=Preparation(divide_by=8)))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "times", "doubted"),
+    [(range(14, 19), 16, 16), (range(14, 19), 48, 16), (range(50, 70), 3, 3), ((14, 15), 32, 1), (range(14, 18), 2, 1)],
+)
+def test_few_numbers_of_a_dark_frame_tell_a_shift(
+    numbers: Iterable[int], times: int, doubted: int, tmp_path: Path
+) -> None:
+    """Within the camera's range, where five multiples of 16 are no chance, and two are one; all may share a larger
+    factor by chance. (Planted: sixteen numbers needed for any factor; the whole factor doubted.)"""
+    dark = np.random.default_rng(2).choice(list(numbers), (40, 36)).astype(np.uint16)
+    np.save(tmp_path / "dark.npy", dark * times)
+    about = RealCapture(CaptureList(patterns="uniform", n=4), twelve(tmp_path), 0.02, black_level_dn=10.0)
+    (*warning,) = import_frames(tmp_path / "dark.npy", tmp_path / "run", about)["warnings"]
+    assert len(warning) == (doubted > 1) and all(f"give --divide {doubted}, else" in each for each in warning)
+
+
 # -------- Folders: all planes, sessions, lists
 
 
@@ -251,12 +274,14 @@ def coloured(folder: Path) -> tuple[Path, np.ndarray, dict[str, np.ndarray]]:
 
 
 def test_all_planes_are_a_coloured_run_with_one_colour_image(tmp_path: Path) -> None:
+    """By a list as an editor of Windows begins it. (Planted: its byte order mark taken for a word.)"""
     (tmp_path / "cals").mkdir()
     calibration, mosaic, planes = coloured(tmp_path)
     written(tmp_path / "frames", "png", mosaic)
     (tmp_path / "camera.toml").write_text(ELECTRONICS)
     (tmp_path / "list.toml").write_text(
-        'patterns = "dots:2x3"\n[prepare]\nchannel = "all"\nmosaic = "GRBG"\nwavelengths_nm = [610.0, 550.0, 450.0]\n'
+        '\ufeffpatterns = "dots:2x3"\n[prepare]\nchannel = "all"\nmosaic = "GRBG"\n'
+        "wavelengths_nm = [610.0, 550.0, 450.0]\n"
     )
     words = f"import {tmp_path / 'frames'} -o {tmp_path / 'run'} --list {tmp_path / 'list.toml'} --exposure 0.0213"
     words += f" --camera {tmp_path / 'camera.toml'} --calibration {calibration} --json"
@@ -382,7 +407,7 @@ def test_a_list_says_what_options_do_not(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, f"{words} -o {tmp_path / 'run3'}".split())
     assert np.array_equal(ms.load_run(tmp_path / "run3").dn, dn[:, ::-1, ::-1])
     stated["centre"] = True
-    (folder / "list.json").write_text(json.dumps(stated))
+    (folder / "list.json").write_text("\ufeff" + json.dumps(stated))
     result = CliRunner().invoke(app, f"{words} -o {tmp_path / 'run4'}".split())
     assert "its centre is false, and the list's true" in str(result.exception)
 
@@ -430,6 +455,19 @@ def test_matlab_files_of_version_7_3(tmp_path: Path) -> None:
     import_file(tmp_path / "again.mat", tmp_path / "run 2", tmp_path / "cal 2")
     assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, ms.load_run(bench.run).dn)
     assert np.array_equal(ms.load_calibration(tmp_path / "cal 2").left, ms.load_calibration(bench.calibration).left)
+
+
+@pytest.mark.parametrize("stated", [{"cSize": [[50.0, 62.0]]}, {}])
+def test_factors_whose_rows_and_columns_are_exchanged_are_refused(stated: dict[str, Any], tmp_path: Path) -> None:
+    """As h5py writes arrays that nobody turned over. (Seen: taken, as a camera of 16 pixels. Planted: not
+    looked at.)"""
+    sides = {f"{stem}r": np.ones((16, pixels)) for stem, pixels in (("P1", 50), ("Q1", 62))}
+    mat73(tmp_path / "calib.mat", {**sides, **stated})
+    with pytest.raises(
+        MitsimError, match="P1r and Q1r have 16 and 16 pixels for 50 and 62 of the scene: rows and columns"
+    ):
+        import_file(tmp_path / "calib.mat", None, tmp_path / "cal", "r")
+    assert not (tmp_path / "cal").exists()
 
 
 def test_damaged_matlab_files_of_version_7_3_are_refused(tmp_path: Path) -> None:
@@ -528,6 +566,12 @@ def picture(mode: str, kind: str, **how: Any) -> bytes:
     return buffer.getvalue()
 
 
+def npy(values: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
 NOT_FINITE = np.full((12, 10), np.nan, np.float32)
 HOSTILE = {
     "palette.png": (picture("P", "png"), "is no grey PNG of 8 or 16 bits"),
@@ -538,6 +582,13 @@ HOSTILE = {
     ),
     "animated.gif": (picture("L", "gif"), "ends in .gif; read are"),
     "lossy.jpg": (picture("L", "jpeg"), "ends in .jpg; read are"),
+    "demosaiced.png": (picture("RGB", "png"), "save one number a pixel, raw and not demosaiced"),
+    "demosaiced.tif": (
+        tiff(values=np.ones((12, 10, 3), np.uint16), photometric="rgb"),
+        "save one number a pixel, raw and not demosaiced",
+    ),
+    "demosaiced.npy": (npy(np.ones((12, 10, 3), np.uint16)), "holds 12 x 10 pixels of 3 numbers, as of red, green and"),
+    "lossy.tif": (picture("L", "tiff", compression="jpeg"), "is compressed by JPEG, which changes numbers"),
     "inks.tif": (picture("CMYK", "tiff"), "is no grey TIFF of 8, 12, 16 or 32 bits"),
     "transparent.tif": (
         tiff(values=np.ones((12, 10, 2), np.uint16), extrasamples=["unassalpha"]),
@@ -556,6 +607,10 @@ HOSTILE = {
 GOOD = {
     "big-endian.tif": tiff(byteorder=">"),
     "tiled.tif": tiff(tile=(16, 16)),
+    "tiled, packed, turned by a quarter.tif": tiff(
+        tile=(16, 16), compression="zlib", predictor=True, extratags=[(274, "H", 1, 6, True)]
+    ),
+    "columns first.npy": npy(np.asfortranarray(np.arange(300, 420, dtype=np.uint16).reshape(12, 10) * 16)),
     "big.tif": tiff(bigtiff=True),
     "big, turned.tif": tiff(bigtiff=True, extratags=[(274, "I", 1, 3, True)]),
     "signed.tif": tiff(values=np.arange(300, 420, dtype=np.int16).reshape(12, 10) * 16),
@@ -565,14 +620,15 @@ GOOD = {
 
 @pytest.mark.parametrize("name", [*HOSTILE, *GOOD])
 def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
-    """Refused with what is wrong, and nothing is left; or read to the number."""
+    """Refused with what is wrong, and nothing is left; or read to the number. (Seen: TIFF of JPEG's numbers taken, and
+    red, green and blue of 12 rows for 12 frames.)"""
     if name.endswith(".dng"):
         pytest.importorskip("rawpy", reason="an extra")
     path, output = tmp_path / name, tmp_path / "run"
     content = HOSTILE[name][0] if name in HOSTILE else GOOD[name]
     path.write_bytes(content)
-    how = Preparation(orientation="file")
-    about = RealCapture("uniform", twelve(tmp_path), 0.02, n=4, black_level_dn=40.0, prepare=how)
+    listed = CaptureList(patterns="uniform", n=4, prepare=Preparation(orientation="file"))
+    about = RealCapture(listed, twelve(tmp_path), 0.02, black_level_dn=40.0)
     if name in HOSTILE:
         with pytest.raises(MitsimError, match=re.escape(HOSTILE[name][1])):
             import_frames(path, output, about)
@@ -581,7 +637,8 @@ def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
     result = import_frames(path, output, about)
     expected = np.arange(300, 420).reshape(12, 10)
     assert result["divided_by"] == 16
-    assert np.array_equal(ms.load_run(output).dn[0], expected[::-1, ::-1] if "turned" in name else expected)
+    turns = -1 if "quarter" in name else 2 if "turned" in name else 0
+    assert np.array_equal(ms.load_run(output).dn[0], np.rot90(expected, turns))
 
 
 # -------- Published captures

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Preparation, Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
-from mitsim.exchange.capture_list import RealCapture
+from mitsim.exchange.capture_list import CaptureList, RealCapture
 from mitsim.exchange.formats import export_run
 from mitsim.exchange.real import LEFT_OUT, import_frames
 from mitsim.reconstruct.factors import Factors
@@ -42,10 +43,13 @@ source = "made up"
 """
 
 
-def known(bench: Made, patterns: str = "dots:2x3", **more: object) -> RealCapture:
+def known(
+    bench: Made, patterns: str = "dots:2x3", black_level_dn: float | None = None, **listed: object
+) -> RealCapture:
     camera = bench.run.parent / "camera.toml"
     camera.write_text(ELECTRONICS)
-    return RealCapture(patterns, str(camera), DIGITAL.exposure_s, **{"calibration": bench.calibration, **more})
+    said = CaptureList(patterns=patterns).model_copy(update=listed)
+    return RealCapture(said, str(camera), DIGITAL.exposure_s, bench.calibration, black_level_dn)
 
 
 def written(folder: Path, kind: str, frames: np.ndarray) -> RealCapture | None:
@@ -186,7 +190,7 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     written(source, "png", dn)
     refused("holds 6 frames, but patterns 'dots:2' take 4", tmp_path, source, known(bench, "dots:2"))
     refused("dots:99", tmp_path, source, known(bench, "dots:99"))
-    refused("projector-pixels", tmp_path, source, known(bench, calibration=None))
+    refused("projector-pixels", tmp_path, source, replace(known(bench), calibration=None))
     refused("the calibration has 10 x 14", tmp_path, source, known(bench, n=12))
     refused("black_level_dn: got -1", tmp_path, source, known(bench, black_level_dn=-1.0))
     (tmp_path / "empty").mkdir()
@@ -199,7 +203,7 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     refused("has the number -", tmp_path, tmp_path / "below", known(bench))
     twelve = tmp_path / "twelve.toml"
     twelve.write_text(ELECTRONICS.replace("bits = 16", "bits = 12"))
-    scaled = RealCapture("dots:2x3", str(twelve), 0.1, bench.calibration)
+    scaled = replace(known(bench), camera=str(twelve))
     written(tmp_path / "scaled", "npy", dn * 16)
     refused("they were scaled", tmp_path, tmp_path / "scaled", scaled)
     written(tmp_path / "eight", "npy", (dn >> 8).astype(np.uint8))

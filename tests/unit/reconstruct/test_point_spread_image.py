@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 import mitsim as ms
 from mitsim.cli import app
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.exr import read_frame
+from mitsim.core.images import lightness, read_image
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
 from mitsim.core.recorders import Recorder, frame_name
 from mitsim.core.runs import Capture
@@ -91,6 +93,7 @@ def test_what_is_no_light_is_refused() -> None:
 
 
 def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_converged(tmp_path: Path) -> None:
+    """And a picture of it whose white is the image's largest number. (Planted: 1, as of images by a calibration.)"""
     shots, _ = capture("uniform", (60, 62))
     run = shots.save(tmp_path / "run")
     np.save(tmp_path / "psf.npy", light_of_a_point())
@@ -105,7 +108,10 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
     psf = "--psf", str(tmp_path / "psf.npy")
     status, found = call(*psf, "--method", "nonnegative", "-o", str(tmp_path / "image"))
     assert status == 0 and found["rank"] is None and found["objective"] > 0 and 0 <= found["relative_gap"] <= 0.05
-    assert (tmp_path / "image" / "image.exr").is_file()
+    image = read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"]
+    shown = read_image(tmp_path / "image" / "image.png")
+    assert np.abs(shown - 255 * lightness(image / image.max())).max() < 0.51, "rounded"
+    assert found["white"] == pytest.approx(image.max())
     result = json.loads((tmp_path / "image" / "result.json").read_text())
     assert result["inputs"].keys() == {"run", "psf", "reduce", "lambda", "method"} and result["iterations"] > 0
     status, found = call(*psf, "--method", "tv", "--bounds", "0:", "--lambda", "1e-9", "-o", str(tmp_path / "tv"))
