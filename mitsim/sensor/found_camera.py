@@ -272,7 +272,7 @@ class _Findings:
                     f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
                     "so correct photons_per_s (photons on one pixel in a second), or leave it out"
                 )
-        found |= self._end(stated, gain_error, notes)
+        found |= self._end(stated, notes)
         bend = [transfer["bend"], transfer["bend_2"]]
         fields: dict[str, Any] = {name: _short(value) for name, (value, _) in found.items()}
         if any(bend):
@@ -400,11 +400,12 @@ class _Findings:
             self.transfer.error("response") / self.transfer["response"], math.sqrt(pixel / m / n + row / m + column / n)
         )
 
-    def _end(self, stated: Stated, gain_error: float, notes: list[str]) -> dict[str, tuple[float, float]]:
+    def _end(self, stated: Stated, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Full well: where frames saturate, or where the ADC does."""
         transfer = self.transfer
         top = None if stated.bits is None else 2.0**stated.bits - 1
         end = transfer.saturation_dn if transfer.saturates else top
+        bent = 1 + transfer["bend"] + transfer["bend_2"]
         if transfer.saturation_dn is None:
             what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
             notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
@@ -412,9 +413,12 @@ class _Findings:
             notes.append("full well: the ADC's end is reached first, so it may be larger")
         if end is None:
             return {"full_well_e": (math.inf, 0.0)}
-        bent = 1 + transfer["bend"] + transfer["bend_2"]
         full = (end - transfer["black"]) / transfer["gain"] / bent
-        return {"full_well_e": (full, full * math.hypot(gain_error, transfer.error("bend") / 10))}
+        if transfer.saturation_dn is None:
+            return {"full_well_e": (full, 0.0)}  # what is not told has no error
+        # By gain, black level and both bends (`photon_transfer.NAMES`), whose errors are not independent.
+        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent])
+        return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 
 def _root_error(square: float, error: float) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -47,6 +48,10 @@ _SATURATED = 0.05
 """Part of the largest variance that light makes, below which the brightest frames are saturated."""
 
 
+Light = Literal["steady", "scatters", "drifts", "undecided"]
+"""What was seen of the light of sets."""
+
+
 @dataclass(frozen=True, eq=False)
 class Taken:
     """Frames that were taken alike.
@@ -72,16 +77,18 @@ class Transfer:
 
     Attributes
     ----------
-    values, errors
-        (7,) by :data:`NAMES`, and their standard errors; an error of 0: not fitted.
+    values, covariance
+        (7,) by :data:`NAMES`, and (7, 7) of their errors; 0: not fitted.
     saturation_dn
         mean of saturated frames; None where no frame is.
     saturates
         whether that is the end of the full well and not of the ADC.
     lamp
         relative scatter of the light of sets about what their exposures say.
-    lamp_drifts
-        whether means rise with exposure otherwise than variances with means, so that the lamp or the exposures are off.
+    light
+        ``steady``: as exposures say. ``scatters`` about that. ``drifts``: means rise with exposure otherwise than
+        variances with means. ``undecided``: means bend, and variances do not tell whether camera or lamp is at fault;
+        the camera is then bent, and the covariance holds what it would be otherwise.
     chi_square, freedom
         of the fit: squares of what is left, and how many are free.
     off
@@ -89,11 +96,11 @@ class Transfer:
     """
 
     values: FloatArray
-    errors: FloatArray
+    covariance: FloatArray
     saturation_dn: float | None
     saturates: bool
     lamp: float
-    lamp_drifts: bool
+    light: Light
     chi_square: float
     freedom: int
     off: FloatArray
@@ -103,7 +110,13 @@ class Transfer:
 
     def error(self, name: str) -> float:
         """Standard error of the number of that ``name``."""
-        return float(self.errors[NAMES.index(name)])
+        index = NAMES.index(name)
+        return math.sqrt(self.covariance[index, index])
+
+    @property
+    def light_error(self) -> float:
+        """Relative error that light of all sets shares: of a lamp that is off, no set is known to be right."""
+        return self.lamp if self.light in ("scatters", "drifts") else 0.0
 
 
 def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
@@ -153,15 +166,18 @@ def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: flo
     """
     problem = _Problem.of(taken, bits, dead, spread)
     steady = problem.begin()
-    if steady.light_chi_square <= _FITS * max(steady.lit - 2, 1) or steady.lit < 4:
-        return steady.transfer(drifts=False)
-    bent = problem.settle(problem.solve(bend=True, lamp=problem.lamp))
-    wide = problem.settle(steady)
+    if steady.light_fits or steady.lit < 4:
+        return steady.transfer("steady")
+    bent = problem.solve(bend=True, lamp=problem.lamp)
+    explains = bent.light_fits
+    bent, wide = problem.settle(bent), problem.settle(steady)
     told = bent.variance_chi_square - wide.variance_chi_square
-    smooth = bent.lamp < wide.lamp / 2
-    if smooth and told < _TELLS:
-        return bent.transfer(drifts=False)
-    return wide.transfer(drifts=smooth)
+    if told < -_TELLS:
+        return bent.transfer("steady" if explains else "scatters")
+    if explains and told < _TELLS:
+        off = bent.values - wide.values
+        return replace(bent, covariance=bent.covariance + np.outer(off, off)).transfer("undecided")
+    return wide.transfer("drifts" if bent.lamp < wide.lamp / 2 else "scatters")
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +217,22 @@ class _Solution:
             np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
         )
 
-    def transfer(self, drifts: bool) -> Transfer:
+    @property
+    def light_fits(self) -> bool:
+        """Whether light is off by no more than is known."""
+        return self.light_chi_square <= _FITS * max(self.lit - 2, 1)
+
+    def transfer(self, light: Light) -> Transfer:
+        """The camera, under such ``light``."""
         problem = self.problem
-        worse = math.sqrt(max(self.chi_square / self.freedom, 1.0)) if self.freedom > 0 else 1.0
-        off = np.full(len(problem.used), np.nan)
-        off[problem.used] = self.rest[len(problem.light) : 2 * len(problem.light)]
-        return Transfer(
-            self.values, np.sqrt(np.diagonal(self.covariance)) * worse, problem.saturation_dn, problem.saturates,
-            self.lamp, drifts, self.chi_square, self.freedom, off,
+        found = Transfer(
+            self.values, self.covariance * max(self.chi_square / max(self.freedom, 1), 1.0), problem.saturation_dn,
+            problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full(len(problem.used), np.nan),
         )  # fmt: skip
+        found.off[problem.used] = self.rest[len(problem.light) : 2 * len(problem.light)]
+        response = NAMES.index("response")
+        found.covariance[response, response] += (found.light_error * found["response"]) ** 2
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +357,7 @@ class _Problem:
     def settle(self, solution: _Solution) -> _Solution:
         """The ``solution`` with the lamp's scatter as large as light is off."""
         for _ in range(3):
-            if solution.light_chi_square <= _FITS * max(solution.lit - 2, 1):
+            if solution.light_fits:
                 break
             solution = self.solve(solution.bend, max(solution.scatter, 1.5 * solution.lamp))
         return solution

@@ -98,7 +98,7 @@ def characterise_frames(
         facts = listed.listed
         stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
         found = find_camera(taken, lambda index: sets[index].mean_image(), stated)
-        frames = Frames.as_taken(taken, found.sensor, found.transfer["response"])
+        frames = Frames.as_taken(taken, found.sensor, found.transfer)
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)
         return _hold_against(

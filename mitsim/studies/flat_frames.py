@@ -241,18 +241,23 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
             f"variances do not rise with means as those of counted electrons: the largest is at {100 * part:.0f} % of "
             "the brightest signal; a gamma curve or compression does that, and no figure is the camera's"
         )
-    if transfer.lamp_drifts:
+    known = (
+        "gain and noise hold; quantum_efficiency, saturation_capacity and linearity are known to that, as their "
+        "standard errors say; take the frames again under a steady lamp"
+    )
+    if transfer.light == "undecided":
+        lines.append(
+            "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts: "
+            "linearity, gain, full_well and quantum_efficiency of the camera found have the difference in their "
+            "standard errors; take more frames in each set, or measure the lamp at each and list it as light"
+        )
+    elif transfer.light == "drifts":
         lines.append(
             "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not as "
-            "listed, "
-            f"by {100 * transfer.lamp:.2g} %; gain and noise hold, linearity and quantum efficiency are off by as much"
+            f"listed, by {100 * transfer.lamp:.2g} %; {known}"
         )
     elif transfer.lamp > _STEADY:
-        lines.append(
-            f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; linearity is known to that, "
-            "gain and "
-            "noise hold"
-        )
+        lines.append(f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; {known}")
     if found.uneven > _EVEN:
         lines.append(
             f"light differs by {100 * found.uneven:.0f} % over the frame, and EMVA 1288 allows {100 * _EVEN:.0f} %: "
