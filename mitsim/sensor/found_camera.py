@@ -30,8 +30,12 @@ _SURE = 4.0
 """Standard errors from which an effect is put into the camera: one in 3e4 is there by chance."""
 _UNEVEN = 0.01
 """Part of the light by which it differs over the frame from which a surface is taken off before pixels are compared."""
+_MOST_UNEVEN = 0.25
+"""The same at most: with more, frames at 0.7 of saturation hold pixels at 0.8, from where few counts are lost."""
 _ROBUST = 1.4826
 """Standard deviation over median absolute deviation, of a normal law."""
+_ROUNDED = 12**-0.5
+"""Standard deviation of what rounding takes off a mean [DN], where no noise dithers it."""
 _CUT = 1e-3
 """Part of dark readings that are 0 from which their spread is not that of offsets."""
 _MOST_RESPONSE = 0.1
@@ -117,6 +121,11 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
         where no camera file can state what was found.
     """
     maps = _Maps.of(taken, images)
+    if maps.uneven > _MOST_UNEVEN:
+        raise MitsimError(
+            f"light differs by {100 * maps.uneven:.0f} % over the frame, so its pixels saturate at other exposures; at "
+            f"most {100 * _MOST_UNEVEN:.0f} % is possible: move the lamp away, or cut the frames to what it lights evenly"
+        )
     dead, offsets = float(maps.dead.mean()), maps.offsets()
     transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
     return _Findings(taken, maps, transfer, offsets, dead).camera(stated)
@@ -168,6 +177,8 @@ class _Maps:
             wide = _ROBUST * float(np.median(np.abs(excess - middle)))
             # Of few codes most readings are one number: noise is then what is left of it.
             wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
+            if float(taken[short].said.pair.variance) < LEAST_DARK:
+                wide = max(wide, _ROUNDED)
             hot = excess > middle + _HOT * wide
         surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
         uneven = float(np.ptp(surface) / surface.mean())
@@ -194,7 +205,8 @@ class _Maps:
 
     @property
     def offset_spread(self) -> float:
-        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light."""
+        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light,
+        if that is no chance."""
         if self.taken[self.short].said.cut[0] < _CUT:
             return float(self.offsets().values.sum())
         lit = [each for each in self.taken if each.light and not any(each.said.cut)]
@@ -204,7 +216,9 @@ class _Maps:
         signal = float(darkest.said.pair.mean) - float(self.taken[self.short].said.pair.mean)
         dead = float(self.dead.mean())
         response = float(self.responses().values.sum()) + dead * (1 - dead)
-        return float(darkest.said.stack.total) - response * signal**2
+        found = float(darkest.said.stack.total) - response * signal**2
+        error = math.sqrt(2 / self.offset.size) * float(darkest.said.pair.variance) / darkest.said.count
+        return found if found > _SURE * error else 0.0
 
 
 def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
@@ -342,11 +356,15 @@ class _Findings:
             return dict.fromkeys(names, nothing)
         seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
         unit, count = gain * seconds, maps.excess.size
+        if not error:
+            error = 0.5 / unit
+            notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
         cool, (m, n) = ~maps.hot, maps.excess.shape
         middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
         beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
         both = taken[maps.long], taken[maps.short]
-        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both)
+        # Rows' part of a variance about the frame's mean lacks a row of m.
+        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both) * (1 - 1 / m)
         # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
         theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
         noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)

@@ -17,7 +17,7 @@ import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor.emva import MOST_FITTED, Alike
+from mitsim.sensor.emva import HIDDEN, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
@@ -29,6 +29,9 @@ _LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
 """The same in the number's unit, at least: also where it is 0."""
 _STARTS = (0.9, 0.8, 0.7, 0.6, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
+_TRIED, _SOLVED = 10, 25
+"""Evaluations in which another beginning must be better, and those of a solution; chosen: a camera of 8 bits that no
+numbers fit takes 10 s."""
 _DITHERED = 0.64
 """Variance [DN^2] below which rounding moves it: of 0.8 DN, as `mitsim.sensor.moments` has it."""
 _HALF = 0.5
@@ -44,8 +47,9 @@ _FITS = 2.0
 _TELLS = 9.0
 """By how much less chi-square variances must have before they tell a bent camera from a drifting lamp: three standard
 errors."""
-_SATURATED = 0.05
-"""Part of the largest variance that light makes, below which the brightest frames are saturated."""
+_SATURATED, _FALLEN = 0.05, 0.5
+"""Part of the largest variance that light makes, below which the brightest frames are saturated; and the same where
+their mean rises by less than the first part of what light does."""
 
 
 Light = Literal["steady", "scatters", "drifts", "undecided"]
@@ -92,7 +96,7 @@ class Transfer:
     chi_square, freedom
         of the fit: squares of what is left, and how many are free.
     off
-        (sets,) by how many errors each set's variance is off; not a number where it was not used.
+        (sets, 2) by how many errors each set's mean and variance are off; not a number where it was not used.
     """
 
     values: FloatArray
@@ -122,7 +126,8 @@ class Transfer:
 def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
     """Which set has the largest variance, and which one is saturated: the brightest, if its variance is small; or None.
 
-    The ``taken`` sets are in any order.
+    Where rounding leaves some of it, other light that makes a set as bright tells. The ``taken`` sets are
+    in any order.
     """
     mean, variance = (
         np.array([float(getattr(each.said.pair, name)) for each in taken]) for name in ("mean", "variance")
@@ -130,7 +135,15 @@ def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
     lit = np.flatnonzero([each.light > 0 for each in taken])
     still = variance[[not each.light for each in taken]].min()
     peak, last = lit[variance[lit].argmax()], lit[mean[lit].argmax()]
-    return int(peak), int(last) if variance[last] - still < _SATURATED * (variance[peak] - still) else None
+    light = np.array([each.light for each in taken])
+    left, most = variance[last] - still, variance[peak] - still
+    others = lit[light[lit] != light[last]]
+    if left < _FALLEN * most and others.size:
+        near = others[mean[others].argmax()]
+        rise = (mean[last] - mean[near]) / (mean[last] - mean[light == 0].min())
+        if rise < _SATURATED * abs(1 - light[near] / light[last]):
+            return int(peak), int(last)
+    return int(peak), int(last) if left < _SATURATED * most else None
 
 
 def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
@@ -227,9 +240,9 @@ class _Solution:
         problem = self.problem
         found = Transfer(
             self.values, self.covariance * max(self.chi_square / max(self.freedom, 1), 1.0), problem.saturation_dn,
-            problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full(len(problem.used), np.nan),
+            problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full((len(problem.used), 2), np.nan),
         )  # fmt: skip
-        found.off[problem.used] = self.rest[len(problem.light) : 2 * len(problem.light)]
+        found.off[problem.used] = self.rest[: 2 * len(problem.light)].reshape(2, -1).T
         response = NAMES.index("response")
         found.covariance[response, response] += (found.light_error * found["response"]) ** 2
         return found
@@ -349,9 +362,9 @@ class _Problem:
             if best.chi_square <= _FITS * max(best.freedom, 1):
                 break
             start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
-            best = min(
-                best, replace(self, start=start).solve(bend=False, lamp=self.lamp), key=lambda each: each.chi_square
-            )
+            trial = replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED)
+            if trial.chi_square < best.chi_square:
+                best = replace(self, start=trial.values).solve(bend=False, lamp=self.lamp)
         return best
 
     def settle(self, solution: _Solution) -> _Solution:
@@ -362,11 +375,13 @@ class _Problem:
             solution = self.solve(solution.bend, max(solution.scatter, 1.5 * solution.lamp))
         return solution
 
-    def solve(self, bend: bool, lamp: float) -> _Solution:
+    def solve(self, bend: bool, lamp: float, most: int = _SOLVED) -> _Solution:
         """Least squares of means, variances, and of how far each set's light is off, of a ``lamp`` of such scatter."""
         count, lit = len(self.light), self.light > 0
         lights = int(np.count_nonzero(lit))
-        free = np.array([True, True, True, np.ptp(self.time[~lit]) > 0, lights > 0, bend, bend])
+        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
+        dark = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
+        free = np.array([True, True, True, dark, lights > 0, bend, bend])
         fixed = self.start.copy()
         fixed[3] = fixed[3] if free[3] else 0.0
 
@@ -403,7 +418,7 @@ class _Problem:
             return found
 
         begin = np.concatenate([fixed[free], np.zeros(lights)])
-        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=25)
+        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most)
         values, scale = take_apart(solved.x)
         normal = solved.jac.T @ solved.jac
         # Of what few codes hide, readings in the dark are known to half a code all the same.

@@ -320,7 +320,8 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
         row, column, pixel = (squares[part][side] for part in ("row", "column", "pixel"))
         total = (row * n + column * m + pixel) / (m * n - 1)
         mean = np.full(_SESSIONS, float(getattr(expected, name).mean))
-        taken = noise[side] / counts[side]
+        freedom = (m - 1) * (counts[side] - 1)
+        taken = (noise[side] - shared + shared * rng.chisquare(freedom, _SESSIONS) / freedom) / counts[side]
         stacks.append(emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
     return stacks
 

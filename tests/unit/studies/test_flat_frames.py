@@ -25,7 +25,8 @@ QUICK = ("plain", "high read noise, cut darks", "nonuniform", "defects")
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
     """By how many standard errors each field of the camera found is off that of the camera of this ``name``."""
     model = camera(name)
-    given = {row.name: _set_field(model, row.name) if row.name in FIELDS else [*model.linearity, 0, 0][int(row.name[-1])]
+    bends = [*model.linearity, 0.0, 0.0]
+    given = {row.name: _set_field(model, row.name) if row.name in FIELDS else bends[int(row.name[-1])]
              for row in done.fields}  # fmt: skip
     return {
         row.name: (row.found - value) / row.standard_error
