@@ -124,7 +124,7 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
             f"light differs by {100 * maps.uneven:.0f} % over the frame, so its pixels saturate at other exposures; at "
-            f"most {100 * _MOST_UNEVEN:.0f} % is possible: move the lamp away, or cut the frames to what it lights evenly"
+            f"most {100 * _MOST_UNEVEN:.0f} % is possible; move the lamp away, or cut frames to what it lights evenly"
         )
     dead, offsets = float(maps.dead.mean()), maps.offsets()
     transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
@@ -234,6 +234,7 @@ def _noise_left(taken: Sequence[Taken], index: int) -> float:
 def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
+    rows *= 1 - 1 / m  # of variances about the frame's mean, which hold a row of m less
     about = np.where(without, 0.0, image - middle_of(image, without))
     total = float(np.square(about).sum()) / (max(int(np.count_nonzero(~without)), 2) - 1) - noise
     row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
@@ -363,7 +364,7 @@ class _Findings:
         middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
         beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
         both = taken[maps.long], taken[maps.short]
-        # Rows' part of a variance about the frame's mean lacks a row of m.
+        # As in `_spatial_parts`.
         rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both) * (1 - 1 / m)
         # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
         theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
