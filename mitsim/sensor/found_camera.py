@@ -118,13 +118,19 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
     Raises
     ------
     MitsimError
-        where no camera file can state what was found.
+        for light that is far from even, and where no camera file can state what was found.
     """
     maps = _Maps.of(taken, images)
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
             f"light differs by {100 * maps.uneven:.0f} % over the frame, so its pixels saturate at other exposures; at "
             f"most {100 * _MOST_UNEVEN:.0f} % is possible; move the lamp away, or cut frames to what it lights evenly"
+        )
+    wide = math.sqrt(max(*maps.responses().values, 0.0))
+    if wide > _MOST_RESPONSE:
+        raise MitsimError(
+            f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
+            f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
         )
     dead, offsets = float(maps.dead.mean()), maps.offsets()
     transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
@@ -300,12 +306,6 @@ class _Findings:
             "source": stated.source,
             "bits": stated.bits,
         }
-        wide = max(fields[f"prnu_{part}"] for part in ("pixel", "row", "column"))
-        if wide > _MOST_RESPONSE:
-            raise MitsimError(
-                f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
-                f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
-            )
         errors = {name: error for name, (_, error) in found.items()}
         if any(bend):
             errors["linearity"] = transfer.error("bend")
