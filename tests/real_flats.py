@@ -39,7 +39,14 @@ CAMERAS: dict[str, dict[str, Any]] = {
     "defects": {
         "dead_pixels": 0.002, "hot_pixels": 0.002, "hot_dark_current_e_per_s": 20_000.0, "row_noise_e": 3.0
     },
-    "bent": {"linearity": (-0.02, 0.01)},
+    "bent": {"linearity": (-0.05, 0.01)},
+    "rows louder than pixels": {"row_noise_e": 20.0},
+    "many hot pixels": {"hot_pixels": 0.1, "hot_dark_current_e_per_s": 30_000.0},
+    "no black level": {"black_level_dn": 0.0},
+    "no black level, rounding leaves noise at saturation": {
+        "bits": 8, "gain_dn_per_e": 0.0115, "read_noise_e": 40.0, "black_level_dn": 0.0
+    },
+    "darks of one code": {"bits": 8, "gain_dn_per_e": 0.0115, "black_level_dn": 4.3},
     "six bits, next to no noise": {"bits": 6, "full_well_e": 10_000.0, "gain_dn_per_e": 0.006, "black_level_dn": 2.0},
 }  # fmt: skip
 """Cameras that are hard to measure, each in its way; all saturate at 1.15 of the ladder or below."""

@@ -21,6 +21,9 @@ QUANTISATION = 1 / 12
 LEAST_DARK = 0.24
 """Variance [DN^2] of dark frames below which rounding hides their noise: it counts as this much, an upper limit of
 0.4 DN for the noise (EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
+HIDDEN = 1e-3
+"""Variance [DN^2] of all dark frames below which one reading in a thousand is another code, and none tells a current:
+chosen below what any camera of 0.2 DN of noise has."""
 MOST_FITTED, LINEAR = 0.7, (0.05, 0.95)
 """Parts of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
 LINE = 3
@@ -240,7 +243,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
     variance) and `full_well` (of the brightest frames) [e-], `linearity_min` and `linearity_max` [1], `dark_current`
     (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2] and
     `prnu_PART` [1] for each PART of :data:`SPLIT`. What the frames do not tell is left out: saturation where nothing is
-    saturated, linearity of fewer than three steps, dark current of one exposure.
+    saturated, linearity of fewer than three steps, dark current of one exposure or all one code.
     """
     photons, signal, noise = session.transfer()
     variance, unlit = session.pairs.variance, session.unlit
@@ -273,7 +276,7 @@ def figures(session: Session) -> dict[str, FloatArray]:
     if used.sum(axis=-1).min() >= LINE:
         low, high = _linearity(photons, signal, used)
         found |= {"linearity_min": low, "linearity_max": high}
-    if np.ptp(times) > 0:
+    if np.ptp(times) > 0 and variance[..., unlit].max() > HIDDEN:
         found |= {"dark_current": slopes[0] / gain, "dark_current_by_variance": slopes[1] / gain**2}
     dim, bright = session.dark_stack, session.bright_stack
     contrast = bright.mean - dim.mean

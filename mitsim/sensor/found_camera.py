@@ -30,8 +30,12 @@ _SURE = 4.0
 """Standard errors from which an effect is put into the camera: one in 3e4 is there by chance."""
 _UNEVEN = 0.01
 """Part of the light by which it differs over the frame from which a surface is taken off before pixels are compared."""
+_MOST_UNEVEN = 0.25
+"""The same at most: with more, frames at 0.7 of saturation hold pixels at 0.8, from where few counts are lost."""
 _ROBUST = 1.4826
 """Standard deviation over median absolute deviation, of a normal law."""
+_ROUNDED = 12**-0.5
+"""Standard deviation of what rounding takes off a mean [DN], where no noise dithers it."""
 _CUT = 1e-3
 """Part of dark readings that are 0 from which their spread is not that of offsets."""
 _MOST_RESPONSE = 0.1
@@ -114,9 +118,20 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
     Raises
     ------
     MitsimError
-        where no camera file can state what was found.
+        for light that is far from even, and where no camera file can state what was found.
     """
     maps = _Maps.of(taken, images)
+    if maps.uneven > _MOST_UNEVEN:
+        raise MitsimError(
+            f"light differs by {100 * maps.uneven:.0f} % over the frame, so its pixels saturate at other exposures; at "
+            f"most {100 * _MOST_UNEVEN:.0f} % is possible; move the lamp away, or cut frames to what it lights evenly"
+        )
+    wide = math.sqrt(max(*maps.responses().values, 0.0))
+    if wide > _MOST_RESPONSE:
+        raise MitsimError(
+            f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
+            f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
+        )
     dead, offsets = float(maps.dead.mean()), maps.offsets()
     transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
     return _Findings(taken, maps, transfer, offsets, dead).camera(stated)
@@ -168,6 +183,8 @@ class _Maps:
             wide = _ROBUST * float(np.median(np.abs(excess - middle)))
             # Of few codes most readings are one number: noise is then what is left of it.
             wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
+            if float(taken[short].said.pair.variance) < LEAST_DARK:
+                wide = max(wide, _ROUNDED)
             hot = excess > middle + _HOT * wide
         surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
         uneven = float(np.ptp(surface) / surface.mean())
@@ -194,7 +211,8 @@ class _Maps:
 
     @property
     def offset_spread(self) -> float:
-        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light."""
+        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light,
+        if that is no chance."""
         if self.taken[self.short].said.cut[0] < _CUT:
             return float(self.offsets().values.sum())
         lit = [each for each in self.taken if each.light and not any(each.said.cut)]
@@ -204,7 +222,9 @@ class _Maps:
         signal = float(darkest.said.pair.mean) - float(self.taken[self.short].said.pair.mean)
         dead = float(self.dead.mean())
         response = float(self.responses().values.sum()) + dead * (1 - dead)
-        return float(darkest.said.stack.total) - response * signal**2
+        found = float(darkest.said.stack.total) - response * signal**2
+        error = math.sqrt(2 / self.offset.size) * float(darkest.said.pair.variance) / darkest.said.count
+        return found if found > _SURE * error else 0.0
 
 
 def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
@@ -220,6 +240,7 @@ def _noise_left(taken: Sequence[Taken], index: int) -> float:
 def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
+    rows *= 1 - 1 / m  # of variances about the frame's mean, which hold a row of m less
     about = np.where(without, 0.0, image - middle_of(image, without))
     total = float(np.square(about).sum()) / (max(int(np.count_nonzero(~without)), 2) - 1) - noise
     row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
@@ -272,7 +293,7 @@ class _Findings:
                     f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
                     "so correct photons_per_s (photons on one pixel in a second), or leave it out"
                 )
-        found |= self._end(stated, gain_error, notes)
+        found |= self._end(stated, notes)
         bend = [transfer["bend"], transfer["bend_2"]]
         fields: dict[str, Any] = {name: _short(value) for name, (value, _) in found.items()}
         if any(bend):
@@ -285,12 +306,6 @@ class _Findings:
             "source": stated.source,
             "bits": stated.bits,
         }
-        wide = max(fields[f"prnu_{part}"] for part in ("pixel", "row", "column"))
-        if wide > _MOST_RESPONSE:
-            raise MitsimError(
-                f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
-                f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
-            )
         errors = {name: error for name, (_, error) in found.items()}
         if any(bend):
             errors["linearity"] = transfer.error("bend")
@@ -342,11 +357,15 @@ class _Findings:
             return dict.fromkeys(names, nothing)
         seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
         unit, count = gain * seconds, maps.excess.size
+        if not error:
+            error = 0.5 / unit
+            notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
         cool, (m, n) = ~maps.hot, maps.excess.shape
         middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
         beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
         both = taken[maps.long], taken[maps.short]
-        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both)
+        # As in `_spatial_parts`.
+        rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both) * (1 - 1 / m)
         # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
         theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
         noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)
@@ -400,11 +419,12 @@ class _Findings:
             self.transfer.error("response") / self.transfer["response"], math.sqrt(pixel / m / n + row / m + column / n)
         )
 
-    def _end(self, stated: Stated, gain_error: float, notes: list[str]) -> dict[str, tuple[float, float]]:
+    def _end(self, stated: Stated, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Full well: where frames saturate, or where the ADC does."""
         transfer = self.transfer
         top = None if stated.bits is None else 2.0**stated.bits - 1
         end = transfer.saturation_dn if transfer.saturates else top
+        bent = 1 + transfer["bend"] + transfer["bend_2"]
         if transfer.saturation_dn is None:
             what = "is taken as what the ADC's end needs" if top else "is taken as infinite"
             notes.append(f"full well: no frame is saturated, so it {what}; take brighter frames")
@@ -412,9 +432,12 @@ class _Findings:
             notes.append("full well: the ADC's end is reached first, so it may be larger")
         if end is None:
             return {"full_well_e": (math.inf, 0.0)}
-        bent = 1 + transfer["bend"] + transfer["bend_2"]
         full = (end - transfer["black"]) / transfer["gain"] / bent
-        return {"full_well_e": (full, full * math.hypot(gain_error, transfer.error("bend") / 10))}
+        if transfer.saturation_dn is None:
+            return {"full_well_e": (full, 0.0)}  # what is not told has no error
+        # By gain, black level and both bends (`photon_transfer.NAMES`), whose errors are not independent.
+        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent])
+        return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 
 def _root_error(square: float, error: float) -> float:

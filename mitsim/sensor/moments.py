@@ -410,13 +410,13 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
 
 
 def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """:func:`_round_moments` for deviations below 2 DN: code by code around the nearest one."""
+    """:func:`_round_moments` for deviations below 2 DN: code by code within eight deviations of the nearest one."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():
         return nearest, np.zeros_like(mean)
     scale = np.where(deviation > 0, deviation, 1)
     first, second = np.zeros_like(mean), np.zeros_like(mean)
-    for step in range(1, 18):
+    for step in range(1, math.ceil(8 * float(deviation.max())) + 2):
         up = scipy.special.ndtr((mean - (nearest + step - 0.5)) / scale) * (nearest + step <= largest)
         down = scipy.special.ndtr(((nearest - step + 0.5) - mean) / scale) * (nearest - step >= 0)
         first += up - down

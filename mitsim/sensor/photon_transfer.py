@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor.emva import MOST_FITTED, Alike
+from mitsim.sensor.emva import HIDDEN, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
@@ -28,6 +29,9 @@ _LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
 """The same in the number's unit, at least: also where it is 0."""
 _STARTS = (0.9, 0.8, 0.7, 0.6, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
+_TRIED, _SOLVED = 10, 25
+"""Evaluations in which another beginning must be better, and those of a solution; chosen: a camera of 8 bits that no
+numbers fit takes 10 s."""
 _DITHERED = 0.64
 """Variance [DN^2] below which rounding moves it: of 0.8 DN, as `mitsim.sensor.moments` has it."""
 _HALF = 0.5
@@ -43,8 +47,13 @@ _FITS = 2.0
 _TELLS = 9.0
 """By how much less chi-square variances must have before they tell a bent camera from a drifting lamp: three standard
 errors."""
-_SATURATED = 0.05
-"""Part of the largest variance that light makes, below which the brightest frames are saturated."""
+_SATURATED, _FALLEN = 0.05, 0.5
+"""Part of the largest variance that light makes, below which the brightest frames are saturated; and the same where
+their mean rises by less than the first part of what light does."""
+
+
+Light = Literal["steady", "scatters", "drifts", "undecided"]
+"""What was seen of the light of sets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,28 +81,30 @@ class Transfer:
 
     Attributes
     ----------
-    values, errors
-        (7,) by :data:`NAMES`, and their standard errors; an error of 0: not fitted.
+    values, covariance
+        (7,) by :data:`NAMES`, and (7, 7) of their errors; 0: not fitted.
     saturation_dn
         mean of saturated frames; None where no frame is.
     saturates
         whether that is the end of the full well and not of the ADC.
     lamp
         relative scatter of the light of sets about what their exposures say.
-    lamp_drifts
-        whether means rise with exposure otherwise than variances with means, so that the lamp or the exposures are off.
+    light
+        ``steady``: as exposures say. ``scatters`` about that. ``drifts``: means rise with exposure otherwise than
+        variances with means. ``undecided``: means bend, and variances do not tell whether camera or lamp is at fault;
+        the camera is then bent, and the covariance holds what it would be otherwise.
     chi_square, freedom
         of the fit: squares of what is left, and how many are free.
     off
-        (sets,) by how many errors each set's variance is off; not a number where it was not used.
+        (sets, 2) by how many errors each set's mean and variance are off; not a number where it was not used.
     """
 
     values: FloatArray
-    errors: FloatArray
+    covariance: FloatArray
     saturation_dn: float | None
     saturates: bool
     lamp: float
-    lamp_drifts: bool
+    light: Light
     chi_square: float
     freedom: int
     off: FloatArray
@@ -103,13 +114,20 @@ class Transfer:
 
     def error(self, name: str) -> float:
         """Standard error of the number of that ``name``."""
-        return float(self.errors[NAMES.index(name)])
+        index = NAMES.index(name)
+        return math.sqrt(self.covariance[index, index])
+
+    @property
+    def light_error(self) -> float:
+        """Relative error that light of all sets shares: of a lamp that is off, no set is known to be right."""
+        return self.lamp if self.light in ("scatters", "drifts") else 0.0
 
 
 def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
     """Which set has the largest variance, and which one is saturated: the brightest, if its variance is small; or None.
 
-    The ``taken`` sets are in any order.
+    Where rounding leaves some of it, other light that makes a set as bright tells. The ``taken`` sets are
+    in any order.
     """
     mean, variance = (
         np.array([float(getattr(each.said.pair, name)) for each in taken]) for name in ("mean", "variance")
@@ -117,7 +135,15 @@ def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
     lit = np.flatnonzero([each.light > 0 for each in taken])
     still = variance[[not each.light for each in taken]].min()
     peak, last = lit[variance[lit].argmax()], lit[mean[lit].argmax()]
-    return int(peak), int(last) if variance[last] - still < _SATURATED * (variance[peak] - still) else None
+    light = np.array([each.light for each in taken])
+    left, most = variance[last] - still, variance[peak] - still
+    others = lit[light[lit] != light[last]]
+    if left < _FALLEN * most and others.size:
+        near = others[mean[others].argmax()]
+        rise = (mean[last] - mean[near]) / (mean[last] - mean[light == 0].min())
+        if rise < _SATURATED * abs(1 - light[near] / light[last]):
+            return int(peak), int(last)
+    return int(peak), int(last) if left < _SATURATED * most else None
 
 
 def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
@@ -153,15 +179,18 @@ def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: flo
     """
     problem = _Problem.of(taken, bits, dead, spread)
     steady = problem.begin()
-    if steady.light_chi_square <= _FITS * max(steady.lit - 2, 1) or steady.lit < 4:
-        return steady.transfer(drifts=False)
-    bent = problem.settle(problem.solve(bend=True, lamp=problem.lamp))
-    wide = problem.settle(steady)
+    if steady.light_fits or steady.lit < 4:
+        return steady.transfer("steady")
+    bent = problem.solve(bend=True, lamp=problem.lamp)
+    explains = bent.light_fits
+    bent, wide = problem.settle(bent), problem.settle(steady)
     told = bent.variance_chi_square - wide.variance_chi_square
-    smooth = bent.lamp < wide.lamp / 2
-    if smooth and told < _TELLS:
-        return bent.transfer(drifts=False)
-    return wide.transfer(drifts=smooth)
+    if told < -_TELLS:
+        return bent.transfer("steady" if explains else "scatters")
+    if explains and told < _TELLS:
+        off = bent.values - wide.values
+        return replace(bent, covariance=bent.covariance + np.outer(off, off)).transfer("undecided")
+    return wide.transfer("drifts" if bent.lamp < wide.lamp / 2 else "scatters")
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +230,22 @@ class _Solution:
             np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
         )
 
-    def transfer(self, drifts: bool) -> Transfer:
+    @property
+    def light_fits(self) -> bool:
+        """Whether light is off by no more than is known."""
+        return self.light_chi_square <= _FITS * max(self.lit - 2, 1)
+
+    def transfer(self, light: Light) -> Transfer:
+        """The camera, under such ``light``."""
         problem = self.problem
-        worse = math.sqrt(max(self.chi_square / self.freedom, 1.0)) if self.freedom > 0 else 1.0
-        off = np.full(len(problem.used), np.nan)
-        off[problem.used] = self.rest[len(problem.light) : 2 * len(problem.light)]
-        return Transfer(
-            self.values, np.sqrt(np.diagonal(self.covariance)) * worse, problem.saturation_dn, problem.saturates,
-            self.lamp, drifts, self.chi_square, self.freedom, off,
+        found = Transfer(
+            self.values, self.covariance * max(self.chi_square / max(self.freedom, 1), 1.0), problem.saturation_dn,
+            problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full((len(problem.used), 2), np.nan),
         )  # fmt: skip
+        found.off[problem.used] = self.rest[: 2 * len(problem.light)].reshape(2, -1).T
+        response = NAMES.index("response")
+        found.covariance[response, response] += (found.light_error * found["response"]) ** 2
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,24 +362,26 @@ class _Problem:
             if best.chi_square <= _FITS * max(best.freedom, 1):
                 break
             start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
-            best = min(
-                best, replace(self, start=start).solve(bend=False, lamp=self.lamp), key=lambda each: each.chi_square
-            )
+            trial = replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED)
+            if trial.chi_square < best.chi_square:
+                best = replace(self, start=trial.values).solve(bend=False, lamp=self.lamp)
         return best
 
     def settle(self, solution: _Solution) -> _Solution:
         """The ``solution`` with the lamp's scatter as large as light is off."""
         for _ in range(3):
-            if solution.light_chi_square <= _FITS * max(solution.lit - 2, 1):
+            if solution.light_fits:
                 break
             solution = self.solve(solution.bend, max(solution.scatter, 1.5 * solution.lamp))
         return solution
 
-    def solve(self, bend: bool, lamp: float) -> _Solution:
+    def solve(self, bend: bool, lamp: float, most: int = _SOLVED) -> _Solution:
         """Least squares of means, variances, and of how far each set's light is off, of a ``lamp`` of such scatter."""
         count, lit = len(self.light), self.light > 0
         lights = int(np.count_nonzero(lit))
-        free = np.array([True, True, True, np.ptp(self.time[~lit]) > 0, lights > 0, bend, bend])
+        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
+        dark = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
+        free = np.array([True, True, True, dark, lights > 0, bend, bend])
         fixed = self.start.copy()
         fixed[3] = fixed[3] if free[3] else 0.0
 
@@ -380,7 +418,7 @@ class _Problem:
             return found
 
         begin = np.concatenate([fixed[free], np.zeros(lights)])
-        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=25)
+        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most)
         values, scale = take_apart(solved.x)
         normal = solved.jac.T @ solved.jac
         # Of what few codes hide, readings in the dark are known to half a code all the same.

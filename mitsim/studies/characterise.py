@@ -98,7 +98,7 @@ def characterise_frames(
         facts = listed.listed
         stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
         found = find_camera(taken, lambda index: sets[index].mean_image(), stated)
-        frames = Frames.as_taken(taken, found.sensor, found.transfer["response"])
+        frames = Frames.as_taken(taken, found.sensor, found.transfer)
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)
         return _hold_against(
@@ -116,7 +116,11 @@ def _hold_against(
     spread, figures = emva.figures(draw_sessions(frames, expected)), emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     sensor = frames.sensor
-    names = [name for name in UNITS if name in figures and (sensor.states_efficiency or name != "quantum_efficiency")]
+    names = [
+        name
+        for name in UNITS
+        if name in figures and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")
+    ]
     rows = tuple(row_of(frames, name, figures[name], spread[name]) for name in names)
     fields = fields_of(found, None if what.get("real") else sensor)
     return Characterisation(

@@ -23,7 +23,7 @@ from mitsim.sensor import emva
 from mitsim.sensor.chain import expose
 from mitsim.sensor.emva import Session
 from mitsim.sensor.moments import frame_moments
-from mitsim.sensor.photon_transfer import Taken, nonuniform, saturation_of
+from mitsim.sensor.photon_transfer import Taken, Transfer, nonuniform, saturation_of
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 
@@ -65,6 +65,8 @@ class Frames:
         whether the brightest set is saturated.
     seed
         root of every draw.
+    lamp
+        relative errors of the light: of each set, and of all.
     """
 
     sensor: SensorModel
@@ -77,6 +79,7 @@ class Frames:
     bright: int
     saturates: bool = True
     seed: int = 0
+    lamp: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> Frames:
@@ -108,31 +111,22 @@ class Frames:
         return cls(sensor, side, light, electrons, exposures, counts, bright + 1, bright, seed=procedure.seed)
 
     @classmethod
-    def as_taken(cls, taken: list[Taken], sensor: SensorModel, response: float) -> Frames:
+    def as_taken(cls, taken: list[Taken], sensor: SensorModel, transfer: Transfer) -> Frames:
         """Those of a real camera.
 
         Parameters
         ----------
         taken
             sets of its frames.
-        sensor
-            the camera that was found in them.
-        response
-            its photoelectrons for a unit of light.
+        sensor, transfer
+            the camera that was found in them, and the fit that it is of.
         """
         light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
-        counts = np.array([each.said.count for each in taken])
-        places = nonuniform(taken)
         return cls(
-            sensor,
-            taken[0].said.shape,
-            light,
-            response * light,
-            time,
-            counts,
-            *places,
-            saturation_of(taken)[1] is not None,
-        )
+            sensor, taken[0].said.shape, light, transfer["response"] * light, time,
+            np.array([each.said.count for each in taken]), *nonuniform(taken), saturation_of(taken)[1] is not None,
+            lamp=(transfer.lamp, transfer.light_error),
+        )  # fmt: skip
 
     @property
     def efficiency(self) -> float:
@@ -204,12 +198,13 @@ class Frames:
             rounded,
         )
 
-    def _expected_pair(self, index: int) -> emva.Pair:
-        time, light = float(self.exposure_s[index]), np.array([self.electrons[index], 0.0])
+    def _expected_pair(self, index: int, part: float = 1.0) -> emva.Pair:
+        """Of a set whose light is a ``part`` of what it should be."""
+        time, light = float(self.exposure_s[index]), np.array([part * self.electrons[index], 0.0])
         mean, variance = frame_moments(light, time, self.alike)
         dead = self.sensor.dead_pixels
         rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
-        lit = [np.asarray((1 - dead) * part[0] + dead * part[1]) for part in (mean, variance)]
+        lit = [np.asarray((1 - dead) * moment[0] + dead * moment[1]) for moment in (mean, variance)]
         return emva.Pair(lit[0], lit[1], np.minimum(rows, lit[1]))
 
     def _expected_stack(self, mean: FloatArray, index: int) -> emva.Stack:
@@ -272,8 +267,26 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
         variance + np.sqrt(spread) * z[1] + shared,
         rows + shared + alone,
     )
+    if any(frames.lamp):
+        pairs = _under_lamp(frames, pairs, rng)
     dark, bright = _drawn_stacks(frames, expected, rng)
     return replace(expected, pairs=pairs, dark_stack=dark, bright_stack=bright)
+
+
+def _under_lamp(frames: Frames, pairs: emva.Pair, rng: np.random.Generator) -> emva.Pair:
+    """Drawn ``pairs`` (sessions, S) of sets whose light is off, each by its part and all by another."""
+    each, every = frames.lamp
+    step = max(frames.lamp)
+    sides = [
+        emva.pairs_of([frames._expected_pair(index, 1 + side * step) for index in range(len(frames.light))])
+        for side in (-1, 1)
+    ]
+    off = each * rng.standard_normal(pairs.mean.shape) + every * rng.standard_normal((_SESSIONS, 1))
+    mean, variance = (
+        getattr(pairs, name) + off * (getattr(sides[1], name) - getattr(sides[0], name)) / (2 * step)
+        for name in ("mean", "variance")
+    )
+    return emva.Pair(mean, variance, pairs.rows)
 
 
 def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -> list[emva.Stack]:
@@ -307,7 +320,8 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
         row, column, pixel = (squares[part][side] for part in ("row", "column", "pixel"))
         total = (row * n + column * m + pixel) / (m * n - 1)
         mean = np.full(_SESSIONS, float(getattr(expected, name).mean))
-        taken = noise[side] / counts[side]
+        freedom = (m - 1) * (counts[side] - 1)
+        taken = (noise[side] - shared + shared * rng.chisquare(freedom, _SESSIONS) / freedom) / counts[side]
         stacks.append(emva.Stack(mean, total - taken, row / m - taken / n, column / n - taken / m))
     return stacks
 

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.report.pages import round_to_error, typeset
-from mitsim.report.plots import BLACK, BLUE, FONT, GREEN, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
 from mitsim.sensor.emva import LINEAR, MOST_FITTED, Session
 from mitsim.studies.emva_results import MOST_OFF, Characterisation, Row
 
-_CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5, "label": "closed form"}
+_CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5}
 _PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
 """How what is expected and what was found are drawn."""
 
@@ -35,8 +35,8 @@ def _chart(
     done: Characterisation, points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
 ) -> tuple[Figure, Axes]:
     figure, axes = figure_of(0.45 * WIDTH)
-    for session, style in ((done.expected, _CLOSED), (done.session, _PAIRS)):
-        axes.plot(*points(session), **style)
+    axes.plot(*points(done.expected), **_CLOSED, label="camera found" if done.real else "closed form")
+    axes.plot(*points(done.session), **_PAIRS)
     axes.set_title(title, fontsize=FONT + 1)
     label_axes(axes, x, y)
     return figure, axes
@@ -49,7 +49,7 @@ def _photon_transfer(done: Characterisation) -> Figure:
         _, signal, noise = session.transfer()
         return signal, noise
 
-    title = f"Photon transfer: the gain is {_figure_text(done, 'system_gain')}"
+    title = f"Photon transfer: EMVA 1288 finds a gain of {_figure_text(done, 'system_gain')}"
     figure, axes = _chart(
         done, points, title, "signal less dark signal [DN]", "temporal variance less dark variance [DN$^2$]"
     )
@@ -58,9 +58,6 @@ def _photon_transfer(done: Characterisation) -> Figure:
     line = np.array([0.0, MOST_FITTED * full if done.session.saturates else full])
     label = "fit to 70 % of saturation" if done.session.saturates else "fit"
     axes.plot(line, _figure(done, "system_gain").found * line, color=VERMILION, lw=2, ls="--", label=label)
-    if done.real:
-        camera = "camera found, by closed forms"
-        axes.plot(line, done.found.sensor.gain_dn_per_e * line, color=GREEN, lw=1.5, label=camera)
     if done.session.saturates:
         axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
         axes.set_xlim(right=1.1 * float(signal.max()))
@@ -90,7 +87,7 @@ def _dark_current(done: Characterisation) -> Figure:
         signal = session.pairs.mean[session.unlit] - done.sensor.superpixel_black_level_dn
         return session.exposure_s[session.unlit], signal / _figure(done, "system_gain").found
 
-    title = f"The dark current is {_figure_text(done, 'dark_current')}"
+    title = f"EMVA 1288 finds a dark current of {_figure_text(done, 'dark_current')}"
     figure, axes = _chart(done, points, title, "exposure time [s]", "dark signal less black level [e$^-$]")
     axes.legend(fontsize=FONT - 1, frameon=False)
     return figure
@@ -105,7 +102,7 @@ def _figure_text(done: Characterisation, name: str) -> str:
     row = _figure(done, name)
     error = round_to_error(row.standard_error, row.standard_error)
     unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-    beside = f"{'camera' if done.real else 'set'} {row.set:.5g}"
+    beside = f"{'camera found' if done.real else 'set'} {row.set:.5g}"
     return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, {beside}")
 
 
@@ -123,7 +120,7 @@ def _deviations(done: Characterisation) -> Figure:
     verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
     axes.set_title(f"{verdict} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
     axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
-    label_axes(
-        axes, f"found less set or expected [predicted standard errors]; shaded: within {MOST_OFF:g}", "", grid="x"
-    )
+    of = "the camera's" if done.real else "set"
+    label = f"found less {of} or expected [predicted standard errors]; shaded: within {MOST_OFF:g}"
+    label_axes(axes, label, "", grid="x")
     return figure

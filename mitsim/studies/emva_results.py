@@ -185,7 +185,8 @@ class Characterisation:
             "figures": [asdict(row) for row in self.rows],
             "camera_found": [asdict(row) for row in self.fields],
             "light": {
-                "uneven": self.found.uneven, "scatter": transfer.lamp, "drifts": transfer.lamp_drifts,
+                "uneven": self.found.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
+                "seen": transfer.light,
                 "chi_square": transfer.chi_square, "freedom": transfer.freedom,
             },
             "notes": list(self.found.notes),

@@ -20,7 +20,7 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.devices.flatlist import DarkSet, FlatFrames, LitSet
-from mitsim.sensor.emva import Alike, alike
+from mitsim.sensor.emva import LINEAR, MOST_FITTED, Alike, alike
 from mitsim.sensor.found_camera import FoundCamera
 from mitsim.sensor.photon_transfer import Taken, saturation_of
 
@@ -33,12 +33,20 @@ _SURE = 6.0
 """Standard errors from which a difference is none by chance, of thousands that are looked at."""
 _WHITE = 0.02
 """Correlation of the noise of neighbours that charge between pixels may make (some 1 to 2 % in infrared arrays)."""
+_MIXED = 0.1
+"""The same, from which frames were computed from their neighbours: variances are then a tenth off, and no fit explains
+them."""
 _EVEN = 0.03
 """Part of the light by which EMVA 1288 4.0 lets it differ over the frame."""
 _STEADY = 0.01
 """Part of the light by which sets may be off what their exposures say before it is said."""
 _STRAIGHT = 0.05
 """Part of a variance by which it may be off what the camera explains before it is said."""
+_STILL = 0.1
+"""Digital numbers by which a dark mean may be off what the camera explains before it is said: chosen, a tenth of the
+least step."""
+_SWAPPED = 1.5
+"""Response over that of most sets, or below, at which no lamp is steady enough."""
 _PEAK = 0.6
 """Part of the brightest signal at which a camera's variance is largest at least: cameras reach it at 0.8 or later, and
 charge that is held at a soft full well somewhat before."""
@@ -102,6 +110,7 @@ def read_sets(flats: FlatFrames, job: Job) -> list[FlatSet]:
         sets = in_threads(lambda each: _read_set(flats, each, shape), flats.sets)
     _check_numbers(where, flats, sets)
     _check_light(where, sets)
+    _check_noise(where, sets)
     return sets
 
 
@@ -155,48 +164,71 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
     """MitsimError for sets that are not what the list says."""
     dark = {each.taken.exposure_s: each for each in sets if not each.taken.light}
     lit = [each for each in sets if each.taken.light]
+    signals = list[float]()
     for each in lit:
         said, still = each.taken.said, dark[each.taken.exposure_s].taken.said
-        signal = float(said.pair.mean) - float(still.pair.mean)
-        if signal <= _SURE * math.hypot(said.mean_error, still.mean_error):
+        signals.append(float(said.pair.mean) - float(still.pair.mean))
+        if signals[-1] <= _SURE * math.hypot(said.mean_error, still.mean_error):
             raise MitsimError(
                 f"{where}: {each.name} is no brighter than the dark frames of its exposure; light it, or list it as "
                 "dark"
             )
-        if said.flicker > _UNEQUAL * signal:
+        if said.flicker > _UNEQUAL * signals[-1]:
             raise MitsimError(
-                f"{where}: {each.name} differ by {100 * said.flicker / signal:.0f} % of their light; take the "
-                "frames of a "
-                "set with one exposure, under a steady lamp"
+                f"{where}: {each.name} differ by {100 * said.flicker / signals[-1]:.0f} % of their light; take the "
+                "frames of a set with one exposure, under a steady lamp"
             )
-    if any(_is_lit(each, lit) for each in dark.values()):
-        each = next(each for each in dark.values() if _is_lit(each, lit))
-        raise MitsimError(
-            f"{where}: {each.name} are listed as dark and differ by {each.taken.said.flicker:.3g} DN; cover the "
-            "camera, "
-            "and take them again"
-        )
-    below = [each for each in lit if each.taken.said.cut[1] == 0]
-    if not below:
+    brightest = max(float(each.taken.said.pair.mean) for each in lit)
+    for each in dark.values():
+        if each.taken.said.flicker > _UNEQUAL * max(brightest - float(each.taken.said.pair.mean), 0.0):
+            raise MitsimError(
+                f"{where}: {each.name} are listed as dark and differ by {each.taken.said.flicker:.3g} DN; cover the "
+                "camera, and take them again"
+            )
+    if all(each.taken.said.cut[1] for each in lit):
         part = min(each.taken.said.cut[1] for each in lit)
         raise MitsimError(
             f"{where}: all sets under light hold saturated numbers, {100 * part:.3g} % of them at least; expose "
             "some for less"
         )
-    for each in below:
-        if not float(each.taken.said.pair.variance) and not _is_saturated(sets, each):
-            raise MitsimError(f"{where}: {each.name} are equal in every number, which no camera's frames are; take two")
+    peak, _ = saturation_of([each.taken for each in sets])
+    full = signals[lit.index(sets[peak])]
+    for each, signal in zip(lit, signals, strict=True):
+        if not each.taken.said.cut[1] and signal <= full and not float(each.taken.said.pair.variance):
+            raise MitsimError(
+                f"{where}: {each.name} are equal in every number: one frame twice, or noise below a code; take two, "
+                "at a higher gain"
+            )
+    responses = {
+        each.name: signal / each.taken.light
+        for each, signal in zip(lit, signals, strict=True)
+        if LINEAR[0] * full < signal < MOST_FITTED * full
+    }
+    middle = float(np.median([*responses.values()])) if responses else 1.0
+    for name, response in responses.items():
+        if not 1 / _SWAPPED < response / middle < _SWAPPED:
+            raise MitsimError(
+                f"{where}: {name} are {response / middle:.3g} times as bright as most sets are at their exposures; "
+                "correct exposure_s, light or files of the list"
+            )
 
 
-def _is_lit(each: FlatSet, lit: Sequence[FlatSet]) -> bool:
-    """Whether frames of a set in the dark differ by a tenth of what the brightest light makes."""
-    brightest = max(float(other.taken.said.pair.mean) for other in lit)
-    return each.taken.said.flicker > _UNEQUAL * max(brightest - float(each.taken.said.pair.mean), 0.0)
-
-
-def _is_saturated(sets: Sequence[FlatSet], each: FlatSet) -> bool:
-    peak, _ = saturation_of([other.taken for other in sets])
-    return float(each.taken.said.pair.mean) > float(sets[peak].taken.said.pair.mean)
+def _check_noise(where: str, sets: Sequence[FlatSet]) -> None:
+    """MitsimError for pictures that were computed from a camera's readings."""
+    mixed = float(np.median([max(map(abs, _correlations(each.taken.said))) for each in sets]))
+    if mixed > _MIXED:
+        raise MitsimError(
+            f"{where}: noise of neighbouring pixels is correlated by {mixed:.2g}, so frames were compressed, "
+            "smoothed, scaled or demosaiced, and tell no gain or noise of the camera; give raw frames"
+        )
+    means = [float(each.taken.said.pair.mean) for each in sets]
+    part = (means[saturation_of([each.taken for each in sets])[0]] - min(means)) / (max(means) - min(means))
+    if part < _PEAK:
+        raise MitsimError(
+            f"{where}: variances do not rise with means as those of counted electrons, the largest is at "
+            f"{100 * part:.0f} % of the brightest signal; a gamma curve, compression or codes coarser than the noise "
+            "do that; give raw frames of more bits, or of a higher gain"
+        )
 
 
 def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
@@ -210,49 +242,54 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
         the camera that explains them.
     """
     transfer, lines = found.transfer, list[str]()
-    used = [index for index, off in enumerate(transfer.off) if math.isfinite(off)]
-    smooth = max((abs(part), index) for index in used for part in _correlations(sets[index].taken.said))
-    if smooth[0] > 0:
-        each = sets[smooth[1]]
+    used = [(sets[index], off) for index, off in enumerate(transfer.off) if np.all(np.isfinite(off))]
+    smooth, each = max(
+        ((max(map(abs, _correlations(each.taken.said))), each) for each, _ in used), key=lambda pair: pair[0]
+    )
+    if smooth > 0:
         lines.append(
-            f"noise of neighbouring pixels is correlated by {smooth[0]:.2g} in {each.name}: frames were compressed, "
+            f"noise of neighbouring pixels is correlated by {smooth:.2g} in {each.name}: frames were compressed, "
             "smoothed, scaled or demosaiced, and gain and noise are of those pictures, not of the camera; give raw "
             "frames"
         )
+    widened = math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1))
     bent = [
-        (abs(transfer.off[index]) * said.variance_error / float(said.pair.variance), index)
-        for index in used
-        for said in [sets[index].taken.said]
-        if abs(transfer.off[index]) > _SURE and sets[index].taken.light
-    ]  # fmt: skip
+        (abs(off[1]) * said.variance_error / float(said.pair.variance), each.name)
+        for each, off in used
+        for said in [each.taken.said]
+        if abs(off[1]) > _SURE and each.taken.light
+    ]
     if bent and max(bent)[0] > _STRAIGHT:
-        part, index = max(bent)
+        part, name = max(bent)
         lines.append(
-            f"variances do not rise with means as those of counted electrons: {sets[index].name} is off by "
-            f"{100 * part:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are "
-            "widened by "
-            f"{math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1)):.2g}"
+            f"variances do not rise with means as those of counted electrons: {name} is off by {100 * part:.0f} %; a "
+            f"gamma curve, compression or automatic gain does that; standard errors are widened by {widened:.2g}"
         )
-    peak, _ = saturation_of([each.taken for each in sets])
-    means = [float(each.taken.said.pair.mean) for each in sets]
-    part = (means[peak] - min(means)) / (max(means) - min(means))
-    if part < _PEAK:
+    still = [(abs(off[0]) * each.taken.said.mean_error, each.name) for each, off in used
+             if abs(off[0]) > _SURE and not each.taken.light]  # fmt: skip
+    if still and max(still)[0] > _STILL:
         lines.append(
-            f"variances do not rise with means as those of counted electrons: the largest is at {100 * part:.0f} % of "
-            "the brightest signal; a gamma curve or compression does that, and no figure is the camera's"
+            f"dark means do not rise with exposure: {max(still)[1]} is off by {max(still)[0]:.2g} DN; the black level "
+            "or the temperature drifts, or frames are listed at another exposure; black_level_dn and "
+            f"dark_current_e_per_s are not to be trusted, standard errors are widened by {widened:.2g}"
         )
-    if transfer.lamp_drifts:
+    known = (
+        "gain and noise hold; quantum_efficiency, saturation_capacity and linearity are known to that, as their "
+        "standard errors say; take the frames again under a steady lamp"
+    )
+    if transfer.light == "undecided":
+        lines.append(
+            "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts: "
+            "linearity, gain, full_well and quantum_efficiency of the camera found have the difference in their "
+            "standard errors; take more frames in each set, or measure the lamp at each and list it as light"
+        )
+    elif transfer.light == "drifts":
         lines.append(
             "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not as "
-            "listed, "
-            f"by {100 * transfer.lamp:.2g} %; gain and noise hold, linearity and quantum efficiency are off by as much"
+            f"listed, by {100 * transfer.lamp:.2g} %; {known}"
         )
     elif transfer.lamp > _STEADY:
-        lines.append(
-            f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; linearity is known to that, "
-            "gain and "
-            "noise hold"
-        )
+        lines.append(f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; {known}")
     if found.uneven > _EVEN:
         lines.append(
             f"light differs by {100 * found.uneven:.0f} % over the frame, and EMVA 1288 allows {100 * _EVEN:.0f} %: "

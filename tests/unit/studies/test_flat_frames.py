@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,16 +18,17 @@ from mitsim.devices.flatlist import load_flats
 from mitsim.devices.sensor import load_sensor
 from mitsim.studies.characterise import CAMERA_FILE, characterise_frames
 from mitsim.studies.emva_results import FIELDS, Characterisation, _set_field
-from tests.real_flats import CAMERAS, camera, write_flats
+from tests.real_flats import CAMERAS, Light, camera, write_flats
 
-QUICK = ("plain", "high read noise, cut darks", "nonuniform", "defects")
-"""Cameras of the quick tests: one of each kind of fault."""
+SLOW = ("few bits", "dark current", "high gain", "saturating ADC")
+"""Cameras of the slow tests: the quick ones are one of each kind of fault."""
 
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
     """By how many standard errors each field of the camera found is off that of the camera of this ``name``."""
     model = camera(name)
-    given = {row.name: _set_field(model, row.name) if row.name in FIELDS else model.linearity[int(row.name[-1])]
+    bends = [*model.linearity, 0.0, 0.0]
+    given = {row.name: _set_field(model, row.name) if row.name in FIELDS else bends[int(row.name[-1])]
              for row in done.fields}  # fmt: skip
     return {
         row.name: (row.found - value) / row.standard_error
@@ -35,13 +38,17 @@ def off_by(done: Characterisation, name: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CAMERAS]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CAMERAS]
 )
 def test_frames_of_a_camera_characterise_to_that_camera(name: str, tmp_path: Path) -> None:
-    """Every field within five standard errors, of some fifteen a camera; and its file is a camera's."""
+    """Every field within five standard errors, of some fifteen a camera; and its file is a camera's.
+
+    (Planted, each seen by the camera that it is of: row noise not less by a row of m; hot pixels told by noise that
+    rounding hides; a spread of offsets that is chance; saturation by variance alone; dark current fitted to one code.)
+    """
     done = characterise_frames(load_flats(write_flats(tmp_path / "frames", camera(name), stack=8)), tmp_path / "out")
     off = off_by(done, name)
-    assert len(off) >= 14 and all(abs(value) < 5 for value in off.values()), off
+    assert len(off) >= 12 and all(abs(value) < 5 for value in off.values()), off
     assert all(abs(row.deviations) < 5 for row in done.rows), done.warnings
     found = load_sensor(tmp_path / "out" / CAMERA_FILE)
     assert found == done.found.sensor
@@ -73,29 +80,89 @@ def shaded(photons: float, number: int, frame: int) -> np.ndarray:
     return photons * (1 + 0.1 * np.linspace(-1, 1, 96) + np.zeros((96, 1)))
 
 
-AMISS: dict[str, tuple[dict[str, Any], str]] = {
-    "an uneven lamp": ({"light": shaded}, "light differs by 20 % over the frame"),
-    "a drifting lamp": ({"light": lambda photons, number, frame: photons * (1 - 0.2 * number / 16), "side": 192},
-                        "so the lamp drifts"),
-    "a scattering lamp": ({"light": lambda photons, number, frame: photons * (1 + 0.03 * np.sin(5.0 * number))},
-                          "light scatters by"),
-    "8 bits as of a JPEG": ({"read": compressed, "bits": 8}, "noise of neighbouring pixels is correlated by"),
-    "a gamma curve": ({"read": lambda frame: np.rint(4095 * (frame / 4095) ** (1 / 2.2)), "photons_per_s": None},
-                      "variances do not rise with means"),
+def gamma(frame: np.ndarray) -> np.ndarray:
+    return np.rint(4095 * (frame / 4095) ** (1 / 2.2))
+
+
+WALK = np.cumsum(np.random.default_rng(0).normal(0, 0.02, 16))
+LAMPS: dict[str, tuple[Light, int, str]] = {
+    "linear": (lambda photons, number, frame: photons * (1 - 0.2 * number / 16), 96, "so the lamp drifts"),
+    "warming up": (lambda photons, number, frame: photons * (1 + 0.1 * np.exp(-number / 4)), 96, "so the lamp drifts"),
+    "random walk": (lambda photons, number, frame: photons * (1 + WALK[number]), 96, "light scatters by"),
+    "step": (lambda photons, number, frame: photons * (1.05 if number >= 8 else 1.0), 96, "light scatters by"),
+    "scattering": (lambda photons, number, frame: photons * (1 + 0.03 * np.sin(5.0 * number)), 96, "light scatters by"),
+    "weakly linear": (lambda photons, number, frame: photons * (1 + 0.02 * number / 16), 96,
+                      "variances do not tell whether the camera bends or the lamp drifts"),
+    "weakly linear, more pixels": (lambda photons, number, frame: photons * (1 + 0.02 * number / 16), 192,
+                                   "so the lamp drifts"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if "JPEG" in name else []) for name in AMISS]
-)
-def test_what_is_amiss_with_frames_is_said_once(name: str, tmp_path: Path) -> None:
-    changes, words = AMISS[name]
-    done = characterise_frames(load_flats(write_flats(tmp_path / "frames", camera("plain"), **changes)))
-    assert any(words in line for line in done.about), done.about
-    if "lamp" in name:
-        off = off_by(done, "plain")
-        assert all(abs(off[field]) < 5 for field in ("gain_dn_per_e", "read_noise_e", "black_level_dn")), off
-        assert not done.found.sensor.linearity
+@pytest.mark.parametrize("name", LAMPS)
+def test_a_lamp_that_drifts_is_said_and_in_the_errors_of_what_depends_on_it(name: str, tmp_path: Path) -> None:
+    """All fields and figures within five standard errors, and a line that names those which are known the less.
+
+    (Planted: the lamp's part left out of the error of the response, of the drawn sessions; the difference between bent
+    camera and drifting lamp left out of the covariance; an error for a full well that no frame reaches.)
+    """
+    light, side, words = LAMPS[name]
+    done = characterise_frames(load_flats(write_flats(tmp_path / "frames", camera("plain"), light=light, side=side)))
+    (line,) = done.warnings[:1]
+    assert words in line and "quantum_efficiency" in line and "linearity" in line
+    assert bool(done.found.sensor.linearity) == (done.found.transfer.light == "undecided")
+    off = off_by(done, "plain")
+    assert all(abs(value) < 5 for value in off.values()), off
+    assert ("full_well_e" in off) == (name != "linear")  # its brightest frames are below saturation
+    assert all(abs(row.deviations) < 5 for row in done.rows), done.rows
+
+
+def test_light_that_is_uneven_or_smoothed_somewhat_is_said(tmp_path: Path) -> None:
+    """A fifth over the frame; and 6 % of the neighbour in a row."""
+    done = characterise_frames(load_flats(write_flats(tmp_path / "a", camera("plain"), light=shaded)))
+    assert any("light differs by 20 % over the frame" in line for line in done.about)
+    off = off_by(done, "plain")
+    assert all(abs(off[name]) < 5 for name in ("gain_dn_per_e", "read_noise_e", "quantum_efficiency")), off
+
+    def smoothed(frame: np.ndarray) -> np.ndarray:
+        return np.rint(0.94 * frame + 0.06 * np.roll(frame, 1, axis=1))
+
+    done = characterise_frames(
+        load_flats(write_flats(tmp_path / "b", camera("saturating ADC"), side=192, read=smoothed))
+    )
+    assert any("noise of neighbouring pixels is correlated by" in line for line in done.about), done.about
+
+
+def vignetted(photons: float, number: int, frame: int) -> np.ndarray:
+    y, x = np.mgrid[-1:1:96j, -1:1:96j]
+    return photons * (1 - 0.15 * (x**2 + y**2))
+
+
+def behind_filters(photons: float, number: int, frame: int) -> np.ndarray:
+    light = np.full((96, 96), photons)
+    light[::2, ::2] *= 0.6
+    light[1::2, 1::2] *= 0.4
+    return light
+
+
+NO_CAMERA: dict[str, tuple[dict[str, Any], str]] = {
+    "8 bits as of a JPEG": ({"read": compressed, "bits": 8}, "so frames were compressed"),
+    "a gamma curve": ({"read": gamma}, "a gamma curve, compression"),
+    "a gamma curve of 8 bits": ({"read": lambda frame: np.rint(gamma(frame) / 16), "bits": 8}, "a gamma curve"),
+    "a vignetted lamp": ({"light": vignetted}, "light differs by 33 % over the frame"),
+    "colour filters": ({"light": behind_filters}, "give the frames of one colour behind filters"),
+    "shifted numbers": ({"read": lambda frame: 16 * frame, "bits": 16}, "multiples of 16"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NO_CAMERA)
+def test_frames_that_tell_nothing_of_a_camera_are_refused_soon(name: str, tmp_path: Path) -> None:
+    """In 10 s of the processor, most of it for the frames."""
+    changes, words = NO_CAMERA[name]
+    flats = load_flats(write_flats(tmp_path / "frames", camera("plain"), **changes))
+    start = time.process_time()
+    with pytest.raises(MitsimError, match=re.escape(words)):
+        characterise_frames(flats)
+    assert time.process_time() - start < 10
 
 
 def alone(listed: dict[str, Any]) -> None:
@@ -119,6 +186,11 @@ def twice(listed: dict[str, Any]) -> None:
     listed["lit"][3]["files"] = listed["lit"][2]["files"]
 
 
+def swapped(listed: dict[str, Any]) -> None:
+    first, second = listed["lit"][4], listed["lit"][8]
+    first["files"], second["files"] = second["files"], first["files"]
+
+
 def dark_is_lit(listed: dict[str, Any]) -> None:
     listed["lit"][5]["files"] = listed["dark"][5]["files"]
     listed["dark"][5]["files"] = ["lit_05_00.npy", "lit_05_01.npy"]
@@ -138,6 +210,7 @@ WRONG: dict[Callable[[dict[str, Any]], None], str] = {
     unequal: "of their light; take the frames of a set with one exposure",
     only_saturated: "all sets under light hold saturated numbers",
     twice: "is listed twice",
+    swapped: "lit_08_00.npy to lit_08_01.npy are 1.8 times as bright as most sets",
     dark_is_lit: "is no brighter than the dark frames",
     too_few_bits: "numbers of 10 bits are 0 to 1023",
     photons_of_another_lamp: "electrons a photon; at most 1 is possible",
@@ -164,10 +237,20 @@ def test_a_list_s_mistakes_are_refused_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_numbers_that_were_shifted_are_named_with_their_factor(tmp_path: Path) -> None:
-    folder = write_flats(tmp_path / "f", camera("plain"), side=32, steps=4, read=lambda frame: 16 * frame, bits=16)
-    with pytest.raises(MitsimError, match="multiples of 16"):
-        characterise_frames(load_flats(folder))
+def test_darks_of_another_exposure_are_named(tmp_path: Path) -> None:
+    """The shortest and the longest dark pair are listed for each other; one saturated set is enough for a full well."""
+    folder = write_flats(tmp_path / "frames", camera("plain"))
+    facts = json.loads((folder / "session.json").read_text())
+    facts["lit"] = facts["lit"][:10] + facts["lit"][-1:]
+    (folder / "session.json").write_text(json.dumps(facts))
+    done = characterise_frames(load_flats(folder))
+    off = off_by(done, "plain")
+    assert not done.about and "full_well_e" in off and all(abs(value) < 5 for value in off.values()), off
+    first, last = facts["dark"][0], facts["dark"][-1]
+    first["files"], last["files"] = last["files"], first["files"]
+    (folder / "session.json").write_text(json.dumps(facts))
+    (line,) = characterise_frames(load_flats(folder)).about
+    assert "dark means do not rise with exposure: dark_15" in line and "dark_current_e_per_s" in line
 
 
 def test_one_exposure_tells_gain_and_noise_and_says_what_it_does_not(tmp_path: Path) -> None:
