@@ -201,7 +201,7 @@ def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, 
     )  # fmt: skip
     light = np.maximum(ndimage.uniform_filter(plane, _SMOOTH), 0)
     shot, read = (stream(seed, "twin", kind, name) for kind in ("shot", "read"))
-    return np.asarray(expose(light / gain, EXPOSURE_S, sensor, shot, read), dtype=np.float64) - light
+    return np.asarray(expose(light / gain, EXPOSURE_S, sensor, shot, read) - light, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
