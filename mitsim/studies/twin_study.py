@@ -26,7 +26,7 @@ from mitsim.studies.framework.run import Findings
 from mitsim.studies.twin_capture import Learned, Measured, read_captures
 from mitsim.studies.twin_diffuser import DiffuserTwin, frequencies, radial_power, read_spread, twin_of
 from mitsim.studies.twin_files import TwinFiles
-from mitsim.studies.twin_frame import Twin, compare, correlation, render
+from mitsim.studies.twin_frame import CAUSES, Twin, compare, correlation, render
 
 _GREEN = "gb"
 """Plane whose frames are shown."""
@@ -36,6 +36,8 @@ _BRIGHT = 3.0
 """Standard deviations of a frame from mid-grey to white."""
 _EDGES = np.geomspace(0.005, 0.5, 29)
 """Of the bands of a frame's radial spectrum [cycles / pixel]: a sixth of a frequency wide."""
+_TICKS = (0.02, 0.05, 0.1, 0.2, 0.4)
+"""Frequencies that are named along a diffuser's spectrum [cycles / pixel]."""
 _RENDERED = 0.1
 """Relative error of a simulated frame from which a twin is not to be trusted: its energy is then a hundredth, as much
 as causes are told by."""
@@ -127,6 +129,7 @@ class TwinFindings(Findings):
             ),
             ("frames.png", "spectra.png"),
             (
+                "Frames are planes of the Bayer sensor: red, green beside blue, green beside red, blue.",
                 "Other scene: correlation with another capture's scene through the same codes: what bright scenes have "
                 "in common. A twin is worth what it has above that.",
                 "Explained: part of the frame's energy. Noise alone: part that no model explains, by the frame's own "
@@ -134,21 +137,22 @@ class TwinFindings(Findings):
                 "light over what the learned codes expect.",
             ),
         )
-        causes = list(self.twins[0].parts)
         yield Part(
             "By cause",
-            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave. "
+            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave; bars "
+            "show what the simulation leaves. "
             "Smooth field: polynomials of light and of gain. Mask's code: codes fitted to this very frame. Scene's "
             "image: a correction of least risk. Noise that a fit takes with it counts as noise; the rest is not "
             "explained: of what is not separable, moved or grew.",
-            ("frame", *causes),
-            tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in causes)) for twin in self.twins),
+            ("frame", *CAUSES),
+            tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in CAUSES)) for twin in self.twins),
             ("causes.png",),
         )
         yield Part(
             "Means of rows and columns, and what cannot be known",
             "The camera's program takes the means off. Correlation of measured and simulated means, and the measured "
-            "mean level over the simulated one where coded parts agree.",
+            "mean level over the simulated one where coded parts agree. What no comparison of these frames can tell "
+            "stands below.",
             ("frame", "rows", "columns", "level"),
             tuple(
                 (twin.measured.name, *(f"{each:.2f}" for each in (*_of_means(twin), twin.level))) for twin in self.twins
@@ -163,13 +167,13 @@ class TwinFindings(Findings):
         if self.twins:
             green = [twin for twin in self.twins if twin.measured.plane == _GREEN][:2]
             parts = {
-                twin.measured.name: {name: max(100 * part, 0.0) for name, part in twin.parts.items()}
+                twin.measured.name: {name: max(100 * twin.parts[name], 0.0) for name in CAUSES[2:]}
                 for twin in self.twins
             }
             shown |= {
                 "frames.png": _frames_figure(green),
                 "spectra.png": _spectra_figure(green),
-                "causes.png": plots.stacked_bars(parts, "energy of the frame [%]"),
+                "causes.png": plots.stacked_bars(parts, "not explained by the simulation [% of the frame's energy]"),
                 "means.png": _means_figure(green[0]),
             }
         if self.diffuser:
@@ -306,24 +310,38 @@ def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
 # ---- Figures ----
 
 
+def _pictures(rows: Sequence[Mapping[str, FloatArray]], ends: Sequence[tuple[float, float]], unit: str) -> Figure:
+    """Pictures in ``rows`` by their titles, in greys between each row's ``ends``, which its scale names in a
+    ``unit``."""
+    count = len(rows[0])
+    figure, places = plots.panels_of(
+        len(rows), count, len(rows) * (0.9 * plots.WIDTH / count + 0.3), layout="compressed"
+    )
+    for line, images, (least, most) in zip(places, rows, ends, strict=True):
+        for axes, (title, image) in zip(line, images.items(), strict=True):
+            drawn = axes.imshow(image, cmap="gray", vmin=least, vmax=most, interpolation="none")
+            axes.set(xticks=[], yticks=[])
+            axes.set_title(title, fontsize=plots.FONT - 1)
+        bar = figure.colorbar(drawn, ax=line, extend="max" if least == 0 else "both")
+        bar.set_label(unit, fontsize=plots.FONT - 1)
+        bar.ax.tick_params(labelsize=plots.FONT - 2)
+    return figure
+
+
 def _frames_figure(twins: Sequence[Twin]) -> Figure:
     """Middles of measured and simulated frames with noise, and their difference."""
-    figure, places = plots.panels_of(len(twins), 3, 2.9 * len(twins) + 0.3, layout="compressed")
-    for line, twin in zip(places, twins, strict=True):
-        frame, sigma = twin.measured.frame, float(twin.measured.frame.std())
-        first = [(side - _SHOWN) // 2 for side in frame.shape]
-        middle = np.s_[first[0] : first[0] + _SHOWN, first[1] : first[1] + _SHOWN]
+    rows, ends = [], []
+    for twin in twins:
+        frame = twin.measured.frame
+        row, column = ((side - _SHOWN) // 2 for side in frame.shape)
         images = {
-            "measured": frame,
+            f"{twin.measured.name}: measured": frame,
             "simulated, with noise": twin.noisy,
             "measured less simulated": frame - twin.expected,
         }
-        for axes, (name, image) in zip(line, images.items(), strict=True):
-            axes.imshow(image[middle], cmap="gray", vmin=-_BRIGHT * sigma, vmax=_BRIGHT * sigma, interpolation="none")
-            axes.set(xticks=[], yticks=[])
-            axes.set_title(f"{twin.measured.name}: {name}" if name == "measured" else name, fontsize=plots.FONT - 1)
-    figure.suptitle(f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off, one scale", fontsize=plots.FONT)
-    return figure
+        rows.append({name: image[row : row + _SHOWN, column : column + _SHOWN] for name, image in images.items()})
+        ends.append((-_BRIGHT * float(frame.std()), _BRIGHT * float(frame.std())))
+    return _pictures(rows, ends, "light, row and column means off [DN]")
 
 
 def _spectra_figure(twins: Sequence[Twin]) -> Figure:
@@ -364,14 +382,9 @@ def _means_figure(twin: Twin) -> Figure:
 
 
 def _light_figure(twin: DiffuserTwin) -> Figure:
-    figure, places = plots.panels_of(1, 2, 0.5 * plots.WIDTH, layout="compressed")
-    for axes, (name, light) in zip(
-        places[0], {"measured": twin.measured, "simulated": twin.simulated}.items(), strict=True
-    ):
-        axes.imshow(np.sqrt(light), cmap="gray", vmin=0, vmax=_BRIGHT, interpolation="none")
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(f"{name}, root of light over its mean", fontsize=plots.FONT - 1)
-    return figure
+    images = {"measured": twin.measured, "simulated": twin.simulated}
+    rows = {f"{name}, {len(light)} x {len(light)} pixels": np.sqrt(light) for name, light in images.items()}
+    return _pictures([rows], [(0.0, _BRIGHT)], "root of light over its mean [1]")
 
 
 def _rings_figure(twin: DiffuserTwin) -> Figure:
@@ -383,6 +396,8 @@ def _rings_figure(twin: DiffuserTwin) -> Figure:
     axes.plot(frequencies(), simulated.mean(axis=0), label="simulated, mean", lw=1.8, **plots.line_style(0))
     axes.plot(frequencies(), twin.spreads[0].spectrum, label="measured", lw=1.8, **plots.line_style(1))
     axes.set(xscale="log", yscale="log")
+    axes.set_xticks(_TICKS, map(str, _TICKS))
+    axes.minorticks_off()
     plots.label_axes(axes, "frequency [cycles / pixel]", "power of light over its mean [1]")
     plots.legend_below(figure, 3, *axes.get_legend_handles_labels())
     return figure

@@ -187,9 +187,9 @@ def beyond_scenes(codes: Codes, draws: np.random.Generator) -> FloatArray:
 
 def test_causes_are_found_as_they_were_planted() -> None:
     """Light a tenth more, smooth stray light, another code of either side, noise, and what no scene makes behind such a
-    mask, all at once, in 16 draws: the mean of each cause is the energy that was given, to 4 standard errors, of 2 to
-    5 % of it. (Planted: noise that fits take left out; numbers of the codes left out; the frame before its smooth field
-    is off fitted.)"""
+    mask, all at once, in 16 draws: the mean of each cause is the energy that was given, to 5 permille of the frame's.
+    (Planted: noise that fits take left out; codes fitted before the smooth field is off; noise of half its
+    variance.)"""
     codes = made_codes()
     measured = made(5, codes)
     size = float(np.linalg.norm(measured.frame))
@@ -230,7 +230,8 @@ def test_causes_are_found_as_they_were_planted() -> None:
 def test_noise_alone_has_no_other_cause_and_another_scene_is_one() -> None:
     """Causes that were not planted are nought to a permille of the frame's energy, of 8 draws. Of a scene that differs
     from its image four fifths are found, but a part of them as codes that stand for it, which are fitted before.
-    (Planted: noise that fits take left out, 3 permille to codes; the scene's correction taken with the wrong sign.)"""
+    (Planted: noise that fits take left out; numbers of the codes left out; the scene's correction with the wrong
+    sign.)"""
     codes = made_codes()
     measured = made(5, codes)
     size = float(np.linalg.norm(measured.frame))
