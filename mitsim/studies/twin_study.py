@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.bench.request import Request
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.job import Job
 from mitsim.report import plots
@@ -139,11 +140,10 @@ class TwinFindings(Findings):
         )
         yield Part(
             "By cause",
-            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave; bars "
-            "show what the simulation leaves. "
-            "Smooth field: polynomials of light and of gain. Mask's code: codes fitted to this very frame. Scene's "
-            "image: a correction of least risk. Noise that a fit takes with it counts as noise; the rest is not "
-            "explained: of what is not separable, moved or grew.",
+            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave; "
+            "bars show what the simulation leaves. Smooth field: polynomials of light and of gain. Mask's code: codes "
+            "fitted to this very frame. Scene's image: a correction of least risk. Noise that a fit takes with it "
+            "counts as noise; the rest is not explained: of what is not separable, moved or grew.",
             ("frame", *CAUSES),
             tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in CAUSES)) for twin in self.twins),
             ("causes.png",),
