@@ -341,7 +341,9 @@ def _frames_figure(twins: Sequence[Twin]) -> Figure:
         }
         rows.append({name: image[row : row + _SHOWN, column : column + _SHOWN] for name, image in images.items()})
         ends.append((-_BRIGHT * float(frame.std()), _BRIGHT * float(frame.std())))
-    return _pictures(rows, ends, "light, row and column means off [DN]")
+    figure = _pictures(rows, ends, "light [DN]")
+    figure.suptitle(f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off", fontsize=plots.FONT)
+    return figure
 
 
 def _spectra_figure(twins: Sequence[Twin]) -> Figure:
@@ -384,7 +386,7 @@ def _means_figure(twin: Twin) -> Figure:
 def _light_figure(twin: DiffuserTwin) -> Figure:
     images = {"measured": twin.measured, "simulated": twin.simulated}
     rows = {f"{name}, {len(light)} x {len(light)} pixels": np.sqrt(light) for name, light in images.items()}
-    return _pictures([rows], [(0.0, _BRIGHT)], "root of light over its mean [1]")
+    return _pictures([rows], [(0.0, _BRIGHT)], "root of light over mean [1]")
 
 
 def _rings_figure(twin: DiffuserTwin) -> Figure:
