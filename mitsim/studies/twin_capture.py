@@ -221,5 +221,5 @@ class Learned:
         return cls(pose, fit_codes(turned, Shape(pose.scales, 1, True)))
 
     def see(self, measured: Measured) -> Measured:
-        """The same with its scene as it lies before the mask."""
+        """The ``measured`` plane with its scene as it lies before the mask."""
         return replace(measured, scene=measured.exposure().turn_scene(self.pose.orientation).scene)
