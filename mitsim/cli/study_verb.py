@@ -54,7 +54,6 @@ class Studied:
     seed: Seed = 0
     recipe: Path | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
     data: Path | None = option(None, "of twin: folder of real captures", metavar="DIR")
-    calibration: Path | None = option(None, "of twin: CAL folder of the mask, else learned", metavar="CAL")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
 
 
@@ -88,7 +87,7 @@ def study(
     else:
         refuse_unused(context, ["experiment"], "but with merge; give the module as the study's NAME")
     if name != "twin":
-        refuse_unused(context, ["data", "calibration"], "but on the study twin")
+        refuse_unused(context, ["data"], "but on the study twin")
     session, request = recipe_for(name, studied.recipe), mitsim.Request.of(patterns=studied.patterns, seed=studied.seed)
     warnings: Sequence[str] = ()
     with common.job() as job:
@@ -115,7 +114,7 @@ def study(
             if name == "twin":
                 from mitsim.studies.twin_files import TwinFiles
 
-                settings = {"files": TwinFiles.find(studied.data, studied.calibration), "variant": common.variant}
+                settings = {"files": TwinFiles.find(studied.data), "variant": common.variant}
             run_study = find_study(name, **settings)
             if not points.are_main:
                 raise MitsimError(

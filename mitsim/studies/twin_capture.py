@@ -1,61 +1,45 @@
-"""A FlatCam's raw capture and its authors' image of it in; frame, noise and the mask's codes, learned or read, out.
+"""A FlatCam's raw captures and its authors' images of them in; frames, their noise and the mask's codes out.
 
-What the camera's own program does before its solver is done here: a plane of the Bayer sensor is turned by 0.1 degrees,
-cut, and loses the means of its rows and columns.
-
-A mask close to a sensor casts the same shadow from every direction, shifted: Phi[u, i] = c(u + s i), with s the sensor
-pixels that one scene pixel moves it by, and c the mask's code on a grid of sensor pixels, linear between them. That is
-the mean over a pixel of a mask whose features are as large as pixels, so a code can be drawn. Given one side's code,
-frames Y = Phi_L X Phi_R^T are linear in the other's, and the sides take turns.
+Captures become frames as `mitsim import --list flatcam` makes them (:mod:`mitsim.core.prepare`); codes are learned as
+`mitsim calibrate --known` learns them (:mod:`mitsim.reconstruct.shifted_codes`), with one code a side. Noise is that of
+a capture's own fine structure.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
-from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagelist import Wanted
-from mitsim.core.images import read_image
-from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.imagelist import BGGR, Preparation, Wanted, planes_of
+from mitsim.core.images import Numbers, read_image
+from mitsim.core.manifests import Digital
+from mitsim.core.prepare import Preparer, factor_of
 from mitsim.core.seeds import stream
-from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import centre_columns, centre_frame
+from mitsim.devices.sensor import SensorModel
+from mitsim.reconstruct.known_pictures import PLANES
+from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes
+from mitsim.reconstruct.solver import centre_frame
+from mitsim.sensor.chain import expose
 
-TURN_DEG = 0.1
-"""How the mask is turned against the sensor: 0.00174 rad in the authors' program."""
-CROP = slice(6, 506), slice(10, 630)
-"""Rows and columns of the turned plane that their program keeps."""
-SCALES = 0.475, 0.48
-"""Sensor pixels of a plane that a scene pixel moves the mask's shadow by, along rows and columns: where the residual of
-learned codes is least, to 0.003."""
-FLIPPED = True, True
-"""Whether the scene lies upside down, and mirrored, before that camera: frames that are held out then correlate by 0.87
-and 0.80 with codes learned from the other capture; any other way by 0.81 and 0.68 at most."""
-PLANES = {"b": ((0, 0), 2), "gb": ((0, 1), 1), "r": ((1, 1), 0)}
-"""Planes that are compared: row and column in a cell of the Bayer sensor, and channel of the authors' images. The
-second green one lies half a pixel beside the first and tells nothing else."""
-_RIDGE = 1e-3
-"""Of a code's normal equations, over their mean diagonal: at 1e-4 and 1e-2 a frame that is held out is explained as
-well to 0.002."""
-_TURNS = 4
-"""Of both sides: what codes explain stands still to 1e-4 from the third on."""
+_RAW = 1024, 1280
+"""Rows and columns of a capture."""
+PITCH_MM = 0.0106
+"""Of a plane's pixels, twice 5.3 um: the sensors of 1024 x 1280 pixels in use then have it. Frames do not depend on
+it."""
+EXPOSURE_S = 0.01
+"""Any: frames before noise are compared, and scaled."""
 _BLOCK = 48
 """Side of the blocks whose noise and mean are compared [pixels]: light varies by some per cent within."""
 _SMOOTH = 31
 """Side of the square that gives a pixel's mean light [pixels], far more than the mask's features."""
-_APART = 4
-"""Scene pixels over the distance between those whose shadows are compared first: a quarter of the scene."""
-
-
-# ---- Frames ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,93 +48,117 @@ class Measured:
 
     Attributes
     ----------
-    name
-        of capture and plane.
+    capture, plane
+        names of both.
     level
-        (m, m') turned and cut plane [DN].
-    variance
-        (m, m') of its noise [DN^2], means off.
-    frame
-        (m, m') the plane without row and column means [DN].
+        (m, m') the plane, turned and cut [DN].
+    noise
+        (m, m') drawn as the plane's is, turned and cut, row and column means off [DN].
     scene
-        (n, n') authors' image of it, as the camera sees it, 0 to 1.
+        (n, n') authors' image of it, 0 to 1.
     gain, read_variance
         DN an electron, and noise without light [DN^2], of the raw plane.
     """
 
-    name: str
+    capture: str
+    plane: str
     level: FloatArray
-    variance: FloatArray
-    frame: FloatArray
+    noise: FloatArray
     scene: FloatArray
     gain: float
     read_variance: float
 
     @property
-    def energy(self) -> float:
-        """Sum of squares of the plane about its mean."""
-        return float(np.square(self.level - self.level.mean()).sum())
+    def name(self) -> str:
+        """Of the frame."""
+        return f"{self.capture} {self.plane}"
+
+    @cached_property
+    def frame(self) -> FloatArray:
+        """(m, m') the plane without row and column means [DN]."""
+        return centre_frame(self.level)
+
+    def exposure(self, frame: FloatArray | None = None, group: int = 0) -> Exposure:
+        """What a fit of codes takes: the frame, or another ``frame`` of the plane; ``group``: the picture's number."""
+        return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, PLANES[self.plane])
 
 
-def turn_plane(plane: FloatArray) -> FloatArray:
-    """A ``plane``, or noise alone, turned and cut as the camera's own program does, between pixels linearly."""
-    return np.asarray(ndimage.map_coordinates(plane, _places(plane.shape), order=1, mode="nearest"))
+@dataclass(frozen=True)
+class Recipe:
+    """What `calibration/flatcam.toml` says: ``how`` files become frames, what their numbers are (``digital``), of how
+    many ``bits``, and ``n`` scene pixels a side."""
+
+    how: Preparation
+    digital: Digital
+    bits: int
+    n: int
+
+    @classmethod
+    def load(cls) -> Recipe:
+        """As it ships."""
+        path = shipped_path("calibration", "flatcam.toml")
+        listed = read_toml(path)
+        how = validate(Preparation, listed["prepare"], f"list {path}")
+        return cls(how, validate(Digital, listed["digital"], f"list {path}"), listed["bits"], listed["n"])
+
+    def planes(self, path: Path) -> dict[str, FloatArray]:
+        """Planes of the capture ``path``, whole, as the sensor has them [DN]; MitsimError where it is no capture."""
+        numbers = read_image(path, Wanted("capture", mosaic=self.how.mosaic))
+        if numbers.shape != _RAW:
+            raise MitsimError(f"capture {path}: is {_size(numbers)}; give the raw frame, {_RAW[0]} x {_RAW[1]}")
+        factor, largest = factor_of(numbers) or 1, 2**self.bits - 1
+        if not 0 <= numbers.min() < numbers.max() <= factor * largest:
+            raise MitsimError(
+                f"capture {path}: holds {numbers.min():g} to {numbers.max():g}, no light in numbers of {self.bits} "
+                "bits; give the raw frame"
+            )
+        places = planes_of(self.how.mosaic or BGGR)
+        return {name: np.asarray(numbers[places[name][0] :: 2, places[name][1] :: 2] / factor) for name in PLANES}
+
+    def place(self, plane: FloatArray) -> FloatArray:
+        """A whole ``plane``, or noise alone, turned and cut as a frame."""
+        how = self.how.model_copy(update={"channel": None, "mosaic": None, "divide_by": 1})
+        return Preparer.of(how, self.digital, Wanted()).frame(Path(), plane).astype(np.float64)
+
+    def scene(self, path: Path) -> FloatArray:
+        """(n, n, 3) authors' image in the file ``path``, 0 to 1."""
+        image = read_image(path, Wanted("image", bits=(8,), colour=True))
+        if image.shape != (self.n, self.n, 3):
+            raise MitsimError(
+                f"image {path}: is {_size(image)}; give the authors', {self.n} x {self.n} of red, green and blue"
+            )
+        return np.asarray(image / 255, dtype=np.float64)
 
 
-def _places(shape: tuple[int, ...]) -> FloatArray:
-    """(2, m, m') rows and columns of a plane of that ``shape`` that a turned, cut plane shows."""
-    angle, middle = np.radians(TURN_DEG), (np.array(shape) - 1) / 2
-    row, column = (np.arange(side.start, side.stop) - at for side, at in zip(CROP, middle, strict=True))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    rows = cosine * row[:, None] + sine * column[None, :]
-    columns = -sine * row[:, None] + cosine * column[None, :]
-    return np.stack([rows + middle[0], columns + middle[1]])
+def _size(values: Numbers) -> str:
+    return " x ".join(map(str, values.shape))
 
 
-def read_plane(path: Path, plane: str) -> FloatArray:
-    """(rows, columns) of a ``plane`` of the raw capture ``path``, in steps of its converter: files hold these times a
-    power of two. MitsimError for a file that is none, or another size."""
-    numbers = read_image(path, Wanted("capture"))
-    if numbers.shape[0] // 2 < CROP[0].stop or numbers.shape[1] // 2 < CROP[1].stop:
-        raise MitsimError(
-            f"capture {path}: is {numbers.shape[0]} x {numbers.shape[1]}; give the raw frame, 1024 x 1280"
-        )
-    (row, column), _ = PLANES[plane]
-    common = max(int(np.gcd.reduce(numbers.astype(np.int64).ravel())), 1)
-    return np.asarray(numbers[row::2, column::2] / common, dtype=np.float64)
-
-
-def read_scene(path: Path, plane: str) -> FloatArray:
-    """(n, n') authors' image in the file ``path`` of what a ``plane`` shows, as the camera sees it."""
-    image = read_image(path, Wanted("image", colour=True))
-    if image.ndim != 3:
-        raise MitsimError(f"image {path}: has no colours; give the authors' image, of red, green and blue")
-    values = np.asarray(image[..., PLANES[plane][1]] / 255, dtype=np.float64)
-    return values[:: -1 if FLIPPED[0] else 1, :: -1 if FLIPPED[1] else 1].copy()
-
-
-def measure_plane(name: str, raw: FloatArray, gain: float, read_variance: float, scene: FloatArray) -> Measured:
-    """A raw plane, turned and cut, with its noise.
+def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Measured]:
+    """Every plane of all captures.
 
     Parameters
     ----------
-    name
-        of capture and plane.
-    raw
-        (rows, columns) of it [DN].
-    gain, read_variance
-        of its noise, as :func:`noise_of`.
-    scene
-        (n, n') what it is of.
+    files
+        raw frame and its authors' image, by the capture's name.
+    seed
+        of their drawn noise.
+
+    Raises
+    ------
+    MitsimError
+        for files that are no such captures.
     """
-    places = _places(raw.shape)
-    rows, columns = places - np.floor(places)
-    kept = (rows**2 + (1 - rows) ** 2) * (columns**2 + (1 - columns) ** 2)  # of white noise between pixels
-    level = turn_plane(raw)
-    light = np.maximum(ndimage.uniform_filter(level, _SMOOTH), 0)
-    left = (1 - 1 / level.shape[0]) * (1 - 1 / level.shape[1])  # of it without means
-    variance = kept * (gain * light + read_variance) * left
-    return Measured(name, level, variance, centre_frame(level), scene, gain, read_variance)
+    recipe, found = Recipe.load(), []
+    raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
+    scenes = {name: recipe.scene(image) for name, (_, image) in files.items()}
+    for plane in PLANES:
+        gain, dark = noise_of([planes[plane] for planes in raw.values()])
+        for name, planes in raw.items():
+            noise = recipe.place(draw_noise(planes[plane], gain, dark, seed, f"{name} {plane}"))
+            scene, level = scenes[name][..., "rgb".index(plane[0])], recipe.place(planes[plane])
+            found.append(Measured(name, plane, level, centre_frame(noise), scene, gain, dark))
+    return found
 
 
 def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
@@ -161,13 +169,13 @@ def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
     """
     means, squares = [], []
     for plane in planes:
-        second = np.array([1.0, -2.0, 1.0]) / np.sqrt(6)
-        fine = ndimage.convolve1d(ndimage.convolve1d(plane, second, axis=0), second, axis=1)
-        for row in range(1, plane.shape[0] - _BLOCK, _BLOCK):
-            for column in range(1, plane.shape[1] - _BLOCK, _BLOCK):
+        fine = np.square(np.diff(np.diff(plane, 2, 0), 2, 1)) / 36
+        light = plane[1:-1, 1:-1]
+        for row in range(0, light.shape[0] - _BLOCK, _BLOCK):
+            for column in range(0, light.shape[1] - _BLOCK, _BLOCK):
                 block = np.s_[row : row + _BLOCK, column : column + _BLOCK]
-                means.append(plane[block].mean())
-                squares.append(np.square(fine[block]).mean())
+                means.append(light[block].mean())
+                squares.append(fine[block].mean())
     light, variance = np.array(means), np.array(squares)
     gain, dark = np.polyfit(light, variance, 1)
     if dark < 0 or gain <= 0:  # no dark light is seen: all noise is that of photons
@@ -175,124 +183,43 @@ def noise_of(planes: Sequence[FloatArray]) -> tuple[float, float]:
     return float(gain), float(dark)
 
 
-# ---- Codes ----
-
-
-@dataclass(frozen=True, eq=False)
-class Code:
-    """One side of a camera.
-
-    Attributes
-    ----------
-    values
-        (T,) the mask along that side, a value a sensor pixel; its mean is not known.
-    scale
-        s.
-    scene
-        pixels of the scene.
-    """
-
-    values: FloatArray
-    scale: float
-    scene: int
-
-    @property
-    def factor(self) -> FloatArray:
-        """(m, n) of all sensor pixels that see the code from every scene pixel; columns without their means."""
-        hats = _hats(self.scale, self.scene)
-        return centre_columns(sliding_window_view(self.values, hats.shape[1]) @ hats.T)
-
-
-def _hats(scale: float, scene: int) -> FloatArray:
-    """(n, w) what each scene pixel takes of the window of a code that one sensor pixel sees."""
-    place = scale * np.arange(scene)
-    first = np.floor(place).astype(int)
-    found = np.zeros((scene, first[-1] + 2))
-    found[np.arange(scene), first] = 1 - (place - first)
-    found[np.arange(scene), first + 1] += place - first
-    return found
-
-
-def _fit_side(scale: float, lights: Sequence[FloatArray], frames: Sequence[FloatArray]) -> Code:
-    """The code of rows in ``frames`` (m, k) each = Phi Z, Z of ``lights`` (n, k); least squares, each frame over its
-    energy."""
-    hats = _hats(scale, len(lights[0]))
-    (scene, width), sensor = hats.shape, len(frames[0])
-    weights = [1 / float(np.square(frame).sum()) for frame in frames]
-    gram = np.sum([part * light @ light.T for part, light in zip(weights, lights, strict=True)], axis=0)
-    product = (
-        np.sum([p * frame @ light.T for p, frame, light in zip(weights, frames, lights, strict=True)], axis=0) @ hats
-    )
-    block = hats.T @ gram @ hats
-    length = sensor + width - 1
-    matrix, right, total = np.zeros((length, length)), np.zeros(length), np.zeros((scene, length))
-    for row in range(sensor):
-        window = slice(row, row + width)
-        matrix[window, window] += block
-        right[window] += product[row]
-        total[:, window] += hats
-    matrix -= total.T @ gram @ total / sensor  # frames have no column means
-    matrix[np.diag_indices(length)] += _RIDGE * np.trace(matrix) / length
-    return Code(np.linalg.solve(matrix, right), scale, scene)
-
-
-@single_threaded_blas()
-def learn_codes(
-    planes: Sequence[Measured], scales: tuple[float, float] = SCALES, start: Code | None = None
-) -> tuple[Code, Code]:
-    """Codes of rows and columns, from frames of known scenes.
+def draw_noise(plane: FloatArray, gain: float, read_variance: float, seed: int, name: str) -> FloatArray:
+    """(rows, columns) noise [DN] of a simulated sensor in the light of a plane.
 
     Parameters
     ----------
-    planes
-        frames and scenes.
-    scales
-        s of rows and of columns.
-    start
-        code of columns to begin with; None: a random one, from which the sides come to the same.
+    plane
+        (rows, columns) as the sensor has it [DN].
+    gain, read_variance
+        as :func:`noise_of`.
+    seed, name
+        of the draw.
     """
-    scenes, frames = [each.scene for each in planes], [each.frame for each in planes]
-    hats = _hats(scales[1], scenes[0].shape[1])
-    draws = stream(0, "twin's codes").standard_normal(frames[0].shape[1] + hats.shape[1] - 1)
-    right = start or Code(draws, scales[1], scenes[0].shape[1])
-    for _ in range(_TURNS):
-        across = right.factor
-        left = _fit_side(scales[0], [scene @ across.T for scene in scenes], frames)
-        along = left.factor
-        right = _fit_side(scales[1], [scene.T @ along.T for scene in scenes], [frame.T for frame in frames])
-    return left, right
+    sensor = SensorModel(
+        name="twin", pixel_pitch_um=PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=gain,
+        read_noise_e=float(np.sqrt(read_variance)) / gain, source="mitsim study twin",
+    )  # fmt: skip
+    light = np.maximum(ndimage.uniform_filter(plane, _SMOOTH), 0)
+    shot, read = (stream(seed, "twin", kind, name) for kind in ("shot", "read"))
+    return np.asarray(expose(light / gain, EXPOSURE_S, sensor, shot, read) - light, dtype=np.float64)
 
 
-@single_threaded_blas()
-def read_code(factor: FloatArray) -> tuple[Code, bool, float]:
-    """The code that a calibrated ``factor`` (m, n) is, seen through shifts; whether it is so for the scene in reverse
-    order; and the part of the factor that is something else, in energy.
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Codes of a mask, and how pictures lie before it (``pose``)."""
 
-    MitsimError where no shift is seen: of a mask that does not reach beyond the view.
-    """
-    without = centre_columns(factor)
-    step = factor.shape[1] // _APART
-    spectra = np.fft.rfft(without, 2 * len(factor), axis=0)
-    alike = np.fft.irfft((spectra[:, :-step].conj() * spectra[:, step:]).sum(axis=1))
-    # c(u + s i): a step on in the scene the shadow lies s step earlier.
-    peak = int(np.argmax(alike))
-    shift = -(peak if peak < len(factor) else peak - 2 * len(factor)) / step
-    if abs(shift) * step < 1:
-        raise MitsimError("factor: its columns are not one shadow, shifted; a twin needs a mask that fills the view")
-    straight = without if shift > 0 else without[:, ::-1]
+    pose: Pose
+    codes: Codes
 
-    def fit(scale: float) -> tuple[Code, float]:
-        code = _fit_side(scale, [np.eye(factor.shape[1])], [straight])
-        return code, float(np.square(straight - code.factor).sum() / np.square(straight).sum())
+    @classmethod
+    def of(cls, planes: Sequence[Measured]) -> Learned:
+        """From ``planes`` of known scenes."""
+        names = list(dict.fromkeys(each.capture for each in planes))
+        exposures = [each.exposure(group=names.index(each.capture)) for each in planes]
+        pose = find_pose(exposures)
+        turned = [each.turn_scene(pose.orientation) for each in exposures]
+        return cls(pose, fit_codes(turned, Shape(pose.scales, 1, True)))
 
-    near = 1.0 / step  # a peak is found to a pixel
-    found = minimize_scalar(lambda s: fit(s)[1], bounds=(abs(shift) - near, abs(shift) + near), method="bounded")
-    code, rest = fit(float(found.x))
-    return code, shift < 0, rest
-
-
-def codes_of(factors: Factors) -> tuple[Code, Code, tuple[bool, bool], float]:
-    """Codes of rows and columns in a calibration's ``factors``, whether each is for the scene in reverse order, and the
-    larger part that is no code."""
-    (left, up, beside), (right, mirrored, along) = (read_code(each) for each in (factors.left, factors.right))
-    return left, right, (up, mirrored), max(beside, along)
+    def see(self, measured: Measured) -> Measured:
+        """The ``measured`` plane with its scene as it lies before the mask."""
+        return replace(measured, scene=measured.exposure().turn_scene(self.pose.orientation).scene)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
@@ -20,13 +21,16 @@ from scipy import ndimage
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
+from mitsim.core.imagelist import Wanted
+from mitsim.core.images import read_image
 from mitsim.core.job import Progress
 from mitsim.core.seeds import stream
+from mitsim.devices.mask_profile import load_psf
 from mitsim.transport.plugins.diffuser import Diffuser, Relief, point_spread, random_relief
 
 PITCH_MM = 4 * 5.86e-3
 """Of four of its pixels, of the shipped sensor's size: lengths go with it, and nothing else."""
-REDUCE = 4
+_REDUCE = 4
 """Pixels a side of the picture that become one."""
 _CORRELATIONS_MM = np.geomspace(0.15, 0.45, 8)
 _MOVES_MM = np.geomspace(0.05, 0.25, 8)
@@ -46,6 +50,7 @@ _BANDS = 14
 """Of the radial spectrum: a fourth of a frequency wide, as caustic cells vary."""
 _LOWEST, _HIGHEST = 1 / 70, 0.4
 """Bands of the radial spectrum, from a few caustic cells to where noise of rays would show [cycles / pixel]."""
+_EDGES = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1)
 _LIT, _SURE = 0.2, 12.0
 """Part of the brightest smoothed light that counts as lit, and the width of that smoothing [pixels], a cell's."""
 _BRIGHTEST = 0.05
@@ -119,26 +124,31 @@ def spread_of(light: FloatArray) -> Spread:
     even = light / light.mean()
     ordered = np.sort(even.ravel())
     count = max(1, round(_BRIGHTEST * even.size))
-    return Spread(_spectrum(even), float(even.std()), float(ordered[-count:].sum() / ordered.sum()))
+    return Spread(radial_power(even, _EDGES), float(even.std()), float(ordered[-count:].sum() / ordered.sum()))
 
 
 def frequencies() -> FloatArray:
     """(bands,) middles of the radial bands [cycles / pixel]."""
-    edges = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1)
-    return np.asarray(np.sqrt(edges[1:] * edges[:-1]))
+    return np.asarray(np.sqrt(_EDGES[1:] * _EDGES[:-1]))
 
 
-def _spectrum(even: FloatArray) -> FloatArray:
-    rows, columns = even.shape
-    window = np.outer(np.hanning(rows), np.hanning(columns))
+def radial_power(values: FloatArray, edges: FloatArray) -> FloatArray:
+    """(bands,) mean power a pixel of ``values`` (rows, columns), windowed and without their mean, between frequencies
+    ``edges`` (bands + 1,) [cycles / pixel]."""
+    window = np.outer(*(np.hanning(side) for side in values.shape))
     window /= np.sqrt(np.square(window).mean())
-    without = (even - (even * window**2).mean()) * window
-    power = np.square(np.abs(np.fft.fft2(without))) / without.size
-    radius = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.fftfreq(columns)[None, :])
-    edges = np.geomspace(_LOWEST, _HIGHEST, _BANDS + 1)
+    power = np.square(np.abs(np.fft.fft2((values - (values * window**2).mean()) * window))) / values.size
+    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(side) for side in values.shape), indexing="ij"))
     which = np.digitize(radius.ravel(), edges)
-    sums, counts = (np.bincount(which, weights, _BANDS + 2) for weights in (power.ravel(), None))
+    sums, counts = (np.bincount(which, weights, len(edges) + 1) for weights in (power.ravel(), None))
     return np.asarray(sums[1:-1] / np.maximum(counts[1:-1], 1))
+
+
+def read_spread(path: Path) -> FloatArray:
+    """(rows, columns) light of the point spread function in the picture ``path``; MitsimError for one of colours."""
+    if read_image(path, Wanted("point spread function", colour=True)).ndim != 2:
+        raise MitsimError(f"point spread function {path}: is in colour; give the sensor's own grey picture")
+    return lit_square(load_psf(path, _REDUCE))
 
 
 def lit_square(light: FloatArray) -> FloatArray:
@@ -189,24 +199,18 @@ def fit(measured: FloatArray, grid: FloatArray) -> tuple[int, int, float, float]
     return best[1:]
 
 
-def twin_of(light: FloatArray, seed: int, variant: str, progress: Progress) -> DiffuserTwin:
+def twin_of(square: FloatArray, seed: int, variant: str, progress: Progress) -> DiffuserTwin:
     """A diffuser whose statistics are those of a point spread function.
 
     Parameters
     ----------
-    light
-        (rows, columns) of it, in pixels of :data:`PITCH_MM`.
+    square
+        lit part of it, as :func:`read_spread` finds it, in pixels of :data:`PITCH_MM`.
     seed
         of the diffusers.
     variant, progress
         of Mitsuba, and who is told how far the work is.
-
-    Raises
-    ------
-    MitsimError
-        as :func:`lit_square`.
     """
-    square = lit_square(light)
     count = len(square)
     side = count * PITCH_MM + 2 * _MARGIN_MM
     grids = np.empty((_SEEDS, len(_CORRELATIONS_MM), len(_MOVES_MM), _BANDS))
@@ -216,7 +220,7 @@ def twin_of(light: FloatArray, seed: int, variant: str, progress: Progress) -> D
         for each in range(_SEEDS):
             relief = random_relief(side, float(correlation), _SLOPE, seed + each)
             for column, move in enumerate(_MOVES_MM):
-                spectrum = _spectrum(_land(relief, float(move), count, each))
+                spectrum = radial_power(_land(relief, float(move), count, each), _EDGES)
                 grids[each, row, column] = np.maximum(spectrum - floor, spectrum / 10)
     measured = spread_of(square)
     found = fit(measured.spectrum, grids.mean(axis=0))

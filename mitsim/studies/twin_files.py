@@ -36,17 +36,14 @@ class TwinFiles:
         raw frame and its authors' image, by the capture's name.
     psf
         point spread function of a DiffuserCam; None: none is compared.
-    calibration
-        CAL folder of the FlatCam's green plane; None: codes are learned from the other captures.
     """
 
     captures: dict[str, tuple[Path, Path]]
     psf: Path | None
-    calibration: Path | None = None
 
     @classmethod
-    def find(cls, folder: Path | None, calibration: Path | None = None) -> TwinFiles:
-        """Those in a ``folder``, with a ``calibration``; MitsimError where there are none, or too few."""
+    def find(cls, folder: Path | None) -> TwinFiles:
+        """Those in a ``folder``; MitsimError where there are none, or too few."""
         if folder is None:
             raise MitsimError(f"study twin: needs real captures; give --data FOLDER with {SOURCES}")
         if not folder.is_dir():
@@ -54,16 +51,14 @@ class TwinFiles:
         frames = sorted((folder / FLATCAM).glob("fc_*.png"))
         captures = {frame.stem: (frame, frame.with_name(f"rec_{frame.stem[3:]}.png")) for frame in frames}
         psf = folder / DIFFUSERCAM / PSF
-        found = cls(captures, psf if psf.exists() else None, calibration)
+        found = cls(captures, psf if psf.exists() else None)
         for file in (*(each for pair in captures.values() for each in pair), *([found.psf] if found.psf else ())):
             check_plain(file, "capture")
         if not captures and found.psf is None:
             raise MitsimError(f"--data {folder}: has no captures; give a folder with {SOURCES}")
-        if calibration is not None and not captures:
-            raise MitsimError(f"--calibration {calibration}: has no effect without {folder / FLATCAM}; leave it out")
-        if len(captures) == 1 and calibration is None:
+        if len(captures) == 1:
             raise MitsimError(
-                f"--data {folder}: has one capture of a FlatCam, and its mask is learned from others; give "
-                "--calibration CAL, or a second capture"
+                f"--data {folder}: has one capture of a FlatCam, and its mask is learned from others; give a second "
+                "and its image"
             )
         return found

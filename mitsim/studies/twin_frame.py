@@ -19,24 +19,19 @@ from numpy.polynomial.legendre import legvander
 
 from mitsim.api.bench import open_bench
 from mitsim.core.arrays import FloatArray
+from mitsim.core.images import grey_png
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.seeds import stream
-from mitsim.devices.sensor import SensorModel
+from mitsim.reconstruct.known_pictures import PLANES
+from mitsim.reconstruct.shifted_codes import Codes, Shape, fit_codes
 from mitsim.reconstruct.solver import centre_frame
-from mitsim.sensor.chain import expose
-from mitsim.studies.twin_capture import CROP, Code, Measured, learn_codes, turn_plane
+from mitsim.studies.twin_capture import EXPOSURE_S, PITCH_MM, Measured
 
-_PITCH_MM = 0.0106
-"""Of a Bayer plane's pixels, twice 5.3 um: the sensors of 1024 x 1280 pixels in use then have it. Frames do not depend
-on it."""
 _MASK_MM, _SHEET_MM = 10.0, 1000.0
 """Sensor to mask and to sheet: the scene then ends at 4 degrees, where light falls by 1 % by its angle."""
 _ACCURACY = 1e-3
-"""Of frames, whose coded part is a fiftieth: it is then good to 2 to 3 %, where 24 to 60 % are not explained."""
+"""Of frames, whose coded part is a thirtieth: it is then good to 2 to 5 %, where 22 to 58 % are not explained."""
 _WIDER = 1.05
 """Projector's window over the sheet."""
-_EXPOSURE_S = 0.01
-"""Any: frames before noise are compared, and scaled."""
 _SCENE = Template("""<scene version="3.0.0">
 <integrator type="path"><integer name="max_depth" value="2"/></integrator>
 <sensor type="mitsim_lensless" id="camera">
@@ -69,73 +64,50 @@ _SCENE = Template("""<scene version="3.0.0">
 
 
 @single_threaded_blas()
-def render(scene: FloatArray, codes: tuple[Code, Code], folder: Path, variant: str) -> FloatArray:
-    """(m, m') expected electrons of a simulated camera that sees a ``scene`` (n, n') through a mask of ``codes``.
+def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> FloatArray:
+    """(m, m') expected electrons of a simulated camera that sees a frame's scene through a mask of ``codes``.
 
     Parameters
     ----------
-    scene
-        as the camera sees it, 0 to 1.
+    measured
+        the frame, its scene as it lies before the mask.
     codes
-        of rows and of columns.
+        of its mask, one a side.
     folder
         that gets the bench's files, which any verb takes; it exists.
     variant
         of Mitsuba.
     """
-    shape = tuple(len(code.values) - int(code.scale * (code.scene - 1)) - 1 for code in codes)
-    feature = _PITCH_MM * (1 - _MASK_MM / _SHEET_MM)
+    lines = [code[0] for code in codes.codes]
+    feature = PITCH_MM * (1 - _MASK_MM / _SHEET_MM)
+    # The sensor's middle sees the scene's at this number of the code; the drawing's middle is the axis.
     beside = [
-        ((len(code.values) - 1) / 2 - (pixels - 1 + code.scale * (code.scene - 1)) / 2) * feature
-        for code, pixels in zip(codes, shape, strict=True)
+        ((len(line) - 1) / 2 - ((side.sensor - 1 + side.scale * (side.scene - 1)) / 2 + offset)) * feature
+        for line, side, offset in zip(lines, codes.sides, PLANES[measured.plane], strict=True)
     ]
-    height, width = (code.scale * feature / _MASK_MM * code.scene / 2 * _SHEET_MM for code in codes)
+    height, width = (side.scale * feature / _MASK_MM * side.scene / 2 * _SHEET_MM for side in codes.sides)
     half = _WIDER * max(height, width)
-    np.save(folder / "mask.npy", (1 + np.outer(*(code.values / np.abs(code.values).max() for code in codes))) / 2)
-    (folder / "reflectance.png").write_bytes(_picture(scene))
+    np.save(folder / "mask.npy", (1 + np.outer(*(line / np.abs(line).max() for line in lines))) / 2)
+    (folder / "reflectance.png").write_bytes(grey_png(measured.scene))
     window = np.zeros((128, 256))
     window[:, 128:] = 1  # as the photograph's: the right half of a shifted lens
-    (folder / "projector.png").write_bytes(_picture(window))
+    (folder / "projector.png").write_bytes(grey_png(window))
     text = _SCENE.substitute(
-        pitch=_PITCH_MM, mask=_MASK_MM, sheet=_SHEET_MM, offset_row=beside[0], offset_column=beside[1],
-        rows=shape[0], columns=shape[1], width=width, height=height, half=half,
+        pitch=PITCH_MM, mask=_MASK_MM, sheet=_SHEET_MM, offset_row=beside[0], offset_column=beside[1],
+        rows=codes.sides[0].sensor, columns=codes.sides[1].sensor, width=width, height=height, half=half,
         fov=2 * np.degrees(np.arctan(_WIDER * half / _SHEET_MM)), throw=2 * np.degrees(np.arctan(2 * half / _SHEET_MM)),
     )  # fmt: skip
     (folder / "scene.xml").write_text(text, encoding="utf-8")
-    camera = f'name = "twin"\npixel_pitch_um = {_PITCH_MM * 1e3}\nfull_well_e = inf\nread_noise_e = 0.0\n'
+    camera = f'name = "twin"\npixel_pitch_um = {PITCH_MM * 1e3}\nfull_well_e = inf\nread_noise_e = 0.0\n'
     camera += 'quantum_efficiency = 1.0\ngain_dn_per_e = 1.0\nsource = "mitsim study twin"\n'
     camera += f'[mask]\nkind = "drawing"\nfeature_mm = {feature!r}\nfile = "mask.npy"\n'
     (folder / "camera.toml").write_text(camera, encoding="utf-8")
     bench = open_bench(str(folder), variant, str(folder / "camera.toml"))
     plan = bench.plan("uniform", accuracy=_ACCURACY, effects="-diffraction")
-    expected = bench.capture(plan, exposure=_EXPOSURE_S).electrons
+    expected = bench.capture(plan, exposure=EXPOSURE_S).electrons
     if expected is None:
         raise AssertionError  # a simulated capture has them
     return np.asarray(expected[0], dtype=np.float64)
-
-
-def _picture(values: FloatArray) -> bytes:
-    """A PNG of ``values``, 0 to 1, as they are."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    held = BytesIO()
-    Image.fromarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)).save(held, "PNG")
-    return held.getvalue()
-
-
-def draw_noise(measured: Measured, seed: int) -> FloatArray:
-    """(m, m') noise [DN] of the simulated sensor at the ``measured`` light, put through the same turn and cut; its
-    ``seed``."""
-    sensor = SensorModel(
-        name="twin", pixel_pitch_um=_PITCH_MM * 1e3, full_well_e=float("inf"), gain_dn_per_e=measured.gain,
-        read_noise_e=float(np.sqrt(measured.read_variance)) / measured.gain, source="mitsim study twin",
-    )  # fmt: skip
-    light = np.full(tuple(side.start + side.stop for side in CROP), measured.level.mean() / measured.gain)
-    shot, read = (stream(seed, "twin", kind, measured.name) for kind in ("shot", "read"))
-    noisy = np.asarray(expose(light, _EXPOSURE_S, sensor, shot, read), dtype=np.float64)
-    return centre_frame(turn_plane(noisy - noisy.mean()))
 
 
 # ---- What is compared ----
@@ -156,117 +128,110 @@ class Twin:
     ----------
     measured
         the frame.
-    expected, noisy
-        (m, m') the simulated frame without noise and with it, means off, in the measured one's scale [DN].
-    gain
-        found, over that of the learned codes; None where codes are of a calibration in another unit.
-    correlation, chi_square
-        of the two frames, means off; the latter with the measured frame's noise.
-    other
-        correlation of the measured frame with another capture's scene through the same codes: what any bright scene has
-        in common; None where there is no other.
-    parts
-        of the measured frame's energy by :data:`CAUSES`; noise that a correction takes with it counts as noise.
-    rows, columns
-        correlation of the means of rows, and of columns.
-    level
-        measured mean light over the simulated, of frames whose coded parts agree.
-    render_error
-        simulated frame against the product of factors, relative.
+    expected
+        (m, m') the simulated frame without noise, means off, in the measured one's scale [DN].
     electrons
         (m, m') expected of the simulated camera, means and all.
+    gain
+        light found, over that of the learned codes.
+    other
+        correlation of the measured frame with another capture's scene through the same codes: what any bright scene has
+        in common.
+    parts
+        of the measured frame's energy about its mean by :data:`CAUSES`; noise that a correction takes with it counts as
+        noise.
+    render_error
+        simulated frame against the product of factors, relative.
     """
 
     measured: Measured
     expected: FloatArray
-    noisy: FloatArray
-    gain: float | None
-    correlation: float
-    chi_square: float
-    other: float | None
-    parts: dict[str, float]
-    rows: float
-    columns: float
-    level: float
-    render_error: float
     electrons: FloatArray
+    gain: float
+    other: float
+    parts: dict[str, float]
+    render_error: float
+
+    @property
+    def noisy(self) -> FloatArray:
+        """(m, m') the simulated frame with its noise [DN]."""
+        return self.expected + self.measured.noise
+
+    @property
+    def correlation(self) -> float:
+        """Of the two frames, means off."""
+        return correlation(self.measured.frame, self.expected)
+
+    @property
+    def chi_square(self) -> float:
+        """Energy that the simulated frame leaves, over the noise's."""
+        return _energy(self.measured.frame - self.expected) / _energy(self.measured.noise)
+
+    @property
+    def explained(self) -> float:
+        """Part of the frame's energy, means off."""
+        return 1 - _energy(self.measured.frame - self.expected) / _energy(self.measured.frame)
+
+    @property
+    def noise_part(self) -> float:
+        """Part of the frame's energy, means off, that is noise."""
+        return _energy(self.measured.noise) / _energy(self.measured.frame)
+
+    @property
+    def level(self) -> float:
+        """Measured mean light over the simulated, where coded parts agree."""
+        return float(self.measured.level.mean() / (self._scale * self.electrons.mean()))
+
+    @property
+    def _scale(self) -> float:
+        return float(np.linalg.norm(self.expected) / np.linalg.norm(centre_frame(self.electrons)))
 
     def means(self, axis: int) -> dict[str, FloatArray]:
         """Means along an ``axis`` about their mean [DN], measured and simulated."""
-        scale = float(np.linalg.norm(self.expected) / np.linalg.norm(centre_frame(self.electrons)))
-        found = {"measured": self.measured.level, "simulated": scale * self.electrons}
+        found = {"measured": self.measured.level, "simulated": self._scale * self.electrons}
         return {name: each.mean(axis=axis) - each.mean() for name, each in found.items()}
 
 
 @single_threaded_blas()
-def compare(
-    measured: Measured,
-    codes: tuple[Code, Code],
-    electrons: FloatArray,
-    seed: int,
-    learned: bool = True,
-    other: FloatArray | None = None,
-) -> Twin:
+def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: FloatArray) -> Twin:
     """A measured frame beside a simulated one, whose scale is the only number that is fitted.
 
     Parameters
     ----------
     measured
-        the frame.
+        the frame, its scene as it lies before the mask.
     codes, electrons
-        of rows and of columns; and what the simulated camera expects behind them.
-    seed
-        of the simulated noise.
-    learned
-        whether codes were learned from frames in DN, so that they state the scale.
+        of its mask; and what the simulated camera expects behind it.
     other
         scene of another capture.
     """
     frame, simulated = measured.frame, centre_frame(electrons)
-    scale = _dot(frame, simulated) / _dot(simulated, simulated)
-    expected = scale * simulated
-    model = codes[0].factor @ measured.scene @ codes[1].factor.T
-    own = _dot(model, simulated) / _dot(simulated, simulated)
-    wrong = None if other is None else codes[0].factor @ other @ codes[1].factor.T
-    rows, columns = (_correlation(measured.level.mean(axis=axis), electrons.mean(axis=axis)) for axis in (1, 0))
-    return Twin(
-        measured,
-        expected,
-        expected + draw_noise(measured, seed),
-        scale / own if learned else None,
-        _correlation(frame, expected),
-        float((np.square(frame - expected) / measured.variance).mean()),
-        None if wrong is None else _correlation(frame, wrong),
-        _parts(measured, codes, expected, scale / own if learned else 1.0),
-        rows,
-        columns,
-        float(measured.level.mean() / (scale * electrons.mean())),
-        float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model)),
-        electrons,
-    )
+    left, right = codes.factors(PLANES[measured.plane], measured.plane)
+    model = left @ measured.scene @ right.T
+    scale, own = (_dot(each, simulated) / _energy(simulated) for each in (frame, model))
+    expected, gain = scale * simulated, scale / own
+    parts = _parts(measured, codes, expected, gain)
+    error = float(np.linalg.norm(own * simulated - model) / np.linalg.norm(model))
+    return Twin(measured, expected, electrons, gain, correlation(frame, left @ other @ right.T), parts, error)
 
 
-def _parts(measured: Measured, codes: tuple[Code, Code], expected: FloatArray, gain: float) -> dict[str, float]:
+def _parts(measured: Measured, codes: Codes, expected: FloatArray, gain: float) -> dict[str, float]:
     """Energy of a measured frame by :data:`CAUSES`."""
-    frame, noise, whole = measured.frame, float(measured.variance.sum()), measured.energy
-    level = noise / frame.size
-    energies, free = [whole, _dot(frame, frame)], [0.0, 0.0]
-    energies += [_energy(frame - expected / gain), _energy(frame - expected)]
-    free += [0.0, 1.0]
-    field, count = _smooth_field(frame - expected, expected)
-    energies.append(_energy(frame - expected - field))
-    free.append(count)
-    mended = Measured(measured.name, measured.level, measured.variance, frame - field, measured.scene, 1.0, 0.0)
-    better = learn_codes([mended], (codes[0].scale, codes[1].scale), codes[1])
-    model = better[0].factor @ measured.scene @ better[1].factor.T
-    energies.append(_energy(mended.frame - model))
-    free.append(float(sum(len(code.values) for code in better) - 2))
-    more, count = _scene_correction(mended.frame - model, better, level)
-    energies.append(_energy(mended.frame - model - more))
-    free.append(count)
-    steps = [a - b - level * used for a, b, used in zip(energies[:-1], energies[1:], free[1:], strict=True)]
-    rest = energies[-1] + level * sum(free) - noise
-    return dict(zip(CAUSES, np.array([*steps, noise, rest]) / whole, strict=True))
+    frame, noise = measured.frame, _energy(measured.noise)
+    whole, level = _energy(measured.level - measured.level.mean()), noise / measured.frame.size
+    field, smooth = _smooth_field(frame - expected, expected)
+    mended = measured.exposure(frame - field)
+    shape = Shape((codes.sides[0].scale, codes.sides[1].scale), 1, True)
+    better = fit_codes([mended], shape, codes.codes[1][0])
+    left, right = better.factors(mended.offset, measured.plane)
+    rest = mended.frame - left @ measured.scene @ right.T
+    more, corrected = _scene_correction(rest, (left, right), level)
+    energies = [whole, *map(_energy, (frame, frame - expected / gain, frame - expected, mended.frame - expected))]
+    energies += [_energy(rest), _energy(rest - more)]
+    # Two of the codes' numbers are none: the scale of one side over the other, and of both, which `scale` has taken.
+    free = np.array([0.0, 0.0, 1.0, smooth, sum(better.told) - 2, corrected])
+    parts = [*(-np.diff(energies) - level * free), noise, energies[-1] + level * free.sum() - noise]
+    return dict(zip(CAUSES, (float(part / whole) for part in parts), strict=True))
 
 
 def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, float]:
@@ -284,10 +249,12 @@ def _smooth_field(rest: FloatArray, expected: FloatArray) -> tuple[FloatArray, f
     return (design @ found).reshape(rest.shape), float(len(fields))
 
 
-def _scene_correction(rest: FloatArray, codes: tuple[Code, Code], level: float) -> tuple[FloatArray, float]:
+def _scene_correction(
+    rest: FloatArray, factors: tuple[FloatArray, FloatArray], level: float
+) -> tuple[FloatArray, float]:
     """The frame of what is to be added to the scene, by Tikhonov with the weight of least risk; and the numbers that it
     takes of noise of variance ``level``."""
-    (left, first, _), (right, second, _) = (np.linalg.svd(code.factor, full_matrices=False) for code in codes)
+    (left, first, _), (right, second, _) = (np.linalg.svd(each, full_matrices=False) for each in factors)
     seen, strength = left.T @ rest @ right, np.square(np.outer(first, second))
     largest = strength.max()
 
@@ -309,5 +276,6 @@ def _energy(values: FloatArray) -> float:
     return _dot(values, values)
 
 
-def _correlation(first: FloatArray, second: FloatArray) -> float:
+def correlation(first: FloatArray, second: FloatArray) -> float:
+    """Of all numbers of the ``first`` array and the ``second``."""
     return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])

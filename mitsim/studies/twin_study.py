@@ -1,7 +1,7 @@
 """`mitsim study twin`: real captures beside their simulations; what agrees, what does not, and why.
 
-A FlatCam's captures (:mod:`mitsim.studies.twin_capture`): codes of its mask come of other captures, or of a
-calibration. The scene, as the authors' own calibration shows it, is put on a sheet, and captured by a simulated camera
+A FlatCam's captures (:mod:`mitsim.studies.twin_capture`): codes of its mask are learned from the other captures. The
+scene, as the authors' own calibration shows it, is put on a sheet, and captured by a simulated camera
 (:mod:`mitsim.studies.twin_frame`). A DiffuserCam's point spread function: a diffuser whose statistics are fitted to it
 is traced (:mod:`mitsim.studies.twin_diffuser`).
 """
@@ -9,7 +9,7 @@ is traced (:mod:`mitsim.studies.twin_diffuser`).
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,38 +20,37 @@ from matplotlib.figure import Figure
 from mitsim.bench.request import Request
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.mask_profile import load_psf
-from mitsim.reconstruct.factors import load_calibration
 from mitsim.report import plots
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
-from mitsim.studies.twin_capture import (
-    FLIPPED,
-    PLANES,
-    Code,
-    Measured,
-    codes_of,
-    learn_codes,
-    measure_plane,
-    noise_of,
-    read_plane,
-    read_scene,
-)
-from mitsim.studies.twin_diffuser import REDUCE, DiffuserTwin, frequencies, twin_of
+from mitsim.studies.twin_capture import Learned, Measured, read_captures
+from mitsim.studies.twin_diffuser import DiffuserTwin, frequencies, radial_power, read_spread, twin_of
 from mitsim.studies.twin_files import TwinFiles
-from mitsim.studies.twin_frame import Twin, compare, render
+from mitsim.studies.twin_frame import CAUSES, Twin, compare, correlation, render
 
 _GREEN = "gb"
-"""Plane that a calibration is of."""
+"""Plane whose frames are shown."""
 _SHOWN = 160
 """Side of the middle of a frame that is shown [pixels]: features of four pixels are seen on a page."""
 _BRIGHT = 3.0
 """Standard deviations of a frame from mid-grey to white."""
-_NO_CODE = 0.05
-"""Part of a calibration's factor, in energy, that is no shifted code, from which a twin is not to be trusted: half of
-what it is to explain."""
+_EDGES = np.geomspace(0.005, 0.5, 29)
+"""Of the bands of a frame's radial spectrum [cycles / pixel]: a sixth of a frequency wide."""
+_TICKS = (0.02, 0.05, 0.1, 0.2, 0.4)
+"""Frequencies that are named along a diffuser's spectrum [cycles / pixel]."""
+_RENDERED = 0.1
+"""Relative error of a simulated frame from which a twin is not to be trusted: its energy is then a hundredth, as much
+as causes are told by."""
+_NUMBERS = (
+    ("correlation", "correlation", ".3f"),
+    ("other", "other scene", ".3f"),
+    ("explained", "explained", ".1%"),
+    ("chi_square", "chi-square", ".2f"),
+    ("noise_part", "noise alone", ".1%"),
+    ("gain", "scale", ".2f"),
+)
+"""Of a twin: name, head of a column, format."""
 _UNKNOWN = (
     "Distances of mask and scene: only the product of the mask's distance and an angle moves a shadow.",
     "The scene: its image by the authors' own calibration stands for it, with what that smooths and cuts at 0.",
@@ -66,13 +65,11 @@ _UNKNOWN = (
 
 @dataclass(frozen=True, eq=False)
 class TwinFindings(Findings):
-    """Twins of captures, and of a diffuser; ``calibration`` is the CAL folder of the codes, None: learned; ``no_code``
-    the part of its factors that is none."""
+    """Twins of captures, codes of each capture's mask by the capture's name, and a twin of a diffuser."""
 
     twins: tuple[Twin, ...]
+    learned: Mapping[str, Learned]
     diffuser: DiffuserTwin | None
-    calibration: str | None
-    no_code: float | None
 
     title = "Real captures beside their simulation"
 
@@ -80,21 +77,39 @@ class TwinFindings(Findings):
         """The JSON of the command line."""
         return {
             "captures": [_row(twin) for twin in self.twins],
-            "calibration": self.calibration,
-            "factors_not_a_code": self.no_code,
+            "learned": {
+                name: {
+                    "orientation": each.pose.orientation,
+                    "scale": [*each.pose.scales],
+                    "explained": each.codes.explained,
+                    "told": [*each.codes.told],
+                }
+                for name, each in self.learned.items()
+            },
             "diffuser": None if self.diffuser is None else _diffuser_row(self.diffuser),
             "not_known": list(_UNKNOWN),
         }
 
     @property
     def warnings(self) -> Sequence[str]:
-        """That the factors of a calibration are no shifted codes."""
-        if self.no_code is None or self.no_code <= _NO_CODE:
-            return ()
-        return (
-            f"{self.no_code:.0%} of the calibration's factors, in energy, is no code seen through shifts, which the "
-            "simulated mask lacks; calibrate by captures of known pictures",
-        )
+        """That frames are not of their images, or not rendered well."""
+        found = [
+            f"{name}: the other captures do not tell how images lie before the mask; give more captures"
+            for name, each in self.learned.items()
+            if not each.pose.certain
+        ]
+        for twin in self.twins:
+            if twin.correlation <= twin.other:
+                found.append(
+                    f"{twin.measured.name}: another capture's scene explains the frame no worse (correlation "
+                    f"{twin.other:.2f} and {twin.correlation:.2f}); check that each capture lies with its own image"
+                )
+            if twin.render_error > _RENDERED:
+                found.append(
+                    f"{twin.measured.name}: the simulated frame is {twin.render_error:.0%} off the product of its "
+                    "factors; report this"
+                )
+        return found
 
     def parts(self) -> Sequence[Part]:
         """Of its page."""
@@ -104,56 +119,43 @@ class TwinFindings(Findings):
         ]
 
     def _capture_parts(self) -> Iterator[Part]:
-        codes = (
-            f"the calibration {self.calibration}"
-            if self.calibration
-            else "the other captures and their images alone, so every frame is a prediction"
-        )
         yield Part(
-            "A FlatCam's frames",
-            f"Codes of the mask are of {codes}. The simulated frame is of the authors' image on a sheet, through a "
-            "drawn mask; its scale alone is fitted. Row and column means are off, as in the camera's own program.",
-            ("frame", "correlation", "other scene", "explained", "chi-square", "noise alone", "scale"),
+            "FlatCam: frames",
+            "The mask's codes were learned from the other captures and their images alone, so every frame is a "
+            "prediction; one number is fitted, the light. Row and column means are off.",
+            ("frame", *(head for _, head, _ in _NUMBERS)),
             tuple(
-                (
-                    twin.measured.name,
-                    f"{twin.correlation:.3f}",
-                    "" if twin.other is None else f"{twin.other:.3f}",
-                    f"{_explained_part(twin):.1%}",
-                    f"{twin.chi_square:.2f}",
-                    f"{twin.measured.variance.sum() / np.square(twin.measured.frame).sum():.1%}",
-                    "" if twin.gain is None else f"{twin.gain:.2f}",
-                )
+                (twin.measured.name, *(format(getattr(twin, name), form) for name, _, form in _NUMBERS))
                 for twin in self.twins
             ),
             ("frames.png", "spectra.png"),
             (
+                "Frames are planes of the Bayer sensor: red, green beside blue, green beside red, blue.",
                 "Other scene: correlation with another capture's scene through the same codes: what bright scenes have "
                 "in common. A twin is worth what it has above that.",
                 "Explained: part of the frame's energy. Noise alone: part that no model explains, by the frame's own "
-                "fine structure. Chi-square: 1 where only noise is left. Scale: light over what the learned codes "
-                "expect.",
+                "fine structure. Chi-square: energy that is left, over the noise's: 1 where only noise is left. Scale: "
+                "light over what the learned codes expect.",
             ),
         )
-        causes = list(self.twins[0].parts)
         yield Part(
             "By cause",
-            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave. "
-            "Smooth field: polynomials of light and of gain. Mask's code: codes fitted to this very frame. Scene's "
-            "image: a correction of least risk. Noise that a fit takes with it counts as noise; the rest is not "
-            "explained: of what is not separable, moved or grew.",
-            ("frame", *causes),
-            tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in causes)) for twin in self.twins),
+            "The energy of a frame about its mean, in percent, by what takes it out of what the causes before leave; "
+            "bars show what the simulation leaves. Smooth field: polynomials of light and of gain. Mask's code: codes "
+            "fitted to this very frame. Scene's image: a correction of least risk. Noise that a fit takes with it "
+            "counts as noise; the rest is not explained: of what is not separable, moved or grew.",
+            ("frame", *CAUSES),
+            tuple((twin.measured.name, *(f"{100 * twin.parts[each]:.1f}" for each in CAUSES)) for twin in self.twins),
             ("causes.png",),
         )
         yield Part(
             "Means of rows and columns, and what cannot be known",
             "The camera's program takes the means off. Correlation of measured and simulated means, and the measured "
-            "mean level over the simulated one where coded parts agree.",
+            "mean level over the simulated one where coded parts agree. What no comparison of these frames can tell "
+            "stands below.",
             ("frame", "rows", "columns", "level"),
             tuple(
-                (twin.measured.name, f"{twin.rows:.2f}", f"{twin.columns:.2f}", f"{twin.level:.2f}")
-                for twin in self.twins
+                (twin.measured.name, *(f"{each:.2f}" for each in (*_of_means(twin), twin.level))) for twin in self.twins
             ),
             ("means.png",),
             _UNKNOWN,
@@ -163,17 +165,16 @@ class TwinFindings(Findings):
         """By file name."""
         shown: dict[str, Figure] = {}
         if self.twins:
+            green = [twin for twin in self.twins if twin.measured.plane == _GREEN][:2]
+            parts = {
+                twin.measured.name: {name: max(100 * twin.parts[name], 0.0) for name in CAUSES[2:]}
+                for twin in self.twins
+            }
             shown |= {
-                "frames.png": _frames_figure(self._first()),
-                "spectra.png": _spectra_figure(self._first()),
-                "causes.png": plots.stacked_bars(
-                    {
-                        twin.measured.name: {name: max(100 * part, 0.0) for name, part in twin.parts.items()}
-                        for twin in self.twins
-                    },
-                    "energy of the frame [%]",
-                ),
-                "means.png": _means_figure(self._first()[0]),
+                "frames.png": _frames_figure(green),
+                "spectra.png": _spectra_figure(green),
+                "causes.png": plots.stacked_bars(parts, "not explained by the simulation [% of the frame's energy]"),
+                "means.png": _means_figure(green[0]),
             }
         if self.diffuser:
             shown |= {
@@ -181,10 +182,6 @@ class TwinFindings(Findings):
                 "diffuser_spectrum.png": _rings_figure(self.diffuser),
             }
         return shown
-
-    def _first(self) -> list[Twin]:
-        """Green frames of two captures."""
-        return [twin for twin in self.twins if twin.measured.name.endswith(_GREEN)][:2]
 
 
 def measure(
@@ -209,75 +206,48 @@ def measure(
         without files, and for files that are not what they are to be.
     """
     files = files or TwinFiles.find(None)
-    known, no_code = None, None
-    if files.calibration is not None:
-        left, right, turned, no_code = codes_of(load_calibration(files.calibration))
-        known = (left, right), turned
-    planes = [_GREEN] if known else list(PLANES)
-    todo = [(name, plane) for plane in planes for name in files.captures]
+    spread = None if files.psf is None else read_spread(files.psf)
+    planes = read_captures(files.captures, request.seed)
+    learned: dict[str, Learned] = {}
     twins: list[Twin] = []
-    for plane in planes:
-        captures = _read(files, plane, known[1] if known else None)
-        for name, measured in captures.items():
-            job.progress("FlatCam", len(twins) / len(todo))
-            codes = known[0] if known else learn_codes([captures[each] for each in captures if each != name])
-            _check_size(measured, codes, files)
-            with tempfile.TemporaryDirectory(prefix="mitsim-twin-") as folder:
-                electrons = render(measured.scene, codes, Path(folder), variant)
-            other = next((each.scene for key, each in captures.items() if key != name), None)
-            twins.append(compare(measured, codes, electrons, request.seed, known is None, other))
-    diffuser = None
-    if files.psf is not None:
-        diffuser = twin_of(load_psf(files.psf, REDUCE), request.seed, variant, job.progress)
-    twins.sort(key=lambda twin: twin.measured.name)
-    return TwinFindings(tuple(twins), diffuser, str(files.calibration) if files.calibration else None, no_code)
+    for name in files.captures:
+        job.progress("FlatCam", len(learned) / len(files.captures))
+        learned[name] = Learned.of([each for each in planes if each.capture != name])
+        twins += [_twin(each, learned[name], planes, variant) for each in planes if each.capture == name]
+    diffuser = None if spread is None else twin_of(spread, request.seed, variant, job.progress)
+    return TwinFindings(tuple(twins), learned, diffuser)
 
 
-def _read(files: TwinFiles, plane: str, turned: tuple[bool, bool] | None) -> dict[str, Measured]:
-    """A ``plane`` of all captures, by name; scenes as a calibration's codes run, ``turned`` or not."""
-    raw = {name: read_plane(frame, plane) for name, (frame, _) in files.captures.items()}
-    gain, dark = noise_of(list(raw.values()))
-    found = {}
-    for name, (_, image) in files.captures.items():
-        scene = read_scene(image, plane)
-        if turned is not None:
-            steps = (-1 if own != asked else 1 for own, asked in zip(FLIPPED, turned, strict=True))
-            scene = scene[:: next(steps), :: next(steps)].copy()
-        found[name] = measure_plane(f"{name} {plane}", raw[name], gain, dark, scene)
-    return found
-
-
-def _check_size(measured: Measured, codes: tuple[Code, Code], files: TwinFiles) -> None:
-    shapes = tuple(tuple(code.factor.shape[axis] for code in codes) for axis in (0, 1))
-    if shapes != (measured.frame.shape, measured.scene.shape):
-        raise MitsimError(
-            f"--calibration {files.calibration}: is of frames of {shapes[0]} and scenes of {shapes[1]} pixels; "
-            f"{measured.name} has {measured.frame.shape} and {measured.scene.shape}, so calibrate by captures cut alike"
-        )
+def _twin(measured: Measured, learned: Learned, planes: Sequence[Measured], variant: str) -> Twin:
+    seen = learned.see(measured)
+    other = next(each for each in planes if each.plane == measured.plane and each.capture != measured.capture)
+    with tempfile.TemporaryDirectory(prefix="mitsim-twin-") as folder:
+        electrons = render(seen, learned.codes, Path(folder), variant)
+    return compare(seen, learned.codes, electrons, learned.see(other).scene)
 
 
 # ---- Tables ----
 
 
-def _explained_part(twin: Twin) -> float:
-    frame = twin.measured.frame
-    return 1 - float(np.square(frame - twin.expected).sum() / np.square(frame).sum())
+def _of_means(twin: Twin) -> list[float]:
+    """Correlation of measured and simulated means of rows, and of columns."""
+    return [correlation(*twin.means(axis).values()) for axis in (1, 0)]
 
 
 def _row(twin: Twin) -> dict[str, Any]:
-    measured = twin.measured
+    measured, (rows, columns) = twin.measured, _of_means(twin)
     return {
         "frame": measured.name,
         "correlation": twin.correlation,
-        "explained": _explained_part(twin),
+        "explained": twin.explained,
         "correlation_other_scene": twin.other,
         "chi_square": twin.chi_square,
-        "noise": float(measured.variance.sum() / np.square(measured.frame).sum()),
+        "noise": twin.noise_part,
         "scale": twin.gain,
         "gain_dn_per_e": measured.gain,
         "read_variance_dn2": measured.read_variance,
-        "rows": twin.rows,
-        "columns": twin.columns,
+        "rows": rows,
+        "columns": columns,
         "level": twin.level,
         "render_error": twin.render_error,
         "parts": {name: float(part) for name, part in twin.parts.items()},
@@ -340,35 +310,40 @@ def _diffuser_parts(twin: DiffuserTwin) -> list[Part]:
 # ---- Figures ----
 
 
-def _frames_figure(twins: Sequence[Twin]) -> Figure:
-    """Middles of measured and simulated frames with noise, and their difference."""
-    figure, places = plots.panels_of(len(twins), 3, 2.9 * len(twins) + 0.3, layout="compressed")
-    for line, twin in zip(places, twins, strict=True):
-        frame, sigma = twin.measured.frame, float(twin.measured.frame.std())
-        first = [(side - _SHOWN) // 2 for side in frame.shape]
-        middle = np.s_[first[0] : first[0] + _SHOWN, first[1] : first[1] + _SHOWN]
-        images = {
-            "measured": frame,
-            "simulated, with noise": twin.noisy,
-            "measured less simulated": frame - twin.expected,
-        }
-        for axes, (name, image) in zip(line, images.items(), strict=True):
-            axes.imshow(image[middle], cmap="gray", vmin=-_BRIGHT * sigma, vmax=_BRIGHT * sigma, interpolation="none")
+def _pictures(rows: Sequence[Mapping[str, FloatArray]], ends: Sequence[tuple[float, float]], unit: str) -> Figure:
+    """Pictures in ``rows`` by their titles, in greys between each row's ``ends``, which its scale names in a
+    ``unit``."""
+    count = len(rows[0])
+    figure, places = plots.panels_of(
+        len(rows), count, len(rows) * (0.9 * plots.WIDTH / count + 0.3), layout="compressed"
+    )
+    for line, images, (least, most) in zip(places, rows, ends, strict=True):
+        for axes, (title, image) in zip(line, images.items(), strict=True):
+            drawn = axes.imshow(image, cmap="gray", vmin=least, vmax=most, interpolation="none")
             axes.set(xticks=[], yticks=[])
-            axes.set_title(f"{twin.measured.name}: {name}" if name == "measured" else name, fontsize=plots.FONT - 1)
-    figure.suptitle(f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off, one scale", fontsize=plots.FONT)
+            axes.set_title(title, fontsize=plots.FONT - 1)
+        bar = figure.colorbar(drawn, ax=line, extend="max" if least == 0 else "both")
+        bar.set_label(unit, fontsize=plots.FONT - 1)
+        bar.ax.tick_params(labelsize=plots.FONT - 2)
     return figure
 
 
-def _power(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies [cycles / pixel] and radial mean of the power of a windowed ``frame``, a pixel."""
-    window = np.outer(*(np.hanning(side) for side in frame.shape))
-    power = np.square(np.abs(np.fft.fft2(frame * window))) / np.square(window).sum()
-    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(side) for side in frame.shape), indexing="ij"))
-    edges = np.geomspace(0.005, 0.5, 29)
-    which = np.digitize(radius.ravel(), edges)
-    sums, counts = (np.bincount(which, weights, len(edges) + 1) for weights in (power.ravel(), None))
-    return np.sqrt(edges[1:] * edges[:-1]), sums[1:-1] / np.maximum(counts[1:-1], 1)
+def _frames_figure(twins: Sequence[Twin]) -> Figure:
+    """Middles of measured and simulated frames with noise, and their difference."""
+    rows, ends = [], []
+    for twin in twins:
+        frame = twin.measured.frame
+        row, column = ((side - _SHOWN) // 2 for side in frame.shape)
+        images = {
+            f"{twin.measured.name}: measured": frame,
+            "simulated, with noise": twin.noisy,
+            "measured less simulated": frame - twin.expected,
+        }
+        rows.append({name: image[row : row + _SHOWN, column : column + _SHOWN] for name, image in images.items()})
+        ends.append((-_BRIGHT * float(frame.std()), _BRIGHT * float(frame.std())))
+    figure = _pictures(rows, ends, "light [DN]")
+    figure.suptitle(f"Middle {_SHOWN} x {_SHOWN} pixels, row and column means off", fontsize=plots.FONT)
+    return figure
 
 
 def _spectra_figure(twins: Sequence[Twin]) -> Figure:
@@ -382,7 +357,13 @@ def _spectra_figure(twins: Sequence[Twin]) -> Figure:
             "measured less simulated": frame - twin.expected,
         }
         for index, (name, shown) in enumerate(curves.items()):
-            axes.loglog(*_power(shown), label=name, lw=1.8, **plots.line_style(index))
+            axes.loglog(
+                np.sqrt(_EDGES[1:] * _EDGES[:-1]),
+                radial_power(shown, _EDGES),
+                label=name,
+                lw=1.8,
+                **plots.line_style(index),
+            )
         axes.set_title(twin.measured.name, fontsize=plots.FONT)
         first = axes is places[0][0]
         plots.label_axes(axes, "frequency [cycles / pixel]", "power [DN\N{SUPERSCRIPT TWO}]" if first else "")
@@ -403,14 +384,9 @@ def _means_figure(twin: Twin) -> Figure:
 
 
 def _light_figure(twin: DiffuserTwin) -> Figure:
-    figure, places = plots.panels_of(1, 2, 0.5 * plots.WIDTH, layout="compressed")
-    for axes, (name, light) in zip(
-        places[0], {"measured": twin.measured, "simulated": twin.simulated}.items(), strict=True
-    ):
-        axes.imshow(np.sqrt(light), cmap="gray", vmin=0, vmax=_BRIGHT, interpolation="none")
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(f"{name}, root of light over its mean", fontsize=plots.FONT - 1)
-    return figure
+    images = {"measured": twin.measured, "simulated": twin.simulated}
+    rows = {f"{name}, {len(light)} x {len(light)} pixels": np.sqrt(light) for name, light in images.items()}
+    return _pictures([rows], [(0.0, _BRIGHT)], "root of light over mean [1]")
 
 
 def _rings_figure(twin: DiffuserTwin) -> Figure:
@@ -422,6 +398,8 @@ def _rings_figure(twin: DiffuserTwin) -> Figure:
     axes.plot(frequencies(), simulated.mean(axis=0), label="simulated, mean", lw=1.8, **plots.line_style(0))
     axes.plot(frequencies(), twin.spreads[0].spectrum, label="measured", lw=1.8, **plots.line_style(1))
     axes.set(xscale="log", yscale="log")
+    axes.set_xticks(_TICKS, map(str, _TICKS))
+    axes.minorticks_off()
     plots.label_axes(axes, "frequency [cycles / pixel]", "power of light over its mean [1]")
     plots.legend_below(figure, 3, *axes.get_legend_handles_labels())
     return figure

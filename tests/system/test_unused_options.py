@@ -55,7 +55,7 @@ CASES = [
         for option in (
             *("--patterns dots:7", "--seed 0", "--camera imx249", "--projector mp_cl1", "-D a=1", "--quick"),
             *("--allow-outside-files", "--shard 1/1", "--jobs 1", "--scheduler tcp://a:1", "--over seed=1:2:2"),
-            *("--measure psnr", "--recipe {folder}/a.toml", "--data {folder}", "--calibration {cal}"),
+            *("--measure psnr", "--recipe {folder}/a.toml", "--data {folder}"),
         )
     ),
     ("study distance -o {out}", "--experiment a.b"),
@@ -65,7 +65,6 @@ CASES = [
     ("study solver -o {out}", "--camera imx249"),
     ("study solver -o {out}", "-D a=1"),
     ("study solver -o {out}", "--data {folder}"),
-    ("study models -o {out}", "--calibration {cal}"),
 ]
 
 

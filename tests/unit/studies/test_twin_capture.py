@@ -1,4 +1,4 @@
-"""Twins of a FlatCam's captures: codes, noise and causes of simulated frames come out as they were set."""
+"""Twins of a FlatCam's captures: frames, noise and causes of simulated captures come out as they were set."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.known_pictures import PLANES
+from mitsim.reconstruct.shifted_codes import Codes, Side
 from mitsim.reconstruct.solver import centre_frame
-from mitsim.studies.twin_capture import CROP, TURN_DEG, Code, Measured, learn_codes, noise_of, read_code, turn_plane
+from mitsim.studies.twin_capture import Learned, Measured, Recipe, draw_noise, noise_of, read_captures
 from mitsim.studies.twin_files import TwinFiles
 from mitsim.studies.twin_frame import CAUSES, compare, render
 
 SCALES, SCENE, SENSOR = (0.6, 0.7), 40, (80, 90)
 GAIN, LIGHT = 0.1, 600.0
 """DN an electron, and mean light [DN]: as the real captures'."""
+SIDES = float(np.sqrt(np.prod(SENSOR)))
+PLANE = "gb"
 
 
 def smooth(draws: np.random.Generator, *shape: int, width: float = 1.5) -> FloatArray:
@@ -27,110 +32,223 @@ def smooth(draws: np.random.Generator, *shape: int, width: float = 1.5) -> Float
     return np.asarray(values / values.std())
 
 
-def made_codes(seed: int = 3) -> tuple[Code, Code]:
-    draws = np.random.default_rng(seed)
-    left, right = (
-        Code(smooth(draws, sensor + int(scale * (SCENE - 1)) + 1), scale, SCENE)
-        for sensor, scale in zip(SENSOR, SCALES, strict=True)
-    )
-    return left, right
+def codes_of(values: tuple[FloatArray, FloatArray]) -> Codes:
+    """Of one code a side, each of its ``values``."""
+    left, right = (Side(sensor, SCENE, scale, 1, True) for sensor, scale in zip(SENSOR, SCALES, strict=True))
+    nothing = 0.0, 0.0
+    numbers = values[0][None], values[1][None]
+    return Codes((left, right), numbers, dict.fromkeys(PLANES, 1.0), np.zeros(1), 1.0, nothing, nothing, nothing)
 
 
-def made(seed: int, codes: tuple[Code, Code], noise: float = 1.0) -> Measured:
-    """A frame of a made scene, with white noise of the standard deviation ``noise`` [DN]; the light's is 13."""
+def made_codes(seed: int = 3) -> Codes:
     draws = np.random.default_rng(seed)
-    scene = np.clip(0.3 + 0.3 * smooth(draws, SCENE, SCENE, width=1.0), 0, 1)
-    clear = centre_frame(codes[0].factor @ scene @ codes[1].factor.T)
-    level = LIGHT + 13 * clear / clear.std() + noise * draws.standard_normal(SENSOR)
-    gain = 13 / clear.std()
-    return Measured("made", level, np.full(SENSOR, noise**2), centre_frame(level) / gain, scene, GAIN, 0.0)
+    lengths = (Side(sensor, SCENE, scale, 1, True).length for sensor, scale in zip(SENSOR, SCALES, strict=True))
+    left, right = (smooth(draws, length) for length in lengths)
+    return codes_of((left, right))
+
+
+def frame_of(codes: Codes, scene: FloatArray) -> FloatArray:
+    left, right = codes.factors(PLANES[PLANE], PLANE)
+    return np.asarray(left @ scene @ right.T)
+
+
+def made(seed: int, codes: Codes) -> Measured:
+    """A frame of a made scene without noise."""
+    scene = np.clip(0.3 + 0.3 * smooth(np.random.default_rng(seed), SCENE, SCENE, width=1.0), 0, 1)
+    return Measured(f"fc_{seed}", PLANE, LIGHT + frame_of(codes, scene), np.zeros(SENSOR), scene, GAIN, 0.0)
+
+
+def capture(folder: Path, values: np.ndarray, name: str = "fc_6") -> tuple[Path, Path]:
+    """Files of a capture and of an image."""
+    Image.fromarray(values).save(folder / f"{name}.png")
+    image = np.random.default_rng(1).integers(0, 255, (256, 256, 3), dtype=np.uint8)
+    Image.fromarray(image).save(folder / f"rec_{name}.png")
+    return folder / f"{name}.png", folder / f"rec_{name}.png"
+
+
+def test_planes_of_a_capture_are_its_own(tmp_path: Path) -> None:
+    """Numbers in the high bits, each plane of another light, turned and cut; the scene is of the plane's colour.
+    (Planted: gb and gr changed places.)"""
+    light = np.array([[100, 200], [300, 400]])  # b gb, gr r
+    values = np.tile(light, (512, 640)).astype(np.uint16)
+    values += np.random.default_rng(0).integers(0, 20, values.shape, dtype=np.uint16)
+    found = {each.plane: each for each in read_captures({"fc_6": capture(tmp_path, values * 64)}, 0)}
+    means = {name: each.level.mean() for name, each in found.items()}
+    assert means == pytest.approx({"b": 109.5, "gb": 209.5, "gr": 309.5, "r": 409.5}, abs=0.1)
+    assert all(each.frame.shape == (500, 620) for each in found.values())
+    image = np.array(Image.open(tmp_path / "rec_fc_6.png"))
+    assert np.array_equal(found["b"].scene, image[..., 2] / 255)
+
+
+@pytest.mark.parametrize(
+    ("values", "line"),
+    [
+        (np.zeros((600, 800), dtype=np.uint16), r"capture .*fc_6\.png: is 600 x 800; give the raw frame, 1024 x 1280$"),
+        (np.arange(1024 * 1280, dtype=np.uint32).reshape(1024, 1280).astype(np.uint16), "no light in numbers of 10"),
+        (np.full((1024, 1280), 640, dtype=np.uint16), r"holds 640 to 640, no light"),
+        (np.zeros((1024, 1280, 3), dtype=np.uint8), "capture .*: "),
+    ],
+    ids=["size", "bits", "even", "colour"],
+)
+def test_what_is_no_capture_is_refused_in_a_line(tmp_path: Path, values: np.ndarray, line: str) -> None:
+    with pytest.raises(MitsimError, match=line) as said:
+        read_captures({"fc_6": capture(tmp_path, values)}, 0)
+    assert "\n" not in str(said.value)
+
+
+def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
+    frame, image = capture(tmp_path, np.tile(np.arange(1280, dtype=np.uint16) % 1000, (1024, 1)))
+    for mode, size, line in (
+        ("RGB", 200, "is 200 x 200 x 3; give the authors', 256 x 256"),
+        ("L", 256, "is 256 x 256;"),
+    ):
+        Image.new(mode, (size, size)).save(image)
+        with pytest.raises(MitsimError, match=line):
+            read_captures({"fc_6": (frame, image)}, 0)
 
 
 def test_codes_are_learned_from_known_scenes_and_predict_another_frame() -> None:
-    """From four frames without noise; of a random start, on the third turn."""
+    """From six frames without noise, scenes given turned: the orientation is found, and 95 % of another frame are
+    predicted. (Planted: the scene that is predicted left as it is given.)"""
     codes = made_codes()
-    found = learn_codes([made(seed, codes, 0.0) for seed in range(4)], SCALES)
-    held = made(9, codes, 0.0)
-    predicted = found[0].factor @ held.scene @ found[1].factor.T
-    assert np.linalg.norm(predicted - held.frame) < 0.05 * np.linalg.norm(held.frame)
-
-
-@pytest.mark.parametrize("reverse", [False, True])
-def test_a_code_is_read_from_a_factor(reverse: bool) -> None:
-    """Scale to a hundredth of a pixel over the scene, whichever way the scene runs."""
-    code = made_codes()[0]
-    found, flipped, rest = read_code(code.factor[:, ::-1] if reverse else code.factor)
-    assert flipped is reverse and rest < 1e-4
-    assert found.scale == pytest.approx(code.scale, abs=1e-3)
-    assert np.linalg.norm(found.factor - code.factor) < 1e-2 * np.linalg.norm(code.factor)
-
-
-def test_a_factor_without_shifts_is_refused() -> None:
-    with pytest.raises(MitsimError, match="not one shadow, shifted"):
-        read_code(np.outer(smooth(np.random.default_rng(1), 80), np.linspace(1, 2, 40)))
+    planes = [made(seed, codes) for seed in range(6)]
+    given = [replace(each, scene=each.scene[::-1, ::-1].copy()) for each in planes]
+    learned = Learned.of(given)
+    held = made(9, codes)
+    seen = learned.see(replace(held, scene=held.scene[::-1, ::-1].copy()))
+    assert learned.pose.orientation == "turned" and learned.pose.certain
+    left = held.frame - frame_of(learned.codes, seen.scene)
+    assert np.square(left).sum() < 0.05 * np.square(held.frame).sum()
 
 
 def test_noise_of_planes_is_that_of_their_photons() -> None:
-    """Of electrons by Poisson's law, and reading: gain to 5 %, over blocks whose light differs threefold."""
+    """Of electrons by Poisson's law, and reading: gain to 5 %, over blocks whose light differs threefold; what is drawn
+    by these numbers has the variance of the plane's light. (Planted: reading left out of what is drawn.)"""
     draws = np.random.default_rng(0)
     light = np.linspace(200, 700, 400)[:, None] * np.ones(400) / GAIN
     planes = [GAIN * (draws.poisson(light * part) + 20 * draws.standard_normal(light.shape)) for part in (0.5, 1.0)]
     gain, dark = noise_of(planes)
     assert gain == pytest.approx(GAIN, rel=0.05)
     assert dark == pytest.approx((GAIN * 20) ** 2, abs=2.0)
+    drawn = draw_noise(planes[1], GAIN, (GAIN * 20) ** 2, 0, "made")
+    for rows in np.array_split(np.arange(400), 4):
+        expected = GAIN**2 * (light[rows].mean() + 20**2)
+        assert drawn[rows].var() == pytest.approx(expected, rel=5 * np.sqrt(2 / drawn[rows].size))
 
 
-def test_a_plane_is_turned_as_the_cameras_program_turns_it() -> None:
-    """scipy's rotation, cut. (Planted: the other way round.)"""
-    plane = smooth(np.random.default_rng(2), 512, 640, width=3.0)
-    theirs = ndimage.rotate(plane, TURN_DEG, reshape=False, order=1, mode="nearest")[CROP]
-    assert np.abs(turn_plane(plane) - theirs).max() < 1e-9
+def test_noise_is_turned_and_cut_as_frames_are() -> None:
+    """White noise between four pixels: of the variance that bilinear weights leave, between 1 and a quarter."""
+    noise = np.random.default_rng(0).standard_normal((512, 640))
+    placed = Recipe.load().place(noise)
+    assert placed.shape == (500, 620) and 0.3 < placed.var() < 0.6
 
 
-def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path) -> None:
-    """Mask drawn from codes, sheet, light and camera are those of the model: 3 % of the coded part, which is some per
-    cent of all light. (Planted: the mask beside its place by the other sign: 0.19 of a FlatCam's frame.)"""
-    codes, measured = made_codes(), made(0, made_codes())
-    electrons = render(measured.scene, codes, tmp_path, DEFAULT_VARIANT)
-    model = codes[0].factor @ measured.scene @ codes[1].factor.T
+@pytest.mark.parametrize("plane", ["gb", "r"])
+def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path, plane: str) -> None:
+    """Mask drawn from codes, sheet, light and camera are those of the model, half a pixel on for the red plane: 5 % of
+    the coded part, which is some per cent of all light. (Planted: the mask beside its place by the other sign; the
+    plane's half pixel left out: 0.2.)"""
+    codes = made_codes()
+    measured = replace(made(0, codes), plane=plane)
+    electrons = render(measured, codes, tmp_path, DEFAULT_VARIANT)
+    left, right = codes.factors(PLANES[plane], plane)
+    model = left @ measured.scene @ right.T
     seen = centre_frame(electrons)
     seen *= np.vdot(model, seen) / np.vdot(seen, seen)
     assert electrons.shape == SENSOR
     assert np.linalg.norm(seen - model) < 0.05 * np.linalg.norm(model)
 
 
-def cause_of(measured: Measured, codes: tuple[Code, Code], monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """Parts by cause, where the simulation is the model itself."""
-    monkeypatch.setattr("mitsim.studies.twin_frame.draw_noise", lambda measured, seed: np.zeros(SENSOR))
-    electrons = 1000 + codes[0].factor @ measured.scene @ codes[1].factor.T
-    return compare(measured, codes, electrons, 0).parts
+# -------- Causes that are planted
 
 
-def test_causes_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A frame of the model with noise alone has no other cause; a smooth field, another scale and another code are
-    found as such. (Planted: noise that a fit takes left out.)"""
+def parts_of(measured: Measured, codes: Codes, frame: FloatArray, noise: float, seed: int) -> dict[str, float]:
+    """Energies by cause of a ``frame`` with ``noise`` of that standard deviation, over the clear one's energy, where
+    the simulation is the model itself."""
+    draws = np.random.default_rng(seed)
+    level = LIGHT + frame + noise * draws.standard_normal(SENSOR)
+    drawn = centre_frame(noise * np.random.default_rng(seed + 1000).standard_normal(SENSOR))
+    shown = replace(measured, level=level, noise=drawn)
+    found = compare(shown, codes, 1000 + frame_of(codes, measured.scene), measured.scene).parts
+    assert tuple(found) == CAUSES and sum(found.values()) == pytest.approx(1)
+    whole = np.square(level - level.mean()).sum() / np.square(measured.frame).sum()
+    return {name: part * whole for name, part in found.items()}
+
+
+def beyond_scenes(codes: Codes, draws: np.random.Generator) -> FloatArray:
+    """(m, m') what no scene makes behind a mask of ``codes``, of energy 1."""
+    found = smooth(draws, *SENSOR, width=0.5)
+    for axis, factor in enumerate(codes.factors(PLANES[PLANE], PLANE)):
+        basis = np.linalg.qr(factor)[0]
+        found = np.moveaxis(np.tensordot(np.eye(SENSOR[axis]) - basis @ basis.T, found, (1, axis)), 0, axis)
+    found = centre_frame(found)
+    return np.asarray(found / np.linalg.norm(found))
+
+
+def test_causes_are_found_as_they_were_planted() -> None:
+    """Light a tenth more, smooth stray light, another code of either side, noise, and what no scene makes behind such a
+    mask, all at once, in 16 draws: the mean of each cause is the energy that was given, to 5 permille of the frame's.
+    (Planted: noise that fits take left out; codes fitted before the smooth field is off; noise of half its
+    variance.)"""
     codes = made_codes()
-    held = made(5, codes, 0.0)
-    draws = np.random.default_rng(8)
-    noise = 0.3 * held.frame.std()
+    measured = made(5, codes)
+    size = float(np.linalg.norm(measured.frame))
+    clear = measured.frame / size
+    row, column = np.meshgrid(*(np.linspace(-1, 1, side) for side in SENSOR), indexing="ij")
+    ramp = centre_frame(row * column**2)
+    ramp /= np.linalg.norm(ramp)
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    shapes = [clear * row**i * column**j for i, j in powers] + [row**i * column**j for i, j in powers if i * j]
+    even = np.stack([centre_frame(each).ravel() for each in shapes], axis=1)
+    off = []
+    for seed in range(16):
+        draws = np.random.default_rng(seed)
+        own = [code[0] for code in codes.codes]
+        aged = codes_of((own[0] + 0.25 * smooth(draws, len(own[0])), own[1] + 0.25 * smooth(draws, len(own[1]))))
+        moved = frame_of(aged, measured.scene) / size - clear
+        others = 0.3 * ramp * draws.choice((-1, 1)) + 0.2 * beyond_scenes(aged, draws)
+        found = parts_of(measured, codes, size * (1.1 * clear + moved + others), 0.3 * size / SIDES, seed)
+        light = 1.1 + np.vdot(clear, moved + others)
+        left = 1.1 * clear + moved + others - light * clear
+        kept = (left.ravel() - even @ np.linalg.lstsq(even, left.ravel(), rcond=None)[0]).reshape(SENSOR)
+        given = {
+            "explained": light**2 - (light - 1) ** 2,
+            "scale": (light - 1) ** 2,
+            "smooth field": np.square(left).sum() - np.square(kept).sum(),
+            "mask's code": np.square(kept).sum() - 0.2**2,
+            "scene's image": 0.0,
+            "noise": 0.3**2 * (1 - 1 / SENSOR[0]) * (1 - 1 / SENSOR[1]),
+            "rest": 0.2**2,
+        }
+        off.append([(found[name], given[name]) for name in CAUSES[1:]])
+    found, given = np.array(off).transpose(2, 0, 1)
+    errors = (found - given).std(axis=0, ddof=1) / 4
+    assert errors.max() < 2e-3
+    assert found.mean(axis=0) == pytest.approx(given.mean(axis=0), abs=5e-3)
 
-    def frame(values: FloatArray) -> Measured:
-        shown = values + noise * draws.standard_normal(SENSOR)
-        return replace(held, frame=centre_frame(shown), level=shown, variance=np.full(SENSOR, noise**2))
 
-    clean = cause_of(frame(held.frame), codes, monkeypatch)
-    assert tuple(clean) == CAUSES and sum(clean.values()) == pytest.approx(1)
-    assert all(abs(clean[name]) < 0.02 for name in ("scale", "smooth field", "mask's code", "scene's image", "rest"))
-    assert clean["noise"] == pytest.approx(0.09 / 1.09, rel=0.1)
-    brighter = cause_of(frame(1.5 * held.frame), codes, monkeypatch)
-    assert brighter["scale"] == pytest.approx(0.25 / 2.25, rel=0.15)
-    ramp = np.outer(np.linspace(-1, 1, SENSOR[0]), np.linspace(-1, 1, SENSOR[1]))
-    field = cause_of(frame(held.frame * (1 + 0.5 * ramp) + held.frame.std() * ramp), codes, monkeypatch)
-    assert field["smooth field"] > 5 * abs(field["rest"]) and field["smooth field"] > 0.05
-    other = made_codes(11)
-    moved = tuple(replace(a, values=a.values + 0.4 * b.values) for a, b in zip(codes, other, strict=True))
-    code = cause_of(frame(moved[0].factor @ held.scene @ moved[1].factor.T), codes, monkeypatch)
-    assert code["mask's code"] > 3 * max(abs(code[name]) for name in ("smooth field", "scene's image", "rest"))
+def test_noise_alone_has_no_other_cause_and_another_scene_is_one() -> None:
+    """Causes that were not planted are nought to a permille of the frame's energy, of 8 draws. Of a scene that differs
+    from its image four fifths are found, but a part of them as codes that stand for it, which are fitted before.
+    (Planted: noise that fits take left out; numbers of the codes left out; the scene's correction with the wrong
+    sign.)"""
+    codes = made_codes()
+    measured = made(5, codes)
+    size = float(np.linalg.norm(measured.frame))
+    changed = smooth(np.random.default_rng(7), SCENE, SCENE, width=1.0)
+    more = frame_of(codes, changed)
+    more *= 0.4 * size / np.linalg.norm(more)
+    noise = 0.3 * size / SIDES
+    alone, other = (
+        {name: np.mean([run[name] for run in runs]) for name in CAUSES}
+        for runs in (
+            [parts_of(measured, codes, measured.frame + shown, noise, seed) for seed in range(8)]
+            for shown in (0.0, more)
+        )
+    )
+    assert all(abs(alone[name]) < 1e-3 for name in ("scale", "smooth field", "mask's code", "scene's image", "rest"))
+    assert other["mask's code"] + other["scene's image"] > 0.8 * 0.16 and other["scene's image"] > 0.4 * 0.16
+    assert other["rest"] < 0.15 * 0.16
 
 
 def test_files_are_found_or_a_line_says_where_they_are_from(tmp_path: Path) -> None:
@@ -146,6 +264,8 @@ def test_files_are_found_or_a_line_says_where_they_are_from(tmp_path: Path) -> N
     with pytest.raises(MitsimError, match=r"rec_7\.png: cannot be read"):
         TwinFiles.find(tmp_path)
     (tmp_path / "flatcam" / "fc_7.png").unlink()
-    with pytest.raises(MitsimError, match="give --calibration CAL"):
+    with pytest.raises(MitsimError, match="give a second and its image"):
         TwinFiles.find(tmp_path)
-    assert list(TwinFiles.find(tmp_path, tmp_path).captures) == ["fc_6"]
+    (tmp_path / "flatcam" / "rec_7.png").touch()
+    (tmp_path / "flatcam" / "fc_7.png").touch()
+    assert [*TwinFiles.find(tmp_path).captures] == ["fc_6", "fc_7"]

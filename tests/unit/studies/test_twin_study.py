@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
 from mitsim.core.errors import MitsimError
+from mitsim.reconstruct.shifted_codes import Pose
 from mitsim.studies.framework.run import run_study
+from mitsim.studies.twin_capture import Learned
 from mitsim.studies.twin_diffuser import (
     _BLURS,
     _CORRELATIONS_MM,
@@ -23,6 +27,7 @@ from mitsim.studies.twin_diffuser import (
     fit,
     frequencies,
     lit_square,
+    read_spread,
     spread_of,
 )
 from mitsim.studies.twin_frame import CAUSES, Twin
@@ -84,15 +89,16 @@ def diffuser_twin() -> DiffuserTwin:
 
 def twin(seed: int) -> Twin:
     measured = made(seed, made_codes())
-    frame = measured.frame
-    object.__setattr__(measured, "name", f"fc_{seed} gb")
+    noise = 0.2 * np.random.default_rng(seed).standard_normal(measured.frame.shape)
+    measured = replace(measured, noise=noise, level=measured.level + noise)
     parts = dict.fromkeys(CAUSES, 1 / len(CAUSES))
-    return Twin(measured, frame, frame, 1.0, 0.9, 1.6, 0.7, parts, 0.5, 0.5, 0.1, 0.02, measured.level)
+    return Twin(measured, measured.frame, measured.level, 1.0, 0.7, parts, 0.02)
 
 
 def test_findings_have_a_page_a_table_and_figures(tmp_path: Path) -> None:
     """Every figure that the page names is there, and what cannot be known stands on it."""
-    found = TwinFindings((twin(6), twin(7)), diffuser_twin(), None, None)
+    learned = {"fc_6": Learned(Pose("turned", (0.6, 0.7)), made_codes())}
+    found = TwinFindings((twin(6), twin(7)), learned, diffuser_twin())
     run_study("twin", lambda *_: found, None, tmp_path / "out")
     written = {path.name for path in (tmp_path / "out").iterdir()}
     named = {name for part in found.parts() for name in part.figures}
@@ -102,4 +108,20 @@ def test_findings_have_a_page_a_table_and_figures(tmp_path: Path) -> None:
     kept = json.loads((tmp_path / "out" / "twin.json").read_text(encoding="utf-8"))
     assert [row["frame"] for row in kept["captures"]] == ["fc_6 gb", "fc_7 gb"] and kept["not_known"]
     assert kept["diffuser"]["contrast"].keys() == {"measured", "simulated", "scatter"}
-    assert not found.warnings and TwinFindings((), diffuser_twin(), "cal", 0.2).warnings
+    assert kept["learned"]["fc_6"]["scale"] == [0.6, 0.7] and not found.warnings
+
+
+def test_twins_that_are_not_to_be_trusted_say_so() -> None:
+    """An image that is not the frame's, a bad rendering, and images that may lie otherwise: a line each. (Planted: the
+    other scene's correlation left out of the comparison.)"""
+    swapped, coarse = replace(twin(6), other=1.01), replace(twin(7), render_error=0.2)
+    unsure = {"fc_7": Learned(Pose("turned", (0.6, 0.7), 0.001, False), made_codes())}
+    said = TwinFindings((swapped, coarse), unsure, None).warnings
+    assert [line.split(":")[0] for line in said] == ["fc_7", "fc_6 gb", "fc_7 gb"]
+    assert "its own image" in said[1] and "20% off" in said[2]
+
+
+def test_a_point_spread_function_of_colours_is_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (300, 300)).save(tmp_path / "psf.tif")
+    with pytest.raises(MitsimError, match=r"psf\.tif: is in colour; give"):
+        read_spread(tmp_path / "psf.tif")
