@@ -443,10 +443,10 @@ def _warnings(captures: KnownCaptures, read: _Read, pose: Pose) -> Iterator[str]
             f"orientation: {pose.orientation!r} explains no more than {pose.margin:.1%} of the frames beyond another; "
             "give pictures that are not symmetric, or state orientation in the list"
         )
-    yield from _saturated(read)
+    yield from _of_saturation(read)
 
 
-def _saturated(read: _Read) -> Iterator[str]:
+def _of_saturation(read: _Read) -> Iterator[str]:
     if read.saturated:
         yield (
             f"saturation: {len(read.saturated)} runs have readings at the full well or the ADC's end, first "
@@ -471,8 +471,9 @@ _REACH = 8
 """Parts of the sensor, of which the shadow is looked for in one to either side: beyond, a mask has come off."""
 _STARTED = 4
 """Frames by which the shadow is looked for, and which way pictures lie, at most."""
-_CLEARER = 1.2
-"""Times the likeness of pictures as they are that another orientation must reach, or noise may be the cause."""
+_CLEARER = 1.5
+"""Times what another orientation leaves of the frames that pictures as they are must leave to be refused: up to there
+noise, or a shadow between two pixels, may be the cause."""
 _MASK = "mask_rows_um", "mask_columns_um", "mask_axis_um"
 """What `study drift` calls the ways of a mask [um]."""
 
@@ -503,7 +504,7 @@ def _mend(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, Factors]
         before = camera.misfit(read, start.still())
         fitted = camera.fit(read, start)
         after = camera.misfit(read, fitted)
-    return {name: _mended(captures, read, camera, fitted, (before, after), name, job) for name in aged}
+    return {name: _mended_factors(captures, read, camera, fitted, (before, after), name, job) for name in aged}
 
 
 def _load_aged(captures: KnownCaptures, folder: Path) -> dict[str, Factors]:
@@ -547,7 +548,7 @@ class _Moved:
         """Nothing moved."""
         return replace(self, move=np.zeros(3))
 
-    def changed(self, step: FloatArray) -> _Moved:
+    def after_step(self, step: FloatArray) -> _Moved:
         """The same after a ``step``."""
         gains = {name: gain + more for (name, gain), more in zip(self.gains.items(), step[3:].tolist(), strict=True)}
         return replace(self, move=self.move + step[:3], gains=gains)
@@ -612,7 +613,7 @@ class _Shadow:
     def _unlike(self) -> float:
         return float(np.linalg.norm(self._still * self._brightness - self.factor))
 
-    def displaced(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    def move_by(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
         """The factor of a shadow seen so many ``pixels`` (m, n) further along the sensor, its slope there, and which
         numbers are known: beyond the sensor's edge it is as at the edge.
 
@@ -643,12 +644,12 @@ class _AgedCamera:
 
     def side(self, line: str, axis: int, move: FloatArray) -> tuple[FloatArray, float]:
         """A factor of the plane ``line``, and the part of its numbers that is not known."""
-        moved, _, known = self._shadows[line][axis].displaced(self._longer(line, axis) * move[2] - move[axis])
+        moved, _, known = self._shadows[line][axis].move_by(self._longer(line, axis) * move[2] - move[axis])
         return moved, float(1 - known.mean())
 
-    def _seen(self, line: str, axis: int, move: FloatArray) -> npt.NDArray[np.bool_]:
+    def _seen_rows(self, line: str, axis: int, move: FloatArray) -> npt.NDArray[np.bool_]:
         """(m,) whether all numbers of each sensor row of a factor are known."""
-        known = self._shadows[line][axis].displaced(self._longer(line, axis) * move[2] - move[axis])[2]
+        known = self._shadows[line][axis].move_by(self._longer(line, axis) * move[2] - move[axis])[2]
         return np.asarray(known.all(axis=1))
 
     def _longer(self, line: str, axis: int) -> FloatArray:
@@ -660,10 +661,10 @@ class _AgedCamera:
 
     def sides(self, line: str, move: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Both factors, without columns' means where frames are centred."""
-        left, right = (self._centred(self.side(line, axis, move)[0]) for axis in (0, 1))
+        left, right = (self._without_means(self.side(line, axis, move)[0]) for axis in (0, 1))
         return left, right
 
-    def _centred(self, side: FloatArray) -> FloatArray:
+    def _without_means(self, side: FloatArray) -> FloatArray:
         return centre_columns(side) if self.first.centre else side
 
     def _slopes(self, line: str, move: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -671,10 +672,10 @@ class _AgedCamera:
         found = []
         for axis in (0, 1):
             longer = self._longer(line, axis)
-            _, slope, _ = self._shadows[line][axis].displaced(longer * move[2] - move[axis])
+            _, slope, _ = self._shadows[line][axis].move_by(longer * move[2] - move[axis])
             own = [np.zeros_like(slope), np.zeros_like(slope), slope * longer]
             own[axis] = -slope
-            found.append(np.stack([self._centred(each) for each in own]))
+            found.append(np.stack([self._without_means(each) for each in own]))
         return found[0], found[1]
 
     # -------- Where to begin
@@ -689,10 +690,10 @@ class _AgedCamera:
             if "transposed" not in turn or some[0].scene.shape[0] == some[0].scene.shape[1]
         }
         best = max(likeness, key=lambda turn: likeness[turn][0])
-        if likeness[best][0] > _CLEARER * likeness["upright"][0]:
+        if 1 - likeness["upright"][0] ** 2 > _CLEARER * (1 - likeness[best][0] ** 2):
             raise MitsimError(
                 f"list {name}: pictures lie {best} of how images by the calibration lie: frames correlate by "
-                f"{likeness[best][0]:.2f} with those of pictures that lie so, and by {likeness['upright'][0]:.2f} with "
+                f"{likeness[best][0]:.3f} with those of pictures that lie so, and by {likeness['upright'][0]:.3f} with "
                 "those of these; save the pictures so"
             )
         move = np.array([*likeness["upright"][1], 0.0])
@@ -741,11 +742,11 @@ class _AgedCamera:
             step = np.asarray(np.linalg.solve(here.matrix, here.right), dtype=np.float64)
             errors = np.sqrt(np.diag(np.linalg.inv(here.matrix)))
             for _ in range(_HALVINGS):
-                there = self._normal(read, at.changed(step), variances)
+                there = self._normal(read, at.after_step(step), variances)
                 if there.misfit <= here.misfit * (1 + 1e-12):
                     break
                 step = step / 2
-            at, here = at.changed(step), there
+            at, here = at.after_step(step), there
             converged = bool((np.abs(step) < _MOVED * errors).all())
             if converged:
                 break
@@ -773,7 +774,7 @@ class _AgedCamera:
             slopes, gain, noise = self._slopes(line, at.move), at.gains[line], self.factors[line].manifest.noise
             own = [0, 1, 2, 3 + lines.index(line)]
             # Sensor rows and columns that see what no pixel saw before tell nothing of where the shadow is.
-            seen = np.multiply.outer(*(self._seen(line, axis, at.move) for axis in (0, 1)))
+            seen = np.multiply.outer(*(self._seen_rows(line, axis, at.move) for axis in (0, 1)))
             pulls = [np.zeros((4, *side.shape)) for side in (left, other)]
             for each, variance in zip(read.exposures, variances, strict=True):
                 if each.plane != line:
@@ -838,7 +839,7 @@ class _AgedCamera:
         }
 
 
-def _mended(
+def _mended_factors(
     captures: KnownCaptures,
     read: _Read,
     camera: _AgedCamera,
@@ -859,7 +860,7 @@ def _mended(
     numbers = camera.numbers(at)
     status = _aged_status(numbers, at, (unexplained_before, unexplained), bool(np.isfinite(read.noises).all()))
     flagged = (f"the calibration was flagged before it was mended: {text}" for text in aged.warnings)
-    warnings = (*flagged, *_saturated(read), *(() if status.ok else (str(status),)))
+    warnings = (*flagged, *_of_saturation(read), *(() if status.ok else (str(status),)))
     result: dict[str, Any] = {
         "n": left.shape[1],
         "frames": read.frames,
