@@ -17,7 +17,11 @@ from mitsim.devices.patterns import parse_patterns
 
 ROWS, COLUMNS, N = 64, 72, 20
 SCALES = 0.78, 0.74
-PLANES = {"r": (0.5, 0.5), "gb": (0.0, 0.5), "gr": (0.5, 0.0), "b": (0.0, 0.0)}
+PLANES = {
+    "BGGR": {"r": (0.5, 0.5), "gb": (0.0, 0.5), "gr": (0.5, 0.0), "b": (0.0, 0.0)},
+    "RGGB": {"r": (0.0, 0.0), "gr": (0.0, 0.5), "gb": (0.5, 0.0), "b": (0.5, 0.5)},
+}
+"""Places of the planes of a mosaic, down and to the right, in pixels of a plane: written out, not worked out."""
 
 
 def write_known(path: Path, runs: list[dict[str, str]], **more: Any) -> Path:
@@ -68,6 +72,7 @@ class KnownCamera:
     ) -> Path:  # fmt: skip
         """The RUN folder of a ``scene`` under ``patterns``, lit so and then turned as it lies before the camera."""
         folder.mkdir(parents=True)
+        prepare = digital.pop("prepare", {})
         family, (left, right) = parse_patterns(patterns, N), self.factors(offset)
         names = [f"frame_{index}.exr" for index in range(len(family.shots))]
         stated = {
@@ -80,17 +85,24 @@ class KnownCamera:
             dn = np.rint(np.maximum(electrons * stated["gain_dn_per_e"] + 100, 0))
             write_frame(folder / name, {"DN": np.minimum(dn, stated["saturation_dn"]).astype(np.float32)}, {})
         manifest = RunManifest(
-            status="complete", camera={"name": "known"}, digital=Digital(**stated), patterns=Patterns.of(family, names)
-        )
+            status="complete", camera={"name": "known"}, digital=Digital(**stated), patterns=Patterns.of(family, names),
+            configuration={"prepare": prepare} if prepare else {},
+        )  # fmt: skip
         write_manifest(folder, manifest)
         return folder
 
-    def write_planes(self, folder: Path, scene: FloatArray) -> Path:
-        """The coloured RUN folder of all planes of a Bayer sensor, of a ``scene`` (20, 20, 3)."""
+    def write_planes(
+        self, folder: Path, scene: FloatArray, mosaic: str = "BGGR", further: tuple[float, float] = (0.0, 0.0)
+    ) -> Path:
+        """The coloured RUN folder of all planes of a sensor behind a ``mosaic``, of a ``scene`` (20, 20, 3), by pixels
+        that lie so much ``further`` down and to the right."""
         lengths = {"r": 600.0, "g": 540.0, "b": 460.0}
-        for name, offset in PLANES.items():
-            self.write_run(folder / name, scene[:, :, "rgb".index(name[0])], offset=offset)
-        lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
+        for name, place in PLANES[mosaic].items():
+            self.write_run(
+                folder / name, scene[:, :, "rgb".index(name[0])], offset=(place[0] + further[0], place[1] + further[1]),
+                prepare={"mosaic": mosaic, "channel": name},
+            )  # fmt: skip
+        lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES[mosaic]]
         write_colours(folder, ColourManifest.model_validate({"kind": RUN, "channels": lines}))
         return folder
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
 """Options of `mitsim calibrate` that go with --frames."""
-_OF_KNOWN = {"known", "output", "as_json", "quiet"}
+_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet"}
 """Those that go with --known."""
 
 
@@ -55,6 +55,9 @@ class Session:
     )
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
     known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
+    aged: Path | None = option(
+        None, "calibration that has aged: moved until the frames of --known fit", "--from", metavar="CAL"
+    )
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
     recipe: Path | None = option(None, "session recipe, TOML", metavar="FILE.toml")
@@ -124,7 +127,9 @@ def calibrate(
     if session.known is not None:
         folder = Planned().folder(session.output)
         _check_alone(context, f"--known {session.known}: runs and their list decide", _OF_KNOWN)
-        return _calibrate_known(session.known, folder, limited)
+        return _calibrate_known(session.known, session.aged, folder, limited)
+    if session.aged is not None:
+        raise MitsimError(f"--from {session.aged}: is mended by captures of known pictures; give --known LIST too")
     if modelled.model is not None and not planned.planning:
         modelling, folder = modelled.modelling(session.accuracy), planned.folder(session.output)
         return _fit(context, scene, modelling, folder, session, devices, limited)
@@ -282,18 +287,18 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
 # ---- captures of known pictures --------------------------------------------------------------------------------------
 
 
-def _calibrate_known(listed: Path, output: Path, limited: Limited) -> int:
+def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Limited) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.knownlist import load_known
 
     captures = load_known(listed)  # refused before the fit is imported
     check_output(output)
-    from mitsim.reconstruct.known_pictures import calibrate_known
+    from mitsim.reconstruct.known_pictures import calibrate_known, moved_in_words
 
     held = memory_from_here()
     with limited.job() as job:
-        found = calibrate_known(captures, output, job)
+        found = calibrate_known(captures, output, job, aged)
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
         for name, each in found.items()
@@ -303,9 +308,13 @@ def _calibrate_known(listed: Path, output: Path, limited: Limited) -> int:
     payload = {**first, "memory_bytes": memory_since(held), "warnings": warnings, "output": str(output)}
     if captures.lines is not None:
         payload["planes"] = results
+    said = f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {output}"
+    if aged is not None:
+        left = f"left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
+        return finish(limited.as_json, payload, [said, f"moved: {moved_in_words(first['moved'])}", left], warnings)
     rows, columns = first["scale"]
     lines = [
-        f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {output}",
+        said,
         f"pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
         "columns of pixels",
         *(

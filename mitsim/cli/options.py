@@ -37,6 +37,7 @@ _SPELLED = {
     "outside": "--allow-outside-files",
     "planning": "--plan",
     "as_json": "--json",
+    "aged": "--from",
     "lam": "--lambda",
 }
 """Options that are not called like their parameter."""

@@ -14,6 +14,7 @@ from pydantic import FailFast, Field, model_validator
 from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain, read_json
+from mitsim.core.imagelist import Preparation
 from mitsim.core.manifests import RunManifest, read_manifest
 from mitsim.core.spectral_manifests import RUN, ColourManifest, is_coloured, is_mosaic, read_colours
 
@@ -125,6 +126,16 @@ def load_known(path: Path | str) -> KnownCaptures:
     return found
 
 
+def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
+    """What an import did to files before they were the frames of a ``manifest`` at a ``place``; of other runs nothing.
+    MitsimError where the manifest says what no import does."""
+    return validate(Preparation, manifest.configuration.get("prepare") or {}, f"{place}: a run's configuration.prepare")
+
+
+_PLACING = "mosaic", "orientation", "turn_deg", "turn_about", "crop"
+"""Of a preparation, what moves pixels: frames of two such are of two cameras."""
+
+
 def _run_of(folder: Path) -> tuple[ColourManifest | None, dict[str, RunManifest]]:
     if not is_coloured(folder):
         return None, {"": read_manifest(folder, RunManifest)}
@@ -149,6 +160,13 @@ def _check_alike(found: KnownCaptures, capture: KnownCapture, manifests: dict[st
         if manifest.camera != ours.camera:
             raise MitsimError(
                 f"list {found.path}: {capture.run} is of another camera than {first}; calibrate each by its own"
+            )
+        how, first_how = (preparation_of(each, found.path) for each in (manifest, ours))
+        unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
+        if unlike is not None:
+            raise MitsimError(
+                f"list {found.path}: {capture.run} was imported with another {unlike} than {first}, so its pixels see "
+                "other parts of the mask; import both alike"
             )
         sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
         if sides != own:

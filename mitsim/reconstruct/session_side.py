@@ -88,11 +88,8 @@ class MovingShadow:
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Collection[int] = ()) -> None:
         pixels, (n, count) = len(vectors), signs.shape
         taper = _taper(pixels)
-        # A frame's mean light is no part of the shadow's shape, and centred frames have none.
-        spectra = np.fft.rfft(vectors * taper[:, None], axis=0)[1:]
-        stride = -(-len(spectra) // _FREQUENCIES)
-        angles = 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / pixels
-        self._spectra = spectra = spectra[::stride]
+        self._spectra, angles, stride = _spectra(vectors, taper)
+        spectra = self._spectra
         columns = spectra @ signs.T / count
         self.step = _step(columns, angles, pixels)
         modes = _modes(angles, self.step, n)
@@ -148,6 +145,21 @@ class MovingShadow:
         pull = np.real(shown.conj() * self._left).sum(axis=0)
         size = np.maximum((np.square(np.abs(shown)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
         return np.asarray(np.square(pull) / size / self._unit)
+
+
+def shadow_step(factor: FloatArray) -> float:
+    """Sensor pixels that the shadow in a ``factor`` (m, n) moves by from one column to the next."""
+    spectra, angles, _ = _spectra(factor, _taper(len(factor)))
+    return _step(spectra, angles, len(factor))
+
+
+def _spectra(columns: FloatArray, taper: FloatArray) -> tuple[ComplexArray, FloatArray, int]:
+    """(frequencies, n) of tapered ``columns`` (m, n), angles of the frequencies a pixel, and how many are passed over
+    from one to the next."""
+    # A frame's mean light is no part of the shadow's shape, and centred frames have none.
+    spectra = np.fft.rfft(columns * taper[:, None], axis=0)[1:]
+    stride = -(-len(spectra) // _FREQUENCIES)
+    return spectra[::stride], 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / len(columns), stride
 
 
 def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
