@@ -58,6 +58,8 @@ _COARSE_STEPS, _LEAST_SIDE = 60, 32
 """Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
 _SMOOTH = 1e-3
 """Slope below which TV is quadratic, over the image's largest number."""
+_FIRST_SMOOTH, _SMOOTHER = 10.0, 0.3
+"""The same of the first pass, over that of the last ones, and from pass to pass."""
 _PASS, _PASS_UNBOUND = 6, 12
 """Steps of a pass, with bounds and without: of 1 to 12 those that end soonest. Fewer forget what was found, and more go
 where bounds do not let them."""
@@ -286,8 +288,11 @@ class _State:
 
     def _pull(self, down: Array, across: Array) -> tuple[Array, Array]:
         """Slopes times the weight, over the image's slopes."""
-        scale = self.prior.weight / np.maximum(self._slopes[2], self.smooth)
-        return down * scale, across * scale
+        return down * self._stiffness, across * self._stiffness
+
+    @cached_property
+    def _stiffness(self) -> Array:
+        return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
 
     @cached_property
     def gradient(self) -> Array:
@@ -495,31 +500,33 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
 
 def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
     """The state after at most so many steps, their number, and its fall."""
-    divide = _Division(state.light, state.prior, state.smooth)
+    least = state.smooth
+    state = replace(state, smooth=least * _FIRST_SMOOTH)
     most = _PASS if state.prior.bounded else _PASS_UNBOUND
     spent, fall, objectives = 0, math.inf, [(0, state.objective)]
     while spent < iterations and fall > tolerance:
-        direction, seen, promised = _pass(state, divide, min(most, iterations - spent))
+        direction, seen, promised = _pass(state, min(most, iterations - spent))
         length, following = 1.0, state.move(direction, seen, 1.0)
         while following.smoothed > state.smoothed and length > _FEWEST:
             length /= 2
             following = state.move(direction, seen, length)
         still = promised <= 0 or length <= _FEWEST
         if not still:
-            state, spent = following, min(spent + most, iterations)
+            state = replace(following, smooth=max(state.smooth * _SMOOTHER, least))
+            spent = min(spent + most, iterations)
             objectives.append((spent, state.objective))
         earlier = next(objective for steps, objective in reversed(objectives) if 2 * steps <= spent)
-        if still or len(objectives) > 2:
+        if still or (len(objectives) > 2 and state.smooth == least):
             fall = max(earlier - state.objective, promised) / max(state.objective, _NOTHING)
         if still:
             break
     return state, spent, fall
 
 
-def _pass(state: _State, divide: _Division, steps: int) -> tuple[Array, Array, float]:
+def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
     """Where conjugate gradients lead in the pixels that no bound holds, what the sensor sees of it, and what it lowers
     the quadratic by that touches the objective in ``state``."""
-    free = state.free
+    free, divide = state.free, _Division(state.light, state.prior, state.smooth)
     left = np.where(free, state.gradient, state.precise(0))
     total, seen = np.zeros_like(left), np.zeros_like(state.residual)
     direction, power, promised = np.zeros_like(left), math.inf, 0.0
@@ -588,7 +595,7 @@ def solve_point_spread(
     lam: float | Literal["auto"] = "auto",
     bounds: Bounds | None = None,
     iterations: int = 300,
-    tolerance: float = 0.05,
+    tolerance: float = 0.02,
 ) -> Solution:
     """The image of all frames.
 

@@ -17,7 +17,7 @@ from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
 from mitsim.reconstruct.point_spread import ShiftedLight, reduce_frame, solve_point_spread
 from mitsim.reconstruct.reconstruct import Reconstruction
-from mitsim.reconstruct.request import TIKHONOV, Bounds, ImageRequest, plain_bounds
+from mitsim.reconstruct.request import TIKHONOV, Bounds, ImageRequest
 
 _NUMBERS = 24
 """Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
@@ -31,6 +31,7 @@ def reconstruct_psf(
     lam: float | Literal["auto"] = "auto",
     method: str = TIKHONOV,
     bounds: Bounds | None = None,
+    iterations: int | None = None,
 ) -> Reconstruction:
     """Recover the image of a camera whose scene points all cast one pattern of light, each shifted by its place.
 
@@ -52,7 +53,9 @@ def reconstruct_psf(
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     bounds
-        least and largest number of the image [electrons/s], by ``nonnegative`` and ``tv``.
+        least and largest number of the image [electrons/s], by ``nonnegative`` and ``tv``; None: 0 and inf.
+    iterations
+        most steps, by ``nonnegative`` and ``tv``; None: 300.
 
     Raises
     ------
@@ -60,7 +63,7 @@ def reconstruct_psf(
         for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
         than is free, another lambda, method or bounds, and ``auto`` under patterns other than uniform light.
     """
-    return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds))
+    return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds, iterations=iterations))
 
 
 @single_threaded_blas()
@@ -87,7 +90,7 @@ def reconstruct_psf_request(
         Cost(memory_bytes=4.0 * _NUMBERS * numbers).check(f"{shots.name}: its image", Limits())
         frames = seen.read()
     with clock.stage("solve"):
-        solution = solve_point_spread(camera, frames, request.method, request.lam, request.bounds)
+        solution = solve_point_spread(camera, frames, request.method, request.lam, **request.iterative)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
     if seen.saturated:
         flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")
@@ -116,7 +119,7 @@ def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageReque
     """
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {"run": shots.fingerprint, "psf": digest, "reduce": reduce, "lambda": request.lam, "method": request.method}
-    return asked if request.bounds is None else {**asked, "bounds": plain_bounds(request.bounds)}
+    return {**asked, **request.plain}
 
 
 def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
