@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ from skimage.transform import resize
 from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
-from mitsim.reconstruct.point_spread import ShiftedLight, minimise, solve_point_spread
+from mitsim.reconstruct.point_spread import ShiftedLight, minimise
+from mitsim.reconstruct.point_spread_image import solve_point_spread
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.solvers import Prior, solve_nonnegative, solve_tv
@@ -91,7 +93,7 @@ def weights(place: Path | None) -> list[dict[str, Any]]:
                 seen = frame + noise * frame.mean() * rng.normal(size=frame.shape)
                 for method in ("tikhonov", "nonnegative", "tv"):
                     case = {"camera": name, "scene": scene, "noise": noise, "method": method}
-                    add(case, lambda lam, m=method, s=seen, L=light: solve_point_spread(L, s, m, lam), truth)
+                    add(case, partial(solve_point_spread, light, seen, method), truth)
     size, pixels = 48, 96
     left, right = (gaussian_filter((rng.random((pixels, size)) > 0.5).astype(float), (0.7, 0)) for _ in range(2))
     for name in ("uniform", "dots:3", "hadamard:4"):
@@ -106,7 +108,7 @@ def weights(place: Path | None) -> list[dict[str, Any]]:
                     sums.add(frame + noise * np.abs(frame).mean() * rng.normal(size=frame.shape), i, j)
                 for method, solver in (("nonnegative", solve_nonnegative), ("tv", solve_tv)):
                     case = {"camera": f"separable, {name}", "scene": scene, "noise": noise, "method": method}
-                    add(case, lambda lam, s=solver, p=prepared, f=sums: s(p, f, lam), truth)
+                    add(case, partial(solver, prepared, sums), truth)
     return rows
 
 

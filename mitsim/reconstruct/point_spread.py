@@ -37,7 +37,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,9 +45,6 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.convolution import check_lambda
-from mitsim.reconstruct.request import TIKHONOV, TV, Bounds
-from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import Prior
 
 Array = npt.NDArray[Any]
@@ -58,8 +55,9 @@ _COARSE_STEPS, _LEAST_SIDE = 60, 32
 """Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
 _SMOOTH = 1e-3
 """Slope below which TV is quadratic, over the image's largest number."""
-_FIRST_SMOOTH, _SMOOTHER = 10.0, 0.3
-"""The same of the first pass, over that of the last ones, and from pass to pass."""
+_FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
+"""That of the first pass over this, and of each pass over that of the one before. Of none, 10 or 30, and 0.3 or 0.5,
+those that end soonest: with none, large weights take five times as many steps to within 5 %."""
 _PASS, _PASS_UNBOUND = 6, 12
 """Steps of a pass, with bounds and without: of 1 to 12 those that end soonest. Fewer forget what was found, and more go
 where bounds do not let them."""
@@ -71,10 +69,6 @@ _FEWEST = 1e-12
 """Shortest part of a pass that is taken: below it nothing is gained in double precision."""
 _HUGE = 1e30
 """In place of an infinite bound, where a distance to it is multiplied."""
-_RIDGE, _WEIGHT = 50.0, 1.2
-"""Automatic lambda over the mean square of a scene pixel's light, by a frame's noise over its mean; and automatic
-weight of TV in units of the noise that the data term's gradient carries to a pixel. Chosen on photographs seen by a
-measured diffuser with noise of 0.1 to 8 % (benchmarks/point_spread.py)."""
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -159,7 +153,7 @@ class ShiftedLight:
         if self.patterns is not None or not smaller:
             return None
         rows, columns = self.sensor
-        return replace(self, psf=4 * halve(self.psf), sensor=(rows // 2, columns // 2))
+        return replace(self, psf=4 * reduce_frame(self.psf, 2), sensor=(rows // 2, columns // 2))
 
     def double(self, smaller: Array) -> Array:
         """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
@@ -221,11 +215,6 @@ class ShiftedLight:
         return (np.outer(row, column) for row in left for column in right)
 
 
-def halve(frame: Array) -> Array:
-    """(m // 2, m' // 2) means of 2 x 2 numbers of a ``frame`` (m, m')."""
-    return reduce_frame(frame, 2)
-
-
 def reduce_frame(frame: Array, reduce: int) -> Array:
     """Means of ``reduce`` x ``reduce`` numbers of a ``frame``; rows and columns that remain are left out."""
     rows, columns = (size // reduce for size in frame.shape)
@@ -238,7 +227,7 @@ def reduce_frame(frame: Array, reduce: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """An image X (n, n') of ``frames``, and what follows of it.
+    """An image X (n, n') of ``light``, and what follows of it.
 
     Attributes
     ----------
@@ -249,7 +238,6 @@ class _State:
     """
 
     light: ShiftedLight
-    frames: Array
     prior: Prior
     image: Array
     residual: Array
@@ -282,16 +270,8 @@ class _State:
         return self.objective - self._flattened
 
     @cached_property
-    def bounded(self) -> tuple[Array, Array]:
-        """Q."""
-        return self._pull(self._slopes[0], self._slopes[1])
-
-    def _pull(self, down: Array, across: Array) -> tuple[Array, Array]:
-        """Slopes times the weight, over the image's slopes."""
-        return down * self._stiffness, across * self._stiffness
-
-    @cached_property
     def _stiffness(self) -> Array:
+        """Weight over slopes: Q of slopes of 1."""
         return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
 
     @cached_property
@@ -304,7 +284,7 @@ class _State:
         it at X; of X itself their gradient."""
         bent = self.prior.ridge * direction
         if self.prior.weight:
-            down, across = self._pull(*_slopes(direction))
+            down, across = (each * self._stiffness for each in _slopes(direction))
             bent[1:] += down[:-1]
             bent[:-1] -= down[:-1]
             bent[:, 1:] += across[:, :-1]
@@ -330,13 +310,31 @@ class _State:
         np.clip(image, *self.prior.bounds, out=image)
         return replace(self, image=image, residual=self.residual + self.light.image_of(image - self.image))
 
+    @cached_property
+    def _divided(self) -> Array:
+        light, prior = self.light, self.prior
+        total = np.square(np.abs(light.spectrum)) + _MU * float(np.square(light.psf).sum()) + prior.ridge
+        if prior.weight:
+            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
+            total += prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
+        return np.asarray(1 / total, light.precision)
+
+    def divide(self, image: Array) -> Array:
+        """Near what the inverse of the second derivative makes of an ``image`` under uniform light: a division in the
+        Fourier domain."""
+        if self.light.patterns is not None:
+            return image
+        rows, columns = image.shape
+        turned = fft.rfft2(image, self.light.grid) * self._divided
+        return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
+
     def precise(self, number: float) -> Any:
         """A ``number`` that leaves arrays in their precision."""
         return self.image.dtype.type(number)
 
     # ---- how far above the minimum
 
-    def gap(self, divide: _Division) -> float:
+    def gap(self) -> float:
         """Upper bound of P(X) - min P; the module's text says of which images."""
         variation = 0.0
         if self.prior.weight:
@@ -349,7 +347,7 @@ class _State:
         seen = np.zeros_like(self.residual)
         for _ in range(_TIGHTENED):
             left = np.where(free, slope, self.precise(0))
-            turned = divide(left) * free
+            turned = self.divide(left) * free
             before, power = power, _dot(left, turned)
             if power <= 0:
                 break
@@ -404,32 +402,6 @@ def _dot(first: Array, second: Array) -> float:
     return float(np.vdot(first, second))
 
 
-@dataclass(frozen=True, eq=False)
-class _Division:
-    """Near the inverse of the second derivative under uniform light: a division in the Fourier domain."""
-
-    light: ShiftedLight
-    prior: Prior
-    smooth: float
-
-    @cached_property
-    def _weight(self) -> Array:
-        light = self.light
-        power = np.square(np.abs(light.spectrum))
-        total = power + _MU * float(np.square(light.psf).sum()) + self.prior.ridge
-        if self.prior.weight and self.smooth:
-            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
-            total += self.prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
-        return np.asarray(1 / total, light.precision)
-
-    def __call__(self, image: Array) -> Array:
-        if self.light.patterns is not None:
-            return image
-        rows, columns = image.shape
-        turned = fft.rfft2(image, self.light.grid) * self._weight
-        return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
-
-
 # ---- Minimising ------------------------------------------------------------------------------------------------------
 
 
@@ -472,8 +444,7 @@ def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, 
         most steps at full size, and the fall at which they end.
     """
     state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
-    gap = state.gap(_Division(light, prior, state.smooth))
-    return Minimum(state.image, spent, state.objective, fall, gap / max(state.objective, _NOTHING))
+    return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
 
 
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
@@ -483,12 +454,14 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
     if smaller:
         # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
         half = replace(prior, weight=prior.weight / 2)
-        found = _descend(_start(smaller, np.stack([halve(each) for each in frames]), half), _COARSE_STEPS, 0.0)[0]
+        found = _descend(
+            _start(smaller, np.stack([reduce_frame(each, 2) for each in frames]), half), _COARSE_STEPS, 0.0
+        )[0]
         image = light.double(found.image)
     else:
         image = np.zeros(light.scene, light.precision)
     image = np.clip(image, low, high)
-    start = _State(light, frames, prior, image, light.image_of(image) - frames, 0.0)
+    start = _State(light, prior, image, light.image_of(image) - frames, 0.0)
     if prior.weight and not smaller:
         # Least squares first: they tell how bright the scene is.
         unweighted = replace(start, prior=replace(prior, weight=0.0))
@@ -500,9 +473,8 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
 
 def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
     """The state after at most so many steps, their number, and its fall."""
-    least = state.smooth
-    state = replace(state, smooth=least * _FIRST_SMOOTH)
-    most = _PASS if state.prior.bounded else _PASS_UNBOUND
+    sharp, most = state.smooth, _PASS if state.prior.bounded else _PASS_UNBOUND
+    state = replace(state, smooth=_FIRST_SMOOTH * sharp)
     spent, fall, objectives = 0, math.inf, [(0, state.objective)]
     while spent < iterations and fall > tolerance:
         direction, seen, promised = _pass(state, min(most, iterations - spent))
@@ -511,14 +483,15 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
             length /= 2
             following = state.move(direction, seen, length)
         still = promised <= 0 or length <= _FEWEST
+        ended = still and state.smooth == sharp
         if not still:
-            state = replace(following, smooth=max(state.smooth * _SMOOTHER, least))
-            spent = min(spent + most, iterations)
+            state, spent = following, min(spent + most, iterations)
             objectives.append((spent, state.objective))
-        earlier = next(objective for steps, objective in reversed(objectives) if 2 * steps <= spent)
-        if still or (len(objectives) > 2 and state.smooth == least):
+        state = replace(state, smooth=max(_SHARPENED * state.smooth, sharp))
+        if ended or (len(objectives) > 2 and state.smooth == sharp):
+            earlier = next(objective for steps, objective in reversed(objectives) if 2 * steps <= spent)
             fall = max(earlier - state.objective, promised) / max(state.objective, _NOTHING)
-        if still:
+        if ended:
             break
     return state, spent, fall
 
@@ -526,12 +499,12 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
 def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
     """Where conjugate gradients lead in the pixels that no bound holds, what the sensor sees of it, and what it lowers
     the quadratic by that touches the objective in ``state``."""
-    free, divide = state.free, _Division(state.light, state.prior, state.smooth)
+    free = state.free
     left = np.where(free, state.gradient, state.precise(0))
     total, seen = np.zeros_like(left), np.zeros_like(state.residual)
     direction, power, promised = np.zeros_like(left), math.inf, 0.0
     for step in range(steps):
-        turned = divide(left) * free
+        turned = state.divide(left) * free
         before, power = power, _dot(left, turned)
         if power <= 0:
             break
@@ -546,109 +519,3 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
             bent *= free
             left += state.precise(length) * bent
     return total, seen, promised
-
-
-# ---- Weights from the frames themselves ------------------------------------------------------------------------------
-
-
-def frame_noise(frame: Array) -> float:
-    """Standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer, Comput. Vis.
-    Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3 pixels."""
-    if min(frame.shape) < 3:
-        return 0.0
-    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
-    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
-    return float(np.median(np.abs(bent))) / 6 / 0.6745
-
-
-def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
-    """Lambda for one frame under uniform light: proportional to its noise over its mean. MitsimError for patterns, and
-    for a frame without light.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and the frame (1, m, m') that it saw.
-    """
-    if light.patterns is not None:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    mean = float(frames.mean())
-    if mean <= 0:
-        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
-    return _RIDGE * frame_noise(frames[0]) / mean * light.column_power
-
-
-def automatic_weight(light: ShiftedLight, frames: Array) -> float:
-    """Weight of TV: as :func:`mitsim.reconstruct.solvers.automatic_weight`, with the noise that ``frames`` (K K', m,
-    m') of ``light`` tell by :func:`frame_noise`, and a constant of its own."""
-    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
-    return _WEIGHT * noise * math.sqrt(light.column_power)
-
-
-# ---- The image -------------------------------------------------------------------------------------------------------
-
-
-def solve_point_spread(
-    light: ShiftedLight,
-    frames: Array,
-    method: str,
-    lam: float | Literal["auto"] = "auto",
-    bounds: Bounds | None = None,
-    iterations: int = 300,
-    tolerance: float = 0.02,
-) -> Solution:
-    """The image of all frames.
-
-    Parameters
-    ----------
-    light
-        the camera under its patterns.
-    frames
-        (K K', m, m') row-major over patterns (i, j).
-    method
-        ``tikhonov``, ``nonnegative`` or ``tv``.
-    lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`automatic_ridge`, :func:`automatic_weight`.
-    bounds
-        least and largest number; None: any of ``tikhonov``, 0 and inf of the others, as light is.
-    iterations, tolerance
-        it ends where the last half of its steps lowered the objective by at most ``tolerance`` of itself, or after so
-        many steps.
-
-    Raises
-    ------
-    MitsimError
-        for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
-    """
-    if frames.shape != (light.count, *light.sensor) or not np.isfinite(frames).all():
-        raise MitsimError(
-            f"frames of shape {frames.shape}: give {light.count} of {light.sensor[0]} x {light.sensor[1]} finite "
-            "numbers"
-        )
-    if iterations < 1:
-        raise MitsimError(f"iterations are {iterations}; give at least 1")
-    if lam == "auto":
-        lam = automatic_weight(light, frames) if method == TV else automatic_ridge(light, frames)
-    lam = check_lambda(lam)
-    known = bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf))
-    prior = Prior(weight=lam, bounds=known) if method == TV else Prior(ridge=lam, bounds=known)
-    frames = frames.astype(light.precision)
-    energy = _dot(frames, frames)
-    found = minimise(light, frames, prior, iterations, tolerance)
-    residual = light.image_of(found.image) - frames
-    figures = f"Objective {found.objective:.4g}, proven to be at most {found.gap:.1e} of itself above its minimum."
-    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1e} of itself"
-    if found.fall <= tolerance:
-        status = Status(Verdict.SOLVED, f"Converged: {lowered}", "", figures)
-    else:
-        remedy = "take a larger lambda, or allow more iterations"
-        status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
-    return Solution(
-        image=np.asarray(found.image[light.window], np.float64),
-        lam=lam,
-        residual=math.sqrt(_dot(residual, residual) / energy) if energy else 0.0,
-        status=status,
-        iterations=found.iterations,
-        objective=found.objective,
-        relative_gap=found.gap,
-    )

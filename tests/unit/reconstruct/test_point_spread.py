@@ -12,14 +12,10 @@ from scipy.optimize import lsq_linear, nnls
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.point_spread import (
     ShiftedLight,
-    automatic_ridge,
-    automatic_weight,
-    frame_noise,
-    halve,
     minimise,
     reduce_frame,
-    solve_point_spread,
 )
+from mitsim.reconstruct.point_spread_image import automatic_ridge, automatic_weight, frame_noise, solve_point_spread
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
@@ -132,7 +128,7 @@ def test_half_the_size_sees_half_the_frame() -> None:
         assert half is not None and half.sensor == (40, 41) and half.half_size() is None
         rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
         scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
-        seen, expected = halve(light.image_of(light.double(scene))[0]), half.image_of(scene)[0]
+        seen, expected = reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
         inside = np.s_[5:-5, 5:-5]
         assert np.abs(seen - expected)[inside].max() < 4e-3 * np.ptp(expected)
     assert LIGHTS[2].half_size() is None
