@@ -65,12 +65,12 @@ def lights(place: Path | None) -> dict[str, np.ndarray]:
 
 def loss(solve: Callable[[Any], Solution], truth: np.ndarray) -> dict[str, Any]:
     """Decibels that the automatic weight loses, and whether the best one is at an end of those tried."""
-    automatic = solve("auto")
-    found = [psnr(solve(automatic.lam * factor).image, truth) for factor in FACTORS]
+    automatic, peak = solve("auto"), float(truth.max())
+    found = [psnr(solve(automatic.lam * factor).image / peak, truth / peak) for factor in FACTORS]
     best = int(np.argmax(found))
     return {
-        "psnr": psnr(automatic.image, truth),
-        "loss": max(found[best] - psnr(automatic.image, truth), 0.0),
+        "psnr": psnr(automatic.image / peak, truth / peak),
+        "loss": max(found[best] - psnr(automatic.image / peak, truth / peak), 0.0),
         "best_over_automatic": float(FACTORS[best]),
         "converged": automatic.ok,
     }
