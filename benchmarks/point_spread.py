@@ -54,7 +54,8 @@ def theirs(place: Path, name: str) -> dict[str, Any]:
 
 def ours(place: Path, name: str) -> dict[str, Any]:
     """The same by mitsim: METHOD:STEPS."""
-    from mitsim.reconstruct.point_spread import ShiftedLight, solve_point_spread
+    from mitsim.reconstruct.point_spread import ShiftedLight
+    from mitsim.reconstruct.point_spread_image import solve_point_spread
 
     given, (method, steps) = np.load(place / "given.npz"), name.split(":")
     start = time.process_time()

@@ -66,8 +66,15 @@ class Solving:
     )
     bounds: str | None = option(
         None,
-        "least and largest number of the image, by nonnegative (0: if not given) and tv; either may be left out",
+        "least and largest number of the image, by nonnegative and tv; either may be left out; if not given, 0: of "
+        "nonnegative and with --psf",
         metavar="LOW:HIGH",
+    )
+    iterations: int | None = option(
+        None,
+        "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given",
+        min=1,
+        metavar="N",
     )
     margin: int = option(
         0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
@@ -82,6 +89,7 @@ class Solving:
             "depth_range": None if self.depth_range is None else _two_depths(self.depth_range),
             "margin": self.margin,
             "bounds": None if self.bounds is None else _two_bounds(self.bounds),
+            "iterations": self.iterations,
         }
 
 
@@ -229,6 +237,7 @@ def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
         ("margin", 0),
         ("depth_range", None),
         ("bounds", None),
+        ("iterations", None),
     ):
         if options[name] != neutral:
             raise MitsimError(

@@ -13,8 +13,8 @@ what coefficients W take for image.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -26,7 +26,7 @@ from mitsim.core.manifests import Digital, FactorNoise, RunManifest
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, Bounds, keeps_frames, slab_numbers
+from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Solver
@@ -221,8 +221,8 @@ class Accumulation:
         sums of all frames, and of their noise.
     kept
         the frames themselves while they are few; all or none.
-    bounds
-        of the image, where the method heeds them; None: the method's own.
+    iterative
+        what the method is told besides (:attr:`mitsim.reconstruct.request.ImageRequest.iterative`).
     """
 
     shots: Capture
@@ -232,7 +232,7 @@ class Accumulation:
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
-    bounds: Bounds | None = None
+    iterative: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def solver(self) -> Solver:
@@ -261,9 +261,7 @@ class Accumulation:
 
     def solution(self, lam: float | Literal["auto"]) -> Solution:
         """Their image at ``lam``."""
-        if self.bounds is None:
-            return self.solver.compute(self.prepared, self.frames, lam)
-        return self.solver.compute(self.prepared, self.frames, lam, self.bounds)
+        return self.solver.compute(self.prepared, self.frames, lam, **self.iterative)
 
     def lack(self, image: FloatArray) -> Lack | None:
         """What the factors are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
@@ -275,15 +273,15 @@ class Accumulation:
         return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
 
-def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, bounds: Bounds | None = None) -> Accumulation:
+def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, **iterative: Any) -> Accumulation:
     """The model of shots and factors factorised, and every frame added.
 
     Parameters
     ----------
     shots, factors
         that fit each other.
-    method, bounds
-        of the image that they are for.
+    method, **iterative
+        of the image that they are for, as in :class:`Accumulation`.
 
     Raises
     ------
@@ -306,7 +304,7 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, bounds:
         if few:
             kept.append(measurement)
     model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept), bounds)
+    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept), iterative)
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:

@@ -162,7 +162,7 @@ class _Read:
         self.frames = 0
         self.sums: dict[str, str] = {}
         self.prepared = preparation_of(next(iter(captures.manifests.values())), captures.path)
-        self.places = _places(self.prepared)
+        self.places = plane_offsets(self.prepared)
 
     @classmethod
     def of(cls, captures: KnownCaptures, aged: Mapping[str, Factors] | None = None) -> _Read:
@@ -245,8 +245,15 @@ def _differences_of_turned(shape: tuple[int, ...], how: Preparation) -> float:
     return float(seen.mean() / kept.mean())
 
 
-def _places(how: Preparation) -> dict[str, tuple[float, float]]:
-    """Place of each plane in its cell, as frames that were prepared so show it."""
+def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
+    """Place of each plane of a mosaic in its cell, down and to the right, in pixels of a plane, as frames that were
+    prepared so show it.
+
+    Parameters
+    ----------
+    how
+        what was done to the frames.
+    """
     cell = np.empty((2, 2), dtype=object)
     for name, place in planes_of(how.mosaic or BGGR).items():
         cell[place] = name

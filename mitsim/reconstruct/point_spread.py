@@ -11,11 +11,15 @@ have m + k - 1 scene pixels a side. Convolutions on a grid of that size wrap rou
 image is the middle of it, as large as the sensor; what is beside takes up light from outside, as a margin does. Under
 patterns the scene is theirs, and dark beyond.
 
-**How.** Conjugate gradients (Polak and Ribiere) in the pixels that bounds leave free, projected on the bounds after
-each step (Bertsekas, SIAM J. Control Optim. 20, 1982). |H|^2 spans seven decades, of which the first three lie in some
-hundred low frequencies. A division by |H|^2 + mu takes these out; and a start from the image of frames and light at
-half the size, made the same way, has them right. TV is taken for quadratic where slopes are below a thousandth of the
-peak over a pixel.
+**How.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each pass followed by a
+projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, of which the first three
+lie in some hundred low frequencies. A division by |H|^2 + mu takes these out; and a start from the image of frames and
+light at half the size, made the same way, has them right. TV is taken for quadratic where slopes are below a thousandth
+of the peak over a pixel, and in each pass for the quadratic that touches it.
+
+**When it ends.** Where the last half of all steps has lowered the objective by no more than ``tolerance`` of itself,
+and the quadratic promised no more of the last pass. What steps have gained bounds from below how far the objective was
+above its minimum before them (Strakos and Tichy, ETNA 13, 2002). So this is no proof; the next bound is.
 
 **How far above the minimum.** With r = sum of frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that
 pushes against bounds alone, and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the
@@ -33,7 +37,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,32 +45,30 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.convolution import check_lambda
-from mitsim.reconstruct.request import NONNEGATIVE, TV, Bounds
-from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import Prior
 
 Array = npt.NDArray[Any]
 
 _MU = 10.0
 """mu over the mean of |H|^2: of 10, 30 and 100 that which ends soonest on a measured diffuser, by up to a third."""
-_COARSE_STEPS, _LEAST_SIDE = 30, 32
-"""Steps at each of the smaller sizes, which take an eighth of the time of all, and sides that are not halved."""
+_COARSE_STEPS, _LEAST_SIDE = 60, 32
+"""Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
 _SMOOTH = 1e-3
 """Slope below which TV is quadratic, over the image's largest number."""
-_JUDGED_EACH, _TIGHTENED, _NEAR = 10, 2, 8.0
-"""Steps between two looks at the gap, those that its d takes, and how far above what is enough the bound with d = 0 may
-be for these to help, which lower it to a third: together a twentieth of the time."""
+_FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
+"""That of the first pass over this, and of each pass over that of the one before. Of none, 10 or 30, and 0.3 or 0.5,
+those that end soonest: with none, large weights take five times as many steps to within 5 %."""
+_PASS, _PASS_UNBOUND = 6, 12
+"""Steps of a pass, with bounds and without: of 1 to 12 those that end soonest. Fewer forget what was found, and more go
+where bounds do not let them."""
+_TIGHTENED = 2
+"""Steps of conjugate gradients for the d of a bound: they lower it to a third."""
 _NOTHING = 1e-300
 """In place of a zero that is divided by."""
 _FEWEST = 1e-12
-"""Shortest step, over the one that the quadratic calls for: below it nothing is gained in double precision."""
+"""Shortest part of a pass that is taken: below it nothing is gained in double precision."""
 _HUGE = 1e30
 """In place of an infinite bound, where a distance to it is multiplied."""
-_RIDGE, _WEIGHT = 50.0, 1.2
-"""Automatic lambda over the mean square of a scene pixel's light, by a frame's noise over its mean; and automatic
-weight of TV in units of the noise that the data term's gradient carries to a pixel. Chosen on photographs seen by a
-measured diffuser with noise of 0.1 to 8 % (benchmarks/point_spread.py)."""
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -151,7 +153,7 @@ class ShiftedLight:
         if self.patterns is not None or not smaller:
             return None
         rows, columns = self.sensor
-        return replace(self, psf=4 * halve(self.psf), sensor=(rows // 2, columns // 2))
+        return replace(self, psf=4 * reduce_frame(self.psf, 2), sensor=(rows // 2, columns // 2))
 
     def double(self, smaller: Array) -> Array:
         """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
@@ -213,11 +215,6 @@ class ShiftedLight:
         return (np.outer(row, column) for row in left for column in right)
 
 
-def halve(frame: Array) -> Array:
-    """(m // 2, m' // 2) means of 2 x 2 numbers of a ``frame`` (m, m')."""
-    return reduce_frame(frame, 2)
-
-
 def reduce_frame(frame: Array, reduce: int) -> Array:
     """Means of ``reduce`` x ``reduce`` numbers of a ``frame``; rows and columns that remain are left out."""
     rows, columns = (size // reduce for size in frame.shape)
@@ -230,7 +227,7 @@ def reduce_frame(frame: Array, reduce: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """An image X (n, n') of ``frames``, and what follows of it.
+    """An image X (n, n') of ``light``, and what follows of it.
 
     Attributes
     ----------
@@ -241,7 +238,6 @@ class _State:
     """
 
     light: ShiftedLight
-    frames: Array
     prior: Prior
     image: Array
     residual: Array
@@ -249,9 +245,7 @@ class _State:
 
     @cached_property
     def _slopes(self) -> tuple[Array, Array, Array]:
-        down, across = np.zeros_like(self.image), np.zeros_like(self.image)
-        np.subtract(self.image[1:], self.image[:-1], out=down[:-1])
-        np.subtract(self.image[:, 1:], self.image[:, :-1], out=across[:, :-1])
+        down, across = _slopes(self.image)
         return down, across, np.sqrt(down * down + across * across)
 
     @cached_property
@@ -276,25 +270,26 @@ class _State:
         return self.objective - self._flattened
 
     @cached_property
-    def bounded(self) -> tuple[Array, Array]:
-        """Q."""
-        down, across, length = self._slopes
-        scale = self.prior.weight / np.maximum(length, self.smooth)
-        return down * scale, across * scale
+    def _stiffness(self) -> Array:
+        """Weight over slopes: Q of slopes of 1."""
+        return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
 
     @cached_property
     def gradient(self) -> Array:
         """Of the smoothed objective."""
-        slope = self.light.correlate(self.residual)
-        if self.prior.ridge:
-            slope += self.prior.ridge * self.image
+        return self.light.correlate(self.residual) + self.bend(self.image)
+
+    def bend(self, direction: Array) -> Array:
+        """What the second derivative of ridge and TV makes of a ``direction``, with TV for the quadratic that touches
+        it at X; of X itself their gradient."""
+        bent = self.prior.ridge * direction
         if self.prior.weight:
-            down, across = self.bounded
-            slope[1:] += down[:-1]
-            slope[:-1] -= down[:-1]
-            slope[:, 1:] += across[:, :-1]
-            slope[:, :-1] -= across[:, :-1]
-        return slope
+            down, across = (each * self._stiffness for each in _slopes(direction))
+            bent[1:] += down[:-1]
+            bent[:-1] -= down[:-1]
+            bent[:, 1:] += across[:, :-1]
+            bent[:, :-1] -= across[:, :-1]
+        return bent
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
@@ -307,18 +302,6 @@ class _State:
             free &= (self.image < high) | (self.gradient > 0)
         return free
 
-    def curvature(self, direction: Array, seen: Array) -> float:
-        """Second derivative along a ``direction``, which the sensor sees as ``seen``, with TV for a quadratic of the
-        slopes at X."""
-        total = _dot(seen, seen) + self.prior.ridge * _dot(direction, direction)
-        if self.prior.weight:
-            length = np.maximum(self._slopes[2], self.smooth)
-            down, across = np.diff(direction, axis=0), np.diff(direction, axis=1)
-            bent = np.sum(down * down / length[:-1], dtype=np.float64)
-            bent += np.sum(across * across / length[:, :-1], dtype=np.float64)
-            total += self.prior.weight * float(bent)
-        return total
-
     def move(self, direction: Array, seen: Array, length: float) -> _State:
         """The state a ``length`` along a ``direction``, which the sensor sees as ``seen``, within the bounds."""
         image = self.image + self.precise(length) * direction
@@ -327,30 +310,44 @@ class _State:
         np.clip(image, *self.prior.bounds, out=image)
         return replace(self, image=image, residual=self.residual + self.light.image_of(image - self.image))
 
+    @cached_property
+    def _divided(self) -> Array:
+        light, prior = self.light, self.prior
+        total = np.square(np.abs(light.spectrum)) + _MU * float(np.square(light.psf).sum()) + prior.ridge
+        if prior.weight:
+            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
+            total += prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
+        return np.asarray(1 / total, light.precision)
+
+    def divide(self, image: Array) -> Array:
+        """Near what the inverse of the second derivative makes of an ``image`` under uniform light: a division in the
+        Fourier domain."""
+        if self.light.patterns is not None:
+            return image
+        rows, columns = image.shape
+        turned = fft.rfft2(image, self.light.grid) * self._divided
+        return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
+
     def precise(self, number: float) -> Any:
         """A ``number`` that leaves arrays in their precision."""
         return self.image.dtype.type(number)
 
     # ---- how far above the minimum
 
-    def gap(self, divide: _Division, enough: float = math.inf) -> float:
-        """Upper bound of P(X) - min P; the module's text says of which images. The closer to ``enough``, the more is
-        done for a tight one."""
+    def gap(self) -> float:
+        """Upper bound of P(X) - min P; the module's text says of which images."""
         variation = 0.0
         if self.prior.weight:
             length = self._slopes[2]
             held = length * length / np.maximum(length, self.smooth)
             variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
-        pressed, left = self._parts(self.gradient)
-        best = pressed + self._most_lowered(math.sqrt(_dot(left, left)))
-        if best <= enough or best > _NEAR * enough:
-            return max(variation, 0.0) + best
-        # Conjugate gradients on A^T A d = -g in the pixels that no bound holds.
         free, slope, direction, power = self.free, self.gradient, None, 1.0
+        pressed, left = self._parts(slope)
+        best = pressed + self._most_lowered(math.sqrt(_dot(left, left)))
         seen = np.zeros_like(self.residual)
         for _ in range(_TIGHTENED):
             left = np.where(free, slope, self.precise(0))
-            turned = divide(left) * free
+            turned = self.divide(left) * free
             before, power = power, _dot(left, turned)
             if power <= 0:
                 break
@@ -393,44 +390,49 @@ class _State:
         return slope * reach - ridge * reach**2 / 2
 
 
+def _slopes(image: Array) -> tuple[Array, Array]:
+    """Differences of an ``image`` (n, n') to the next row and column; 0 at the last."""
+    down, across = np.zeros_like(image), np.zeros_like(image)
+    np.subtract(image[1:], image[:-1], out=down[:-1])
+    np.subtract(image[:, 1:], image[:, :-1], out=across[:, :-1])
+    return down, across
+
+
 def _dot(first: Array, second: Array) -> float:
     return float(np.vdot(first, second))
-
-
-@dataclass(frozen=True, eq=False)
-class _Division:
-    """Near the inverse of the second derivative under uniform light: a division in the Fourier domain."""
-
-    light: ShiftedLight
-    prior: Prior
-    smooth: float
-
-    @cached_property
-    def _weight(self) -> Array:
-        light = self.light
-        power = np.square(np.abs(light.spectrum))
-        total = power + _MU * float(np.square(light.psf).sum()) + self.prior.ridge
-        if self.prior.weight and self.smooth:
-            rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in light.grid)
-            total += self.prior.weight / self.smooth * (rows[:, None] + columns[: total.shape[1]])
-        return np.asarray(1 / total, light.precision)
-
-    def __call__(self, image: Array) -> Array:
-        if self.light.patterns is not None:
-            return image
-        rows, columns = image.shape
-        turned = fft.rfft2(image, self.light.grid) * self._weight
-        return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
 
 
 # ---- Minimising ------------------------------------------------------------------------------------------------------
 
 
-def minimise(
-    light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float
-) -> tuple[Array, int, float, float]:
-    """The whole scene (n, n') whose relative gap is at most ``tolerance``, or that after ``iterations`` steps; the
-    steps, its objective, and its gap over that.
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """An image near the minimum, and how near.
+
+    Attributes
+    ----------
+    image
+        the whole scene (n, n').
+    iterations
+        steps at full size.
+    objective
+        P of the image.
+    fall
+        what the last half of the steps lowered the objective by, or what the last pass promised, if that is more; over
+        the objective.
+    gap
+        most that the objective is above its minimum, over the objective.
+    """
+
+    image: Array
+    iterations: int
+    objective: float
+    fall: float
+    gap: float
+
+
+def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float) -> Minimum:
+    """The image at which the fall is at most ``tolerance``, or that after ``iterations`` steps.
 
     Parameters
     ----------
@@ -439,10 +441,10 @@ def minimise(
     prior
         what is known of scenes.
     iterations, tolerance
-        most steps at full size, and the gap over the objective at which they end.
+        most steps at full size, and the fall at which they end.
     """
-    state, spent, relative = _descend(_start(light, frames, prior), iterations, tolerance)
-    return state.image, spent, state.objective, relative
+    state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
+    return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
 
 
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
@@ -452,172 +454,68 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
     if smaller:
         # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
         half = replace(prior, weight=prior.weight / 2)
-        found = _descend(_start(smaller, np.stack([halve(each) for each in frames]), half), _COARSE_STEPS, 0.0)[0]
+        found = _descend(
+            _start(smaller, np.stack([reduce_frame(each, 2) for each in frames]), half), _COARSE_STEPS, 0.0
+        )[0]
         image = light.double(found.image)
     else:
         image = np.zeros(light.scene, light.precision)
     image = np.clip(image, low, high)
-    start = _State(light, frames, prior, image, light.image_of(image) - frames, 0.0)
+    start = _State(light, prior, image, light.image_of(image) - frames, 0.0)
     if prior.weight and not smaller:
         # Least squares first: they tell how bright the scene is.
         unweighted = replace(start, prior=replace(prior, weight=0.0))
-        found = _descend(unweighted, _COARSE_STEPS // 3, 0.0)[0]
+        found = _descend(unweighted, 2 * _PASS, 0.0)[0]
         start = replace(found, prior=prior)
     peak = float(np.abs(start.image).max())
     return replace(start, smooth=_SMOOTH * peak or _SMOOTH)
 
 
 def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
-    """The state after at most so many steps, their number, and its relative gap (inf where ``tolerance`` is 0)."""
-    divide = _Division(state.light, state.prior, state.smooth)
+    """The state after at most so many steps, their number, and its fall."""
+    sharp, most = state.smooth, _PASS if state.prior.bounded else _PASS_UNBOUND
+    state = replace(state, smooth=_FIRST_SMOOTH * sharp)
+    spent, fall, objectives = 0, math.inf, [(0, state.objective)]
+    while spent < iterations and fall > tolerance:
+        direction, seen, promised = _pass(state, min(most, iterations - spent))
+        length, following = 1.0, state.move(direction, seen, 1.0)
+        while following.smoothed > state.smoothed and length > _FEWEST:
+            length /= 2
+            following = state.move(direction, seen, length)
+        still = promised <= 0 or length <= _FEWEST
+        ended = still and state.smooth == sharp
+        if not still:
+            state, spent = following, min(spent + most, iterations)
+            objectives.append((spent, state.objective))
+        state = replace(state, smooth=max(_SHARPENED * state.smooth, sharp))
+        if ended or (len(objectives) > 2 and state.smooth == sharp):
+            earlier = next(objective for steps, objective in reversed(objectives) if 2 * steps <= spent)
+            fall = max(earlier - state.objective, promised) / max(state.objective, _NOTHING)
+        if ended:
+            break
+    return state, spent, fall
 
-    def judge() -> float:
-        objective = max(state.objective, _NOTHING)
-        return state.gap(divide, tolerance * objective) / objective
 
-    direction: Array | None = None
-    earlier, power = state.gradient, 1.0
-    spent, relative = 0, math.inf
-    while spent < iterations:
-        spent += 1
-        free = state.free
-        pull = np.where(free, state.gradient, state.precise(0))
-        turned = divide(pull)
-        turned *= free
-        before, power = power, _dot(pull, turned)
+def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
+    """Where conjugate gradients lead in the pixels that no bound holds, what the sensor sees of it, and what it lowers
+    the quadratic by that touches the objective in ``state``."""
+    free = state.free
+    left = np.where(free, state.gradient, state.precise(0))
+    total, seen = np.zeros_like(left), np.zeros_like(state.residual)
+    direction, power, promised = np.zeros_like(left), math.inf, 0.0
+    for step in range(steps):
+        turned = state.divide(left) * free
+        before, power = power, _dot(left, turned)
         if power <= 0:
             break
-        if direction is None:
-            direction = -turned
-        else:
-            kept = max((power - _dot(earlier, turned)) / before, 0.0)
-            direction = state.precise(kept) * direction * free - turned
-            if _dot(direction, pull) >= 0:
-                direction = -turned
-        earlier = pull
-        seen = state.light.image_of(direction)
-        step = -_dot(pull, direction) / state.curvature(direction, seen)
-        least, following = _FEWEST * step, state.move(direction, seen, step)
-        while following.smoothed > state.smoothed and step > least:
-            step /= 2
-            following = state.move(direction, seen, step)
-        stuck = step <= least
-        if not stuck:
-            state = following
-        elif _dot(direction, turned) == -_dot(turned, turned):
-            break
-        else:
-            direction = None
-        if tolerance and (spent % _JUDGED_EACH == 0 or spent == iterations):
-            relative = judge()
-            if relative <= tolerance:
-                break
-    if tolerance and not math.isfinite(relative):
-        relative = judge()
-    return state, spent, relative
-
-
-# ---- Weights from the frames themselves ------------------------------------------------------------------------------
-
-
-def frame_noise(frame: Array) -> float:
-    """Standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer, Comput. Vis.
-    Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3 pixels."""
-    if min(frame.shape) < 3:
-        return 0.0
-    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
-    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
-    return float(np.median(np.abs(bent))) / 6 / 0.6745
-
-
-def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
-    """Lambda for one frame under uniform light: proportional to its noise over its mean. MitsimError for patterns, and
-    for a frame without light.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and the frame (1, m, m') that it saw.
-    """
-    if light.patterns is not None:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    mean = float(frames.mean())
-    if mean <= 0:
-        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
-    return _RIDGE * frame_noise(frames[0]) / mean * light.column_power
-
-
-def automatic_weight(light: ShiftedLight, frames: Array) -> float:
-    """Weight of TV: as :func:`mitsim.reconstruct.solvers.automatic_weight`, with the noise that ``frames`` (K K', m,
-    m') of ``light`` tell by :func:`frame_noise`, and a constant of its own."""
-    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
-    return _WEIGHT * noise * math.sqrt(light.column_power)
-
-
-# ---- The image -------------------------------------------------------------------------------------------------------
-
-
-def solve_point_spread(
-    light: ShiftedLight,
-    frames: Array,
-    method: str,
-    lam: float | Literal["auto"] = "auto",
-    bounds: Bounds | None = None,
-    iterations: int = 300,
-    tolerance: float = 0.05,
-) -> Solution:
-    """The image of all frames.
-
-    Parameters
-    ----------
-    light
-        the camera under its patterns.
-    frames
-        (K K', m, m') row-major over patterns (i, j).
-    method
-        ``tikhonov``, ``nonnegative`` or ``tv``.
-    lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`automatic_ridge`, :func:`automatic_weight`.
-    bounds
-        least and largest number; None: 0 and inf of ``nonnegative``, any of the others.
-    iterations, tolerance
-        it ends where the gap is at most ``tolerance`` of the objective, or after so many steps.
-
-    Raises
-    ------
-    MitsimError
-        for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
-    """
-    if frames.shape != (light.count, *light.sensor) or not np.isfinite(frames).all():
-        raise MitsimError(
-            f"frames of shape {frames.shape}: give {light.count} of {light.sensor[0]} x {light.sensor[1]} finite "
-            "numbers"
-        )
-    if iterations < 1:
-        raise MitsimError(f"iterations are {iterations}; give at least 1")
-    if lam == "auto":
-        lam = automatic_weight(light, frames) if method == TV else automatic_ridge(light, frames)
-    lam = check_lambda(lam)
-    known = bounds or ((0.0, math.inf) if method == NONNEGATIVE else Prior.bounds)
-    prior = Prior(weight=lam, bounds=known) if method == TV else Prior(ridge=lam, bounds=known)
-    frames = frames.astype(light.precision)
-    energy = _dot(frames, frames)
-    scene, spent, objective, gap = minimise(light, frames, prior, iterations, tolerance)
-    residual = light.image_of(scene) - frames
-    figures = f"{spent} iterations, objective {objective:.4g}."
-    if gap <= tolerance:
-        sentence = f"Solved: {gap:.0e} of the objective or less above its minimum"
-        status = Status(Verdict.SOLVED, sentence, "", figures)
-    else:
-        sentence = f"Not converged: after {spent} iterations the objective may be {gap:.1e} of itself above its minimum"
-        remedy = "take a larger lambda, or allow more iterations"
-        status = Status(Verdict.NOT_CONVERGED, sentence, remedy, figures)
-    return Solution(
-        image=np.asarray(scene[light.window], np.float64),
-        lam=lam,
-        residual=math.sqrt(_dot(residual, residual) / energy) if energy else 0.0,
-        status=status,
-        iterations=spent,
-        objective=objective,
-        relative_gap=gap,
-    )
+        direction = state.precise(power / before) * direction - turned
+        ahead, bent = state.light.image_of(direction), state.bend(direction)
+        length = power / max(_dot(ahead, ahead) + _dot(direction, bent), _NOTHING)
+        total += state.precise(length) * direction
+        seen += state.precise(length) * ahead
+        promised += length * power / 2
+        if step < steps - 1:
+            bent += state.light.correlate(ahead)
+            bent *= free
+            left += state.precise(length) * bent
+    return total, seen, promised

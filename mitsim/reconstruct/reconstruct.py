@@ -279,7 +279,7 @@ def reconstruct(
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
         :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
-        bounds: :func:`reconstruct_request`) or ``tv`` (least total variation).
+        bounds, and iterations: :func:`reconstruct_request`) or ``tv`` (least total variation).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -328,7 +328,7 @@ def reconstruct_request(
     clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
-        data = accumulate(shots, factors, method, request.bounds)
+        data = accumulate(shots, factors, method, **request.iterative)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
@@ -426,7 +426,7 @@ def _without_defects(
 
     def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
         rest = defects.left_out(data)
-        without = accumulate(rest, data.factors, data.method, data.bounds)
+        without = accumulate(rest, data.factors, data.method, **data.iterative)
         return rest, without, without.solution(lam)
 
     found, now, without = None, misfit, data

@@ -44,7 +44,9 @@ class ImageRequest:
         calibrated one.
     bounds
         least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
-        ``tv``.
+        ``tv``, by a point spread function 0 and inf of both.
+    iterations
+        most steps, by ``nonnegative`` and ``tv``; None: the method's own.
     """
 
     lam: float | Literal["auto"] = "auto"
@@ -53,6 +55,7 @@ class ImageRequest:
     margin: int = 0
     depth_range: tuple[float, float] | None = None
     bounds: Bounds | None = None
+    iterations: int | None = None
 
     def __post_init__(self) -> None:
         lam: float | str = self.lam
@@ -68,6 +71,12 @@ class ImageRequest:
             self._check_range(self.depth_range)
         if self.bounds is not None:
             self._check_bounds(self.bounds)
+        steps: Any = self.iterations
+        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
+            raise ArgumentError("iterations", f"{steps}: give a whole number, at least 1")
+        for name, value in self.iterative.items():
+            if method not in (NONNEGATIVE, TV):
+                raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
         if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
@@ -90,8 +99,17 @@ class ImageRequest:
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
         if not (real and ends[0] < ends[1] and ends[0] < math.inf and ends[1] > -math.inf):
             raise ArgumentError("bounds", f"{ends}: give two numbers, the smaller one first")
-        if self.method not in (NONNEGATIVE, TV):
-            raise ArgumentError("bounds", f"{ends}: come with method {NONNEGATIVE} or {TV}; {self.method} has none")
+
+    @property
+    def iterative(self) -> dict[str, Any]:
+        """Those of ``bounds`` and ``iterations`` that are given, as methods by iterations take them."""
+        given = {"bounds": self.bounds, "iterations": self.iterations}
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """What of an image's inputs JSON holds for these."""
+        return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
     def looks_for_depth(self) -> bool:
@@ -124,7 +142,7 @@ class ImageRequest:
         }
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
-        asked |= {} if self.bounds is None else {"bounds": plain_bounds(self.bounds)}
+        asked |= self.plain
         return {**asked, "margin": self.margin} if self.margin else asked
 
 

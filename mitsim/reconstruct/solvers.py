@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -136,12 +136,8 @@ def solve_tv(
         for missing frames, another weight, or no iterations.
     """
     problem = prepared.problem(frames)
-    if weight == "auto":
-        weight = automatic_weight(problem)
-    if isinstance(weight, str) or not (np.isfinite(weight) and weight >= 0):
-        raise MitsimError(f"TV weight is {weight!r}; give a finite number of at least 0, or auto")
-    prior = Prior(weight=float(weight), bounds=bounds or Prior.bounds)
-    return _solve(prepared, problem, prior, iterations, tolerance)
+    lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
+    return _solve(prepared, problem, Prior(weight=lam, bounds=bounds or Prior.bounds), iterations, tolerance)
 
 
 def solve_nonnegative(
@@ -171,9 +167,7 @@ def solve_nonnegative(
         for missing frames, another lambda, or no iterations.
     """
     problem = prepared.problem(frames)
-    if lam == "auto":
-        lam = automatic_lambda(problem)
-    ridge = check_lambda(lam)
+    ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
     return _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
 
 
@@ -407,7 +401,7 @@ class Solver(Protocol):
         ...
 
     def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
         """The image of one scene.
 
@@ -417,8 +411,8 @@ class Solver(Protocol):
             what :meth:`init` gives, and all frames, added up.
         lam
             lambda; what ``auto`` does is the solver's own.
-        bounds
-            least and largest number of the image, of solvers that heed them; None: the solver's own.
+        **iterative
+            what was asked for of ``bounds`` and ``iterations``; a solver that iterates has these arguments.
         """
         ...
 
@@ -433,7 +427,7 @@ class Tikhonov:
         return prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
 
     def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
         """The image of ``frames``.
 
@@ -443,8 +437,8 @@ class Tikhonov:
             what :meth:`init` gives, and all frames, added up.
         lam
             lambda; ``auto``: :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
-        bounds
-            None: a closed form knows no bounds.
+        **iterative
+            nothing: a closed form has neither bounds nor steps.
         """
         return prepared.solve(frames, lam)
 
@@ -465,16 +459,16 @@ class Nonnegative(Tikhonov):
     linear = False
 
     def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``: :func:`solve_nonnegative`.
+        """The image of ``frames``.
 
         Parameters
         ----------
-        prepared, frames, lam, bounds
-            what :meth:`init` gives, all frames, added up, lambda, and ends of the image's numbers; None: 0 and inf.
+        prepared, frames, lam, **iterative
+            as :func:`solve_nonnegative` takes them.
         """
-        return solve_nonnegative(prepared, frames, lam, bounds=bounds)
+        return solve_nonnegative(prepared, frames, lam, **iterative)
 
 
 class TotalVariation(Tikhonov):
@@ -483,16 +477,16 @@ class TotalVariation(Tikhonov):
     linear = False
 
     def compute(
-        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], bounds: Bounds | None = None
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``: :func:`solve_tv`.
+        """The image of ``frames``.
 
         Parameters
         ----------
-        prepared, frames, lam, bounds
-            what :meth:`init` gives, all frames, added up, the weight, and ends of the image's numbers; None: any.
+        prepared, frames, lam, **iterative
+            as :func:`solve_tv` takes them.
         """
-        return solve_tv(prepared, frames, lam, bounds=bounds)
+        return solve_tv(prepared, frames, lam, **iterative)
 
 
 @dataclass(frozen=True)

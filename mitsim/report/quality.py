@@ -67,7 +67,8 @@ def reconstruct(
     job
         its clock.
     **options
-        ``method``, ``focus``, ``margin``, ``depth_range`` and ``bounds``, as there.
+        ``method``, ``focus``, ``margin``, ``depth_range``, ``bounds`` and ``iterations``, as of
+        :class:`mitsim.reconstruct.request.ImageRequest`.
     """
     started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
     with job.clock.stage("read"):
@@ -114,7 +115,7 @@ def reconstruct_psf(
     job
         its clock.
     **options
-        ``lam``, ``method`` and ``bounds``, as there.
+        ``lam``, ``method``, ``bounds`` and ``iterations``, as there.
     """
     from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
 

@@ -18,13 +18,13 @@ from scipy import ndimage
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.imagelist import BGGR, Preparation, Wanted, planes_of
+from mitsim.core.imagelist import BGGR, PLANES, Preparation, Wanted, planes_of
 from mitsim.core.images import Numbers, read_image
 from mitsim.core.manifests import Digital
-from mitsim.core.prepare import Preparer, factor_of
+from mitsim.core.prepare import CommonFactor, Preparer
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
-from mitsim.reconstruct.known_pictures import PLANES
+from mitsim.reconstruct.known_pictures import plane_offsets
 from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.sensor.chain import expose
@@ -50,6 +50,8 @@ class Measured:
     ----------
     capture, plane
         names of both.
+    offset
+        of the plane's pixels, down and to the right [pixels].
     level
         (m, m') the plane, turned and cut [DN].
     noise
@@ -62,6 +64,7 @@ class Measured:
 
     capture: str
     plane: str
+    offset: tuple[float, float]
     level: FloatArray
     noise: FloatArray
     scene: FloatArray
@@ -80,7 +83,7 @@ class Measured:
 
     def exposure(self, frame: FloatArray | None = None, group: int = 0) -> Exposure:
         """What a fit of codes takes: the frame, or another ``frame`` of the plane; ``group``: the picture's number."""
-        return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, PLANES[self.plane])
+        return Exposure(self.scene, self.frame if frame is None else frame, group, self.plane, self.offset)
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ class Recipe:
         numbers = read_image(path, Wanted("capture", mosaic=self.how.mosaic))
         if numbers.shape != _RAW:
             raise MitsimError(f"capture {path}: is {_size(numbers)}; give the raw frame, {_RAW[0]} x {_RAW[1]}")
-        factor, largest = factor_of(numbers) or 1, 2**self.bits - 1
+        factor, largest = self._shift(numbers), 2**self.bits - 1
         if not 0 <= numbers.min() < numbers.max() <= factor * largest:
             raise MitsimError(
                 f"capture {path}: holds {numbers.min():g} to {numbers.max():g}, no light in numbers of {self.bits} "
@@ -114,6 +117,11 @@ class Recipe:
             )
         places = planes_of(self.how.mosaic or BGGR)
         return {name: np.asarray(numbers[places[name][0] :: 2, places[name][1] :: 2] / factor) for name in PLANES}
+
+    def _shift(self, numbers: Numbers) -> int:
+        common = CommonFactor()
+        common.add(numbers)
+        return common.shift(2**self.bits - 1)
 
     def place(self, plane: FloatArray) -> FloatArray:
         """A whole ``plane``, or noise alone, turned and cut as a frame."""
@@ -151,13 +159,14 @@ def read_captures(files: Mapping[str, tuple[Path, Path]], seed: int) -> list[Mea
     """
     recipe, found = Recipe.load(), []
     raw = {name: recipe.planes(frame) for name, (frame, _) in files.items()}
+    offsets = plane_offsets(recipe.how)
     scenes = {name: recipe.scene(image) for name, (_, image) in files.items()}
     for plane in PLANES:
         gain, dark = noise_of([planes[plane] for planes in raw.values()])
         for name, planes in raw.items():
             noise = recipe.place(draw_noise(planes[plane], gain, dark, seed, f"{name} {plane}"))
             scene, level = scenes[name][..., "rgb".index(plane[0])], recipe.place(planes[plane])
-            found.append(Measured(name, plane, level, centre_frame(noise), scene, gain, dark))
+            found.append(Measured(name, plane, offsets[plane], level, centre_frame(noise), scene, gain, dark))
     return found
 
 

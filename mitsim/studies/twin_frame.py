@@ -21,7 +21,6 @@ from mitsim.api.bench import open_bench
 from mitsim.core.arrays import FloatArray
 from mitsim.core.images import grey_png
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.known_pictures import PLANES
 from mitsim.reconstruct.shifted_codes import Codes, Shape, fit_codes
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies.twin_capture import EXPOSURE_S, PITCH_MM, Measured
@@ -83,7 +82,7 @@ def render(measured: Measured, codes: Codes, folder: Path, variant: str) -> Floa
     # The sensor's middle sees the scene's at this number of the code; the drawing's middle is the axis.
     beside = [
         ((len(line) - 1) / 2 - ((side.sensor - 1 + side.scale * (side.scene - 1)) / 2 + offset)) * feature
-        for line, side, offset in zip(lines, codes.sides, PLANES[measured.plane], strict=True)
+        for line, side, offset in zip(lines, codes.sides, measured.offset, strict=True)
     ]
     height, width = (side.scale * feature / _MASK_MM * side.scene / 2 * _SHEET_MM for side in codes.sides)
     half = _WIDER * max(height, width)
@@ -206,7 +205,7 @@ def compare(measured: Measured, codes: Codes, electrons: FloatArray, other: Floa
         scene of another capture.
     """
     frame, simulated = measured.frame, centre_frame(electrons)
-    left, right = codes.factors(PLANES[measured.plane], measured.plane)
+    left, right = codes.factors(measured.offset, measured.plane)
     model = left @ measured.scene @ right.T
     scale, own = (_dot(each, simulated) / _energy(simulated) for each in (frame, model))
     expected, gain = scale * simulated, scale / own

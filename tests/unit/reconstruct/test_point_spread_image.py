@@ -107,7 +107,7 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
 
     psf = "--psf", str(tmp_path / "psf.npy")
     status, found = call(*psf, "--method", "nonnegative", "-o", str(tmp_path / "image"))
-    assert status == 0 and found["rank"] is None and found["objective"] > 0 and 0 <= found["relative_gap"] <= 0.05
+    assert status == 0 and found["rank"] is None and found["objective"] > 0 and found["relative_gap"] >= 0
     image = read_frame(tmp_path / "image" / "image.exr")[0]["reflectance"]
     shown = read_image(tmp_path / "image" / "image.png")
     assert np.abs(shown - 255 * lightness(image / image.max())).max() < 0.51, "rounded"
@@ -115,10 +115,13 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
     result = json.loads((tmp_path / "image" / "result.json").read_text())
     assert result["inputs"].keys() == {"run", "psf", "reduce", "lambda", "method"} and result["iterations"] > 0
     status, found = call(*psf, "--method", "tv", "--bounds", "0:", "--lambda", "1e-9", "-o", str(tmp_path / "tv"))
-    assert status == (0 if found["relative_gap"] <= 0.05 else 1)
     assert (status == 1) == str(found["status"]).startswith("Not converged")
     assert json.loads((tmp_path / "tv" / "result.json").read_text())["inputs"]["bounds"] == [0.0, None]
+    status, found = call(*psf, "--method", "tv", "--iterations", "6", "-o", str(tmp_path / "short"))
+    assert status == 1 and found["iterations"] == 6 and found["status"].startswith("Not converged")
+    assert json.loads((tmp_path / "short" / "result.json").read_text())["inputs"]["iterations"] == 6
     refused = [
+        (*psf, "--iterations", "9"),
         (),
         ("--reduce", "2"),
         (*psf, "--calibration", "x"),
@@ -137,5 +140,6 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
 
 def test_verdicts_of_the_solver_are_those_of_the_image() -> None:
     shots, _ = capture("uniform", (60, 62))
-    found = ms.reconstruct_psf(shots, light_of_a_point(), lam=1e-12, method="tv", bounds=(0.0, np.inf))
-    assert (found.status.verdict is Verdict.SOLVED) == (found.relative_gap <= 0.05)
+    for iterations, verdict in ((300, Verdict.SOLVED), (6, Verdict.NOT_CONVERGED)):
+        found = ms.reconstruct_psf(shots, light_of_a_point(), method="tv", iterations=iterations)
+        assert found.status.verdict is verdict and found.iterations <= iterations and found.image.min() >= 0

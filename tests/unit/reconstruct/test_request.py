@@ -64,3 +64,10 @@ def test_bounds_are_two_numbers_of_a_method_that_heeds_them() -> None:
         with pytest.raises(ArgumentError, match="the smaller one first"):
             ImageRequest(method="tv", bounds=wrong)  # type: ignore[arg-type]
     assert plain_bounds((0.0, math.inf)) == [0.0, None]
+    asked = ImageRequest(method="tv", bounds=(0.0, math.inf), iterations=7)
+    assert asked.iterative == {"bounds": (0.0, math.inf), "iterations": 7} and asked.plain["bounds"] == [0.0, None]
+    for iterations in (0, -1, 2.5, True, "7"):
+        with pytest.raises(ArgumentError, match="give a whole number, at least 1"):
+            ImageRequest(method="tv", iterations=iterations)  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="tikhonov has none"):
+        ImageRequest(iterations=7)

@@ -13,7 +13,8 @@ from scipy import ndimage
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.known_pictures import PLANES
+from mitsim.core.imagelist import Preparation
+from mitsim.reconstruct.known_pictures import plane_offsets
 from mitsim.reconstruct.shifted_codes import Codes, Side
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies.twin_capture import Learned, Measured, Recipe, draw_noise, noise_of, read_captures
@@ -25,6 +26,7 @@ GAIN, LIGHT = 0.1, 600.0
 """DN an electron, and mean light [DN]: as the real captures'."""
 SIDES = float(np.sqrt(np.prod(SENSOR)))
 PLANE = "gb"
+OFFSETS = plane_offsets(Preparation(mosaic="BGGR", channel="all"))
 
 
 def smooth(draws: np.random.Generator, *shape: int, width: float = 1.5) -> FloatArray:
@@ -37,7 +39,7 @@ def codes_of(values: tuple[FloatArray, FloatArray]) -> Codes:
     left, right = (Side(sensor, SCENE, scale, 1, True) for sensor, scale in zip(SENSOR, SCALES, strict=True))
     nothing = 0.0, 0.0
     numbers = values[0][None], values[1][None]
-    return Codes((left, right), numbers, dict.fromkeys(PLANES, 1.0), np.zeros(1), 1.0, nothing, nothing, nothing)
+    return Codes((left, right), numbers, dict.fromkeys(OFFSETS, 1.0), np.zeros(1), 1.0, nothing, nothing, nothing)
 
 
 def made_codes(seed: int = 3) -> Codes:
@@ -48,14 +50,16 @@ def made_codes(seed: int = 3) -> Codes:
 
 
 def frame_of(codes: Codes, scene: FloatArray) -> FloatArray:
-    left, right = codes.factors(PLANES[PLANE], PLANE)
+    left, right = codes.factors(OFFSETS[PLANE], PLANE)
     return np.asarray(left @ scene @ right.T)
 
 
 def made(seed: int, codes: Codes) -> Measured:
     """A frame of a made scene without noise."""
     scene = np.clip(0.3 + 0.3 * smooth(np.random.default_rng(seed), SCENE, SCENE, width=1.0), 0, 1)
-    return Measured(f"fc_{seed}", PLANE, LIGHT + frame_of(codes, scene), np.zeros(SENSOR), scene, GAIN, 0.0)
+    return Measured(
+        f"fc_{seed}", PLANE, OFFSETS[PLANE], LIGHT + frame_of(codes, scene), np.zeros(SENSOR), scene, GAIN, 0.0
+    )
 
 
 def capture(folder: Path, values: np.ndarray, name: str = "fc_6") -> tuple[Path, Path]:
@@ -151,7 +155,7 @@ def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path, plane: s
     codes = made_codes()
     measured = replace(made(0, codes), plane=plane)
     electrons = render(measured, codes, tmp_path, DEFAULT_VARIANT)
-    left, right = codes.factors(PLANES[plane], plane)
+    left, right = codes.factors(OFFSETS[plane], plane)
     model = left @ measured.scene @ right.T
     seen = centre_frame(electrons)
     seen *= np.vdot(model, seen) / np.vdot(seen, seen)
@@ -178,7 +182,7 @@ def parts_of(measured: Measured, codes: Codes, frame: FloatArray, noise: float, 
 def beyond_scenes(codes: Codes, draws: np.random.Generator) -> FloatArray:
     """(m, m') what no scene makes behind a mask of ``codes``, of energy 1."""
     found = smooth(draws, *SENSOR, width=0.5)
-    for axis, factor in enumerate(codes.factors(PLANES[PLANE], PLANE)):
+    for axis, factor in enumerate(codes.factors(OFFSETS[PLANE], PLANE)):
         basis = np.linalg.qr(factor)[0]
         found = np.moveaxis(np.tensordot(np.eye(SENSOR[axis]) - basis @ basis.T, found, (1, axis)), 0, axis)
     found = centre_frame(found)
