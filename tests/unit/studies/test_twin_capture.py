@@ -153,7 +153,7 @@ def test_a_rendered_frame_is_the_product_of_its_factors(tmp_path: Path, plane: s
     the coded part, which is some per cent of all light. (Planted: the mask beside its place by the other sign; the
     plane's half pixel left out: 0.2.)"""
     codes = made_codes()
-    measured = replace(made(0, codes), plane=plane)
+    measured = replace(made(0, codes), plane=plane, offset=OFFSETS[plane])
     electrons = render(measured, codes, tmp_path, DEFAULT_VARIANT)
     left, right = codes.factors(OFFSETS[plane], plane)
     model = left @ measured.scene @ right.T
