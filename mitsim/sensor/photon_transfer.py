@@ -27,7 +27,7 @@ _STEPS = (1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0)
 """Steps by which slopes are found, as parts of a number: where moments change by some of their errors."""
 _LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
 """The same in the number's unit, at least: also where it is 0."""
-_STARTS = (0.9, 0.8, 0.7, 0.6, 0.5)
+_STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
 _TRIED, _SOLVED = 10, 25
 """Evaluations in which another beginning must be better, and those of a solution; chosen: a camera of 8 bits that no
@@ -231,6 +231,11 @@ class _Solution:
         )
 
     @property
+    def worse(self) -> float:
+        """Chi-square over its degrees of freedom, of all or of lit sets' variances: readings of one code always fit."""
+        return max(self.chi_square / max(self.freedom, 1), self.variance_chi_square / max(self.lit - 2, 1))
+
+    @property
     def light_fits(self) -> bool:
         """Whether light is off by no more than is known."""
         return self.light_chi_square <= _FITS * max(self.lit - 2, 1)
@@ -239,7 +244,7 @@ class _Solution:
         """The camera, under such ``light``."""
         problem = self.problem
         found = Transfer(
-            self.values, self.covariance * max(self.chi_square / max(self.freedom, 1), 1.0), problem.saturation_dn,
+            self.values, self.covariance * max(self.worse, 1.0), problem.saturation_dn,
             problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full((len(problem.used), 2), np.nan),
         )  # fmt: skip
         found.off[problem.used] = self.rest[: 2 * len(problem.light)].reshape(2, -1).T
@@ -356,16 +361,20 @@ class _Problem:
 
     def begin(self) -> _Solution:
         """The fit of a linear camera, from other numbers too where the first ones lead nowhere: of few codes, variances
-        rise and fall with the mean."""
-        best = self.solve(bend=False, lamp=self.lamp)
+        rise and fall with the mean, and several cameras explain them where no dark noise is seen."""
+        found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.variance.min() < HIDDEN
         for part in _STARTS if self.variance.min() < _DITHERED else ():
-            if best.chi_square <= _FITS * max(best.freedom, 1):
+            best = min(found, key=lambda each: each.chi_square)
+            if best.worse <= _FITS and not hidden:
                 break
             start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
-            trial = replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED)
-            if trial.chi_square < best.chi_square:
-                best = replace(self, start=trial.values).solve(bend=False, lamp=self.lamp)
-        return best
+            found.append(replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED))
+            if found[-1].chi_square < best.chi_square:
+                found.append(replace(self, start=found[-1].values).solve(bend=False, lamp=self.lamp))
+        best = min(found, key=lambda each: each.chi_square)
+        others = [each.values - best.values for each in found if each.chi_square < best.chi_square + _TELLS]
+        off = max(others, key=lambda other: abs(float(other[0])))
+        return replace(best, covariance=best.covariance + np.outer(off, off))
 
     def settle(self, solution: _Solution) -> _Solution:
         """The ``solution`` with the lamp's scatter as large as light is off."""
