@@ -142,8 +142,7 @@ def test_standard_errors_are_those_of_repeated_sessions(tmp_path: Path, error: f
 
 
 def test_a_mask_that_has_moved_by_features_is_found(tmp_path: Path) -> None:
-    """By two of them, 120 um; what comes into view at the sensor's edge is flagged. (Planted: a search that begins
-    where the mask was.)"""
+    """By two of them, 120 um; what comes into view at the sensor's edge is flagged."""
     aged = Aged(tmp_path, 2, {**STILL, "mask_rows_um": 120.0})
     factors = aged.mended()
     assert factors.status.verdict == Verdict.NOT_SEPARABLE
