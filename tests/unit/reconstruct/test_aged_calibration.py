@@ -215,8 +215,8 @@ def test_a_mask_that_has_come_off_is_flagged(tmp_path: Path) -> None:
 
 
 def with_camera(folder: Path) -> None:
-    manifest = json.loads((folder / "run_0" / MANIFEST).read_text())
-    (folder / "run_0" / MANIFEST).write_text(json.dumps({**manifest, "camera": {"name": "another"}}))
+    for place in (folder / f"run_{number}" / MANIFEST for number in (0, 1)):
+        place.write_text(json.dumps({**json.loads(place.read_text()), "camera": {"name": "another"}}))
 
 
 def turned(folder: Path) -> None:
@@ -244,7 +244,7 @@ def listing(**more: object) -> Callable[[Path], None]:
     [
         (turned, "pictures lie turned of how images by the calibration lie"),
         (transposed, "pictures lie transposed of how images by the calibration lie"),
-        (with_camera, "of another camera|name"),
+        (with_camera, "name is .*another.*calibrate this camera"),
         (listing(orientation="upright"), "orientation is of codes.*leave orientation out"),
         (listing(centre=True), "centre is True, but False in calibration"),
         (listing(known=[{"run": "small", "picture": "small/truth.exr"}]), "16 scene pixels.*has 32"),
