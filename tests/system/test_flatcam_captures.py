@@ -58,8 +58,7 @@ def half(row: int, column: int) -> str:
 
 def test_half_of_one_plane_tells_the_code_and_where_the_mask_is(call: Callable[..., Any], tmp_path: Path) -> None:
     """Correlations were 0.933 and 0.963. Then the capture that was not learned from, and the same one a pixel further
-    down and two to the right: the difference of the two fits is that, to 0.01 pixels of the frame that they share.
-    (Planted: factors of the picture as it stands; the shadow's way of the wrong sign.)"""
+    down and two to the right: the difference of the two fits is that, to 0.01 pixels of the frame that they share."""
     runs = {number: captured(number, call, tmp_path, channel='"gb"', crop=half(80, 100)) for number in (6, 7)}
     further = captured(7, call, tmp_path, channel='"gb"', crop=half(81, 102))
     green = {"colour": "green"}
