@@ -18,8 +18,8 @@ light at half the size, made the same way, has them right. TV is taken for quadr
 of the peak over a pixel, and in each pass for the quadratic that touches it.
 
 **When it ends.** Where the last half of all steps has lowered the objective by no more than ``tolerance`` of itself,
-and the quadratic promised no more of the last pass. What steps have gained bounds from below how far the objective was
-above its minimum before them (Strakos and Tichy, ETNA 13, 2002). So this is no proof; the next bound is.
+and the quadratic promised no more of the last pass. What steps have gained is the least that the objective was above
+its minimum before them (Strakos and Tichy, ETNA 13, 2002), so this is no proof; the next bound is.
 
 **How far above the minimum.** With r = sum of frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that
 pushes against bounds alone, and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the
@@ -50,7 +50,7 @@ from mitsim.reconstruct.solvers import Prior
 Array = npt.NDArray[Any]
 
 _MU = 10.0
-"""mu over the mean of |H|^2: of 10, 30 and 100 that which ends soonest on a measured diffuser, by up to a third."""
+"""mu over the mean of |H|^2: of 0.3 to 100 none ends sooner in all cases, on a measured diffuser."""
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
 """Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
 _SMOOTH = 1e-3
