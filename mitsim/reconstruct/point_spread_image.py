@@ -26,7 +26,7 @@ from mitsim.reconstruct.solvers import Prior
 _RIDGE, _WEIGHT = 50.0, 1.2
 """Automatic lambda over the mean square of a scene pixel's light, by a frame's noise over its mean; and automatic
 weight of TV in units of the noise that the data term's gradient carries to a pixel. Chosen on photographs seen by a
-measured diffuser with noise of 0.1 to 8 % (benchmarks/point_spread.py)."""
+measured diffuser with noise of 0.1 to 8 %; losses on others: benchmarks/iterative_losses.py."""
 _NUMBERS = 24
 """Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
 
