@@ -110,7 +110,8 @@ SQUARE = [ShiftedLight(spread(), (8, 9)), ShiftedLight(spread(), (10, 9), dots(S
 @pytest.mark.parametrize("light", SQUARE)
 @pytest.mark.parametrize("weight", [1e-3, 0.05])
 def test_total_variation_is_no_further_above_its_minimum_than_the_gap_says(light: ShiftedLight, weight: float) -> None:
-    """(Planted: Q that is longer than the weight; a gap without the part of the quadratic TV.)"""
+    """(Planted: Q that is longer than the weight; a gap without the part of the quadratic TV; slopes ten
+    times as blunt.)"""
     frames = noisy(light)
     lower, upper = smoothed_minimum(matrix(light), frames.ravel(), weight)
     for iterations in (1, 10, 3000):
@@ -164,7 +165,7 @@ def test_converged_is_said_near_the_minimum_alone(
 ) -> None:
     """Of blocks, whose light is halved once: where the rule holds the objective is that near to what 1500 steps find,
     and a pass sooner it does not. (Planted: only the last pass's fall;
-    no heed of what was promised; slopes as blunt to the end as in the first pass; a rule from the first pass on.)"""
+    no heed of what was promised; slopes that no pass sharpens; a rule from the first pass on.)"""
     rng = np.random.default_rng(4)
     light = ShiftedLight(drawn(rng), (70, 72), precision=np.float32)
     scene = 200.0 * np.kron(rng.random((14, 13)) > 0.6, np.ones((10, 11)))[:139, :143]
