@@ -21,7 +21,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, read_colours
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.known_pictures import _differences_of_turned, _places
+from mitsim.reconstruct.known_frames import _differences_of_turned, plane_offsets
 from mitsim.reconstruct.shifted_codes import TURNS
 from mitsim.reconstruct.solution import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
@@ -121,7 +121,7 @@ def test_planes_lie_as_the_frames_were_turned(orientation: int) -> None:
     lies where its filter is in the first cell. (Planted: the mosaic's own places, orientation or not.)"""
     sensor = np.array([["b", "gb"] * 2, ["gr", "r"] * 2] * 2)
     turned = orient(sensor, orientation)
-    for name, place in _places(Preparation(channel="all", orientation=orientation)).items():
+    for name, place in plane_offsets(Preparation(channel="all", orientation=orientation)).items():
         assert turned[int(2 * place[0]) :: 2, int(2 * place[1]) :: 2].tolist() == [[name] * 2] * 2
 
 
