@@ -123,6 +123,9 @@ class Transfer:
         return self.lamp if self.light in ("scatters", "drifts") else 0.0
 
 
+# ---- what sets are used ----------------------------------------------------------------------------------------------
+
+
 def saturation_of(taken: Sequence[Taken]) -> tuple[int, int | None]:
     """Which set has the largest variance, and which one is saturated: the brightest, if its variance is small; or None.
 
@@ -161,6 +164,9 @@ def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
     bright = max(near, key=lambda index: (taken[index].said.count, -abs(part[index] - 0.5)))
     time = taken[bright].exposure_s
     return min(dark, key=lambda index: (abs(taken[index].exposure_s - time), -taken[index].said.count)), bright
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------------------
 
 
 def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: float = 0.0) -> Transfer:
