@@ -31,6 +31,11 @@ _REFLECTANCE = "reflectance"
 class KnownFrames:
     """All frames of a list, and what they are of.
 
+    Parameters
+    ----------
+    captures
+        the list, its runs and pictures; :meth:`of` reads them.
+
     Attributes
     ----------
     exposures
