@@ -62,8 +62,8 @@ def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
 
 
 def automatic_weight(light: ShiftedLight, frames: Array) -> float:
-    """Weight of TV: as :func:`mitsim.reconstruct.solvers.automatic_weight`, with the noise that ``frames`` (K K', m,
-    m') of ``light`` tell by :func:`frame_noise`, and a constant of its own."""
+    """Weight of TV: 1.2 times the noise that the data term's gradient carries to a scene pixel, of ``frames`` (K K', m, m')
+    with the noise that :func:`frame_noise` tells."""
     noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
     return _WEIGHT * noise * math.sqrt(light.column_power)
 
@@ -119,8 +119,8 @@ def solve_point_spread(
     energy = float(np.vdot(frames, frames))
     found = minimise(light, frames, prior, iterations, tolerance)
     residual = light.image_of(found.image) - frames
-    figures = f"Objective {found.objective:.4g}, proven to be at most {found.gap:.1e} of itself above its minimum."
-    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1e} of itself"
+    figures = f"Objective {found.objective:.4g}, at most {found.gap:.1%} above its minimum, as far as is proven."
+    lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1%}"
     if found.fall <= tolerance:
         status = Status(Verdict.SOLVED, f"Converged: {lowered}", "", figures)
     else:

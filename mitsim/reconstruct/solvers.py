@@ -56,18 +56,15 @@ _DAMPINGS = 10.0 ** np.arange(-20, 2.1, 0.5)
 """mu over the largest sigma^2: from where no direction feels it to where all do."""
 _NOTHING = 1e-300
 """In place of a zero that is divided by: the smallest power of ten above what underflows."""
-AUTO_WEIGHT = 0.12
-"""Automatic weight in units of the noise that the data term's gradient carries to one scene pixel; chosen by PSNR on
-the anchor's photograph."""
 
 
 def automatic_weight(problem: DiagonalProblem) -> float:
-    """Weight for a ``problem``: standard deviation of its noise times the root mean square of sigma, times a constant.
+    """Weight for a ``problem``: the root of its noise variance times Tikhonov's automatic lambda.
 
-    Where the truth is flat the weight must beat the data term's gradient, which is noise of that standard
-    deviation.
+    Of noise of variance v, and slopes whose size is distributed as exp(-slope / b), the likeliest image is that of
+    weight v / b. Automatic lambda is v over the mean square of what frames tell of the image, whose root is the scale b.
     """
-    return AUTO_WEIGHT * float(np.sqrt(noise_variance(problem) * np.mean(np.square(problem.sigma))))
+    return float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
 
 
 @dataclass(frozen=True)
