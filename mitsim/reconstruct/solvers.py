@@ -62,7 +62,7 @@ def automatic_weight(problem: DiagonalProblem) -> float:
     """Weight for a ``problem``: the root of its noise variance times Tikhonov's automatic lambda.
 
     Of noise of variance v, and slopes whose size is distributed as exp(-slope / b), the likeliest image is that of
-    weight v / b. Automatic lambda is v over the mean square of what frames tell of the image, whose root is the scale b.
+    weight v / b. Automatic lambda is v over the mean square of what frames tell of the image, whose root stands for b.
     """
     return float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
 
