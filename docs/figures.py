@@ -372,7 +372,8 @@ def correlations(folder: Path) -> dict[str, float]:
 
 def walks(work: Path) -> dict[str, float]:
     """The walks' commands run in ``work``; their figures stand in bench.md then, and their pictures are drawn."""
-    page = ROOT / BENCH
+    page, work = ROOT / BENCH, work / "walks"  # the tour has folders of the same names
+    work.mkdir()
     for heading in WALKS:
         for command, reported, now in walked(heading, work):
             new = iter([figure for _, figure in pairs(reported, now)])
