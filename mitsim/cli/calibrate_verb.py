@@ -309,7 +309,8 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
     payload = {**first, "memory_bytes": memory_since(held), "warnings": warnings, "output": str(output)}
     if captures.lines is not None:
         payload["planes"] = results
-    said = f"{first['frames']} frames of {first['pictures']} pictures in {first['seconds']['total']:.1f} s: {output}"
+    pictures = f"{first['pictures']} picture" + "s" * (first["pictures"] > 1)
+    said = f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"
     if aged is not None:
         left = f"left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
         return finish(limited.as_json, payload, [said, f"moved: {moved_in_words(first['moved'])}", left], warnings)

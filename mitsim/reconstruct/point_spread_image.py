@@ -62,8 +62,8 @@ def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
 
 
 def automatic_weight(light: ShiftedLight, frames: Array) -> float:
-    """Weight of TV of ``frames`` (K K', m, m'): 1.2 times the noise that the data term's gradient carries to a scene
-    pixel, by :func:`frame_noise`."""
+    """Weight of TV for ``frames`` (K K', m, m') of ``light``: 1.2 times the noise that the data term's gradient carries
+    to a scene pixel, by :func:`frame_noise`."""
     noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
     return _WEIGHT * noise * math.sqrt(light.column_power)
 
