@@ -36,6 +36,7 @@ FLOORS = (
     "calibrate",
     "api",
     "report",
+    "learn",
     "studies",
     "exchange",
     # The command line stands on the face, as a user's own program does.
@@ -67,6 +68,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
+    "mitsim.learn.request",
 )
 """What looks at words, manifests and lists before work begins."""
 

@@ -213,7 +213,7 @@ class Accumulation:
 
     Attributes
     ----------
-    shots, factors, method
+    shots, factors, solver
         of which, and for what image.
     model
         that the frames are of, factorised.
@@ -227,17 +227,12 @@ class Accumulation:
 
     shots: Capture
     factors: Factors
-    method: str
+    solver: Solver
     model: Model
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
     bounds: Bounds | None = None
-
-    @property
-    def solver(self) -> Solver:
-        """Of the method."""
-        return SOLVERS[self.method]
 
     @property
     def prepared(self) -> Prepared:
@@ -275,14 +270,16 @@ class Accumulation:
         return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
 
-def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, bounds: Bounds | None = None) -> Accumulation:
+def accumulate(
+    shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHONOV], bounds: Bounds | None = None
+) -> Accumulation:
     """The model of shots and factors factorised, and every frame added.
 
     Parameters
     ----------
     shots, factors
         that fit each other.
-    method, bounds
+    solver, bounds
         of the image that they are for.
 
     Raises
@@ -290,7 +287,6 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, bounds:
     MitsimError
         when that takes more memory than is free, or a frame cannot be read.
     """
-    solver = SOLVERS[method]
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
     # The difference of a pair has no ambient frame.
@@ -306,7 +302,7 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, bounds:
         if few:
             kept.append(measurement)
     model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept), bounds)
+    return Accumulation(shots, factors, solver, model, frames, noise, tuple(kept), bounds)
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:

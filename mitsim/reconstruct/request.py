@@ -12,9 +12,12 @@ if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
+    from mitsim.reconstruct.solvers import Solver
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
 """Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+MODEL = ".pt"
+"""Ending of a trained network's file, which may stand for the name of a method."""
 MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 Bounds = tuple[float, float]
@@ -33,7 +36,7 @@ class ImageRequest:
         lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
         from the data.
     method
-        one of :data:`METHODS`.
+        one of :data:`METHODS`, or a solver of one's own, such as a trained network; that has no lambda.
     focus
         depth of the scene [mm]; ``auto``: that which leaves least of the measurements unexplained; ``map``: one for
         each projector pixel; None: the calibrated one.
@@ -48,7 +51,7 @@ class ImageRequest:
     """
 
     lam: float | Literal["auto"] = "auto"
-    method: str = TIKHONOV
+    method: str | Solver = TIKHONOV
     focus: float | Literal["auto", "map"] | None = None
     margin: int = 0
     depth_range: tuple[float, float] | None = None
@@ -57,9 +60,14 @@ class ImageRequest:
     def __post_init__(self) -> None:
         lam: float | str = self.lam
         focus: float | str | None = self.focus
-        method, margin = self.method, self.margin
-        if method not in METHODS:
-            raise ArgumentError("method", f"{method!r}: use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        method, margin = self.name, self.margin
+        if isinstance(self.method, str) and method not in METHODS:
+            raise ArgumentError(
+                "method",
+                f"{method!r}: use {', '.join(METHODS)} or the file of a trained network, which ends in {MODEL}",
+            )
+        if lam != "auto" and not isinstance(self.method, str):
+            raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
         if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < math.inf):
             raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
         if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus < math.inf):
@@ -90,8 +98,13 @@ class ImageRequest:
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
         if not (real and ends[0] < ends[1] and ends[0] < math.inf and ends[1] > -math.inf):
             raise ArgumentError("bounds", f"{ends}: give two numbers, the smaller one first")
-        if self.method not in (NONNEGATIVE, TV):
-            raise ArgumentError("bounds", f"{ends}: come with method {NONNEGATIVE} or {TV}; {self.method} has none")
+        if self.name not in (NONNEGATIVE, TV):
+            raise ArgumentError("bounds", f"{ends}: come with method {NONNEGATIVE} or {TV}; {self.name} has none")
+
+    @property
+    def name(self) -> str:
+        """The method's."""
+        return self.method if isinstance(self.method, str) else self.method.name
 
     @property
     def looks_for_depth(self) -> bool:
@@ -107,10 +120,10 @@ class ImageRequest:
             value = getattr(self, name)
             if value != neutral:
                 raise ArgumentError(name, f"{value}: comes with a calibration, not with a point spread function")
-        if self.method not in (TIKHONOV, NONNEGATIVE, TV):
+        if self.name not in (TIKHONOV, NONNEGATIVE, TV):
             raise ArgumentError(
                 "method",
-                f"{self.method}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
+                f"{self.name}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
                 f"{TV}",
             )
 
@@ -120,7 +133,7 @@ class ImageRequest:
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
             "lambda": self.lam,
-            "method": self.method,
+            "method": self.name,
         }
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}
