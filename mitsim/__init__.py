@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from mitsim.core.runs import load_run as load_run
     from mitsim.devices.session import Modelling as Modelling
     from mitsim.devices.session import load_recipe as load_recipe
+    from mitsim.learn.pair_store import PairStore as PairStore
     from mitsim.light.plan import Plan as Plan
     from mitsim.metrics import psnr as psnr
     from mitsim.metrics import ssim as ssim
@@ -64,6 +65,7 @@ _HOMES = {
         "core.job": "Clock Job Limits",
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
+        "learn.pair_store": "PairStore",
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
