@@ -22,6 +22,7 @@ import mitsim
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.exchange_verbs import export, import_, patterns, transport
 from mitsim.cli.frame_verbs import characterise, reconstruct, sense
+from mitsim.cli.learned_verbs import pairs, train
 from mitsim.cli.options import (
     AUTO,
     MOSAIC,
@@ -57,7 +58,6 @@ from mitsim.cli.options import (
 )
 from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
 from mitsim.cli.study_verb import study
-from mitsim.cli.train_verb import train
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
@@ -512,5 +512,5 @@ def doctor(
 
 # In the order of the help.
 _SCENE = demo, plan, capture, calibrate, reconstruct, render, study
-for _verb in (*_SCENE, export, import_, patterns, transport, characterise, sense, train, doctor):
+for _verb in (*_SCENE, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
     app.command(_verb.__name__.rstrip("_"))(_verb)

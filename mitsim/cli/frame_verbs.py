@@ -76,9 +76,9 @@ class Solving:
         """The options as the solver takes them, with numbers for words; MitsimError for words that are none."""
         method: Any = self.method
         if self.method.endswith(MODEL):
-            from mitsim.learn.verbs import load_model
+            from mitsim.learn.verbs import load_network
 
-            method = load_model(self.method)
+            method = load_network(self.method)
         return {
             "lam": number_of("lam", self.lam),
             "method": method,

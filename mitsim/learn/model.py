@@ -70,7 +70,7 @@ class _Keeping(Accumulator):
 
 @dataclass(frozen=True, eq=False)
 class Learned(Solver):
-    """A trained network as a method of solving; :func:`read_model` reads one.
+    """A trained network as a method of solving; :func:`read_network` reads one.
 
     Attributes
     ----------
@@ -203,7 +203,7 @@ _PATTERNS = ("P_L", "P_R")
 """Tensors of the patterns' factors."""
 
 
-def read_model(path: Path | str, device: str) -> Learned:
+def read_network(path: Path | str, device: str) -> Learned:
     """The network in a file of `mitsim train`.
 
     Parameters

@@ -13,7 +13,7 @@ import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,14 +30,12 @@ from mitsim.core.seeds import integer, stream
 from mitsim.learn.diagonal import Data, Diagonal
 from mitsim.learn.methods import CLASSES, Method
 from mitsim.learn.model import Learned, datum_variance, relative_noise
+from mitsim.learn.pair_store import PairStore
 from mitsim.learn.request import FEWEST_PAIRS, ModelManifest, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.solvers import SOLVERS
-
-if TYPE_CHECKING:
-    from mitsim.learn.pair_store import PairStore
 
 _JUDGING, _MOST_JUDGING = 16, 48
 """One pair in so many judges and does not teach, up to so many: their mean PSNR is then known to 0.5 dB, and its change

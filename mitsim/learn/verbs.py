@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import check_apart, output_file
 from mitsim.core.job import Job
+from mitsim.learn.pair_request import CALIBRATION
 from mitsim.learn.request import Training
 
 if TYPE_CHECKING:
     from mitsim.learn.model import Learned
     from mitsim.learn.training import Trained
-
-CALIBRATION = "calibration"
-"""Folder in a store of pairs that holds the calibration of their camera, where no other is given."""
 
 
 def check_torch() -> None:
@@ -28,7 +26,7 @@ def check_torch() -> None:
 
 
 @check_arguments
-def load_model(path: Path | str, device: str = "cpu") -> Learned:
+def load_network(path: Path | str, device: str = "cpu") -> Learned:
     """A trained network, to give as ``method`` of :func:`mitsim.reconstruct`.
 
     Parameters
@@ -44,9 +42,9 @@ def load_model(path: Path | str, device: str = "cpu") -> Learned:
         where torch is not installed, or the file is none of these.
     """
     check_torch()
-    from mitsim.learn.model import read_model
+    from mitsim.learn.model import read_network
 
-    return read_model(path, device)
+    return read_network(path, device)
 
 
 @check_arguments

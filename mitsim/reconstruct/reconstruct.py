@@ -269,7 +269,7 @@ def reconstruct(
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
         :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
         bounds: :func:`reconstruct_request`), ``tv`` (least total variation), or a solver of one's own, such as a
-        trained network (:func:`mitsim.load_model`).
+        trained network (:func:`mitsim.load_network`).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by

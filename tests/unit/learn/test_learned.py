@@ -21,7 +21,7 @@ from mitsim.core.runs import Capture
 from mitsim.learn import training, verbs
 from mitsim.learn.diagonal import Data, Diagonal
 from mitsim.learn.methods import CLASSES
-from mitsim.learn.model import Learned, read_model
+from mitsim.learn.model import Learned, read_network
 from mitsim.learn.request import METHODS, Training
 from mitsim.learn.training import PairDataset, train_network
 from mitsim.metrics import psnr
@@ -125,7 +125,7 @@ def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) 
     def weights(name: str, **more: Any) -> dict[str, np.ndarray]:
         train_network(store, factors, request, tmp_path / name, **more)
         assert not (tmp_path / f"{name}.unfinished").exists()
-        state = read_model(tmp_path / name, "cpu").network.state_dict()
+        state = read_network(tmp_path / name, "cpu").network.state_dict()
         return {key: values.numpy() for key, values in state.items()}
 
     whole = weights("a.pt")
@@ -219,7 +219,7 @@ def test_an_image_says_by_what_it_was_found(model: Learned, tmp_path: Path) -> N
 
 def test_a_file_gives_the_same_image(model: Learned, tmp_path: Path) -> None:
     model.save(tmp_path / "m.pt")
-    again = verbs.load_model(tmp_path / "m.pt")
+    again = verbs.load_network(tmp_path / "m.pt")
     assert again.name == model.name and again.manifest == model.manifest
     assert_array_equal(image_of(again).image, image_of(model).image)
 
@@ -282,14 +282,14 @@ def test_a_file_that_is_none_is_refused(damage: str, model: Learned, tmp_path: P
         if damage == "folder":
             path.mkdir()
     with pytest.raises(MitsimError, match=r"m\.pt") as refused:
-        verbs.load_model(path)
+        verbs.load_network(path)
     assert "\n" not in str(refused.value)
 
 
 def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verbs, "find_spec", lambda name: None)
     for work in (
-        lambda: verbs.load_model(tmp_path / "m.pt"),
+        lambda: verbs.load_network(tmp_path / "m.pt"),
         lambda: verbs.train("unrolled", tmp_path, tmp_path / "m.pt"),
     ):
         with pytest.raises(MitsimError, match="torch is not installed, which networks need; type: pip install"):
