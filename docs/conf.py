@@ -49,6 +49,7 @@ docs/architecture
 docs/physics
 docs/rare_light
 docs/reconstruction
+docs/learned
 docs/glossary
 docs/formats
 docs/exchange

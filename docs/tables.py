@@ -38,7 +38,7 @@ from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 from mitsim.exchange.capture_list import CaptureList
-from mitsim.learn.request import ModelManifest
+from mitsim.learn.training_request import ModelManifest
 from mitsim.light.plan import PlanFile
 
 FORMATS = Path(__file__).with_name("formats.md")

@@ -68,7 +68,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
-    "mitsim.learn.request",
+    "mitsim.learn.training_request",
 )
 """What looks at words, manifests and lists before work begins."""
 
@@ -335,6 +335,12 @@ WITHOUT_NUMPY = (
     "reconstruct made/run --calibration made/cal -o r --margin 2",
     "reconstruct made/run --calibration made/cal -o full",
     "reconstruct made/run --calibration made/cal -o none/r",
+    "reconstruct made/run --calibration made/cal -o r --method none.pt",
+    "train unroled bad -o m.pt",
+    "train unrolled bad -o m.txt",
+    "train unrolled none -o m.pt",
+    "train unrolled bad -o m.pt",
+    "train unrolled bad --calibration bad -o full/m.pt --rate 0",
     "patterns dotz:3 -o p",
     "patterns dots:3 -o p --seed -1",
     "study weather -o s",
@@ -520,7 +526,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 234, 47_400
+MOST_FILES, MOST_LINES_OF_CODE = 242, 47_400
 """What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
 so here. A new file or line is one more that the next reader has to know."""
 LONG = 450

@@ -29,7 +29,7 @@ from mitsim.cli.options import (
 from mitsim.cli.screen import finish
 from mitsim.core.errors import MitsimError
 from mitsim.core.worker import RESUME, advise
-from mitsim.learn.request import METHODS, Training
+from mitsim.learn.training_request import METHODS, Training
 from mitsim.reconstruct.request import MODEL
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Schedule:
     batch: int = option(Training.batch, "pairs a step")
     rate: float = option(Training.rate, "largest learning rate of the cycle")
     seed: Seed = 0
-    device: str = option(Training.device, "of torch: cpu, cuda, mps, ...")
+    device: str = option(Training.device, "that torch works on")
 
 
 @verb

@@ -28,10 +28,10 @@ from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
 from mitsim.learn.diagonal import Data, Diagonal
+from mitsim.learn.learned_solver import Learned, datum_variance, relative_noise
 from mitsim.learn.methods import CLASSES, Method
-from mitsim.learn.model import Learned, datum_variance, relative_noise
 from mitsim.learn.pair_store import PairStore
-from mitsim.learn.request import FEWEST_PAIRS, ModelManifest, Training
+from mitsim.learn.training_request import FEWEST_PAIRS, ModelManifest, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared
@@ -65,7 +65,13 @@ _UNFINISHED = ".unfinished"
 
 class PairDataset(Dataset[tuple[Tensor, Tensor]]):
     """Pairs of a store as a map-style data set of PyTorch: item -> (frames (K, m, m') [electrons / s], truth (1, n,
-    n')), single precision, read when it is asked for."""
+    n')), single precision, read when it is asked for.
+
+    Parameters
+    ----------
+    store
+        the pairs.
+    """
 
     def __init__(self, store: PairStore) -> None:
         self.store = store
@@ -166,7 +172,7 @@ class Trainer:
         chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
         truths, data = self.batch(chosen)
         if not self.network.reads_frames:
-            truths, data = self._turned(truths, data, random)
+            truths, data = self._turn(truths, data, random)
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
         noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
@@ -190,7 +196,7 @@ class Trainer:
             ordered[:, row, column] = frames[:, number]
         return truths, Data(data.weights, data.deviation, torch.as_tensor(ordered).to(self._like))
 
-    def _turned(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
+    def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
         """The second half of a batch with turned pictures, and with what the frames held beside them: a store then
         teaches as eight times as many pictures."""
         half = len(truths) // 2
@@ -260,7 +266,7 @@ class State:
         trainer.network.load_state_dict(self.network)
         trainer.optimiser.load_state_dict(self.optimiser)
 
-    def ended(self, steps: int) -> bool:
+    def is_over(self, steps: int) -> bool:
         """Whether all ``steps`` are done, or the last looks brought nothing."""
         psnr = [value for _, value in self.curve]
         return self.step >= steps or max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
@@ -393,7 +399,7 @@ def train_network(
         predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - state.step)
         Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
         job.clock.predict({"train": predicted})
-        while not state.ended(request.steps):
+        while not state.is_over(request.steps):
             state.go_on(trainer, job)
             unfinished.write(state)
     network.load_state_dict(state.best)

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError, check_arguments
-from mitsim.core.files import check_apart, output_file
+from mitsim.core.files import check_apart, check_plain, output_file
 from mitsim.core.job import Job
 from mitsim.learn.pair_request import CALIBRATION
-from mitsim.learn.request import Training
+from mitsim.learn.training_request import Training
 
 if TYPE_CHECKING:
-    from mitsim.learn.model import Learned
+    from mitsim.learn.learned_solver import Learned
     from mitsim.learn.training import Trained
 
 
@@ -41,8 +41,9 @@ def load_network(path: Path | str, device: str = "cpu") -> Learned:
     MitsimError
         where torch is not installed, or the file is none of these.
     """
+    check_plain(path, "model")
     check_torch()
-    from mitsim.learn.model import read_network
+    from mitsim.learn.learned_solver import read_network
 
     return read_network(path, device)
 
@@ -62,7 +63,7 @@ def train(
     Parameters
     ----------
     method
-        one of :data:`mitsim.learn.request.METHODS`.
+        one of :data:`mitsim.learn.training_request.METHODS`.
     pairs, output
         folder of `mitsim pairs`, and the file, which ends in ``.pt``.
     calibration
@@ -72,7 +73,7 @@ def train(
     job
         its limits, and who is told how far it is.
     **options
-        ``steps``, ``batch``, ``rate``, ``seed`` and ``device`` of :class:`mitsim.learn.request.Training`.
+        ``steps``, ``batch``, ``rate``, ``seed`` and ``device`` of :class:`mitsim.learn.training_request.Training`.
 
     Raises
     ------
@@ -81,15 +82,16 @@ def train(
         fit each other, a file that is there, and more time or memory than is allowed.
     """
     request = Training(method, **options)
-    check_torch()
-    from mitsim.learn.pair_store import PairStore
-    from mitsim.learn.training import train_network
-    from mitsim.reconstruct.factors import load_calibration
-
-    store = PairStore.open(Path(pairs))
     place = Path(pairs) / CALIBRATION if calibration is None else Path(calibration)
     if calibration is None and not place.is_dir():
         raise MitsimError(f"calibration: {pairs} holds none; give the folder of `mitsim calibrate`")
     check_apart(output, [pairs, place])
+    check_torch()
     with output_file(output) as file:
-        return train_network(store, load_calibration(place), request, file, job, resume)
+        from mitsim.learn.pair_store import PairStore
+        from mitsim.reconstruct.factors import load_calibration
+
+        store, factors = PairStore.open(Path(pairs)), load_calibration(place)
+        from mitsim.learn.training import train_network  # only now: torch takes seconds to import
+
+        return train_network(store, factors, request, file, job, resume)

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
     from mitsim.core.runs import Capture
     from mitsim.reconstruct.factors import Factors
-    from mitsim.reconstruct.solvers import Solver
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
 """Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
@@ -36,7 +35,8 @@ class ImageRequest:
         lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
         from the data.
     method
-        one of :data:`METHODS`, or a solver of one's own, such as a trained network; that has no lambda.
+        one of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network, which has no
+        lambda.
     focus
         depth of the scene [mm]; ``auto``: that which leaves least of the measurements unexplained; ``map``: one for
         each projector pixel; None: the calibrated one.
@@ -51,7 +51,7 @@ class ImageRequest:
     """
 
     lam: float | Literal["auto"] = "auto"
-    method: str | Solver = TIKHONOV
+    method: Any = TIKHONOV
     focus: float | Literal["auto", "map"] | None = None
     margin: int = 0
     depth_range: tuple[float, float] | None = None
@@ -104,7 +104,7 @@ class ImageRequest:
     @property
     def name(self) -> str:
         """The method's."""
-        return self.method if isinstance(self.method, str) else self.method.name
+        return str(self.method if isinstance(self.method, str) else self.method.name)
 
     @property
     def looks_for_depth(self) -> bool:

@@ -20,10 +20,10 @@ from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.learn import training, verbs
 from mitsim.learn.diagonal import Data, Diagonal
+from mitsim.learn.learned_solver import Learned, read_network
 from mitsim.learn.methods import CLASSES
-from mitsim.learn.model import Learned, read_network
-from mitsim.learn.request import METHODS, Training
 from mitsim.learn.training import PairDataset, train_network
+from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solvers import SOLVERS
@@ -155,7 +155,7 @@ def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
     network = training.first_network(request, (16, 16))
     trainer = training.Trainer(request, store, prepared, replace(sums, weights=exact), network)
     truths, data = trainer.batch(np.arange(8))
-    turned, moved = trainer._turned(truths, data, np.random.default_rng(2))
+    turned, moved = trainer._turn(truths, data, np.random.default_rng(2))
     assert not torch.equal(turned[4:], truths[4:]) and torch.equal(turned[:4], truths[:4])
     expected = trainer.model.sigma * trainer.model.coefficients(turned) / moved.deviation
     assert_allclose(moved.weights, expected, rtol=2e-4, atol=2e-4 * float(expected.abs().max()))
@@ -288,9 +288,11 @@ def test_a_file_that_is_none_is_refused(damage: str, model: Learned, tmp_path: P
 
 def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verbs, "find_spec", lambda name: None)
+    (tmp_path / "m.pt").touch()
+    (tmp_path / "calibration").mkdir()
     for work in (
         lambda: verbs.load_network(tmp_path / "m.pt"),
-        lambda: verbs.train("unrolled", tmp_path, tmp_path / "m.pt"),
+        lambda: verbs.train("unrolled", tmp_path, tmp_path / "n.pt"),
     ):
         with pytest.raises(MitsimError, match="torch is not installed, which networks need; type: pip install"):
             work()
@@ -298,5 +300,5 @@ def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: 
 
 def test_a_request_says_what_no_network_is_trained_by() -> None:
     for name, value in (("method", "unroled"), ("steps", 0), ("batch", 1000), ("rate", 0.0), ("rate", float("nan"))):
-        with pytest.raises(ArgumentError, match=f"^{name} "):
+        with pytest.raises(MitsimError, match=f"^{name} "):
             Training(**{**asdict(Training("unrolled")), name: value})

@@ -22,7 +22,7 @@ from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
 from mitsim.learn.diagonal import Data, Diagonal
 from mitsim.learn.methods import CLASSES, Method
-from mitsim.learn.request import ModelManifest
+from mitsim.learn.training_request import ModelManifest
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
 from mitsim.reconstruct.request import TIKHONOV, Bounds

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from mitsim.core.configuration import Configuration, Positive
-from mitsim.core.errors import ArgumentError, near_name
+from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import FORMAT, Plain
 
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
@@ -28,7 +28,7 @@ FEWEST_PAIRS = 8
 
 @dataclass(frozen=True)
 class Training:
-    """How a network is trained. ArgumentError for a number that none is trained by.
+    """How a network is trained. MitsimError for what none is trained by.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Training:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             near = near_name(str(self.method), METHODS)
-            raise ArgumentError("method", f"{self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+            raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
         for name, most in (("steps", _LONGEST), ("batch", _LARGEST_BATCH)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
