@@ -54,6 +54,7 @@ docs/formats
 docs/exchange
 docs/bench
 docs/studies
+docs/learned
 docs/extending
 docs/robustness
 docs/growth

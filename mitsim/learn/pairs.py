@@ -289,8 +289,8 @@ def _shards(asked: PairsRequest) -> tuple[Shard, ...]:
     return tuple(found)
 
 
-def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> PairStore:
-    """Pairs of pictures on the prints of a scene, in a folder.
+def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
+    """Pairs of pictures on the prints of a scene, in a folder; and what they were predicted to take.
 
     Parameters
     ----------
@@ -328,4 +328,4 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> PairStore:
             maker.write(shard, folder / shard.file, digest)
         manifest = maker.finish(PairStore(folder, begun))
         write_pairs_manifest(folder, manifest)
-    return PairStore(folder, manifest)
+    return PairStore(folder, manifest), cost
