@@ -55,6 +55,7 @@ docs/formats
 docs/exchange
 docs/bench
 docs/studies
+docs/learned
 docs/extending
 docs/robustness
 docs/growth

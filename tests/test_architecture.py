@@ -68,6 +68,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
+    "mitsim.learn.pair_request",
     "mitsim.learn.training_request",
 )
 """What looks at words, manifests and lists before work begins."""
@@ -318,6 +319,11 @@ WITHOUT_NUMPY = (
     "render photograph -o x.exr --estimator fast",
     "render photograph -o x.exr --spp 0",
     "transport photograph -o x.txt",
+    "pairs photograph --count 0 -o p",
+    "pairs photograph --count 5 -o full",
+    "pairs photograph --count 5 -o p --pictures none",
+    "pairs photograph --count 5 -o p --vary none.toml",
+    "pairs photograph --count 5 -o p --patterns dots:200",
     "sense x.npy --camera imx249 -o y.png",
     "sense x.txt --camera imx249 -o y.png",
     "sense x.txt --camera imx249 -o y.jpg",

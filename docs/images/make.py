@@ -1,8 +1,8 @@
 """The pictures of the README, from nothing but mitsim's own commands: a demo, and a scene of many depths.
 
-    python docs/images/make.py WORK [demo] [depth]
+    python docs/images/make.py WORK [demo] [depth] [pictures]
 
-Both, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are
+All, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call found there are
 used again.
 """
 
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
+from mitsim.learn.pictures import DrawnPictures
 
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),
@@ -33,7 +34,7 @@ Panel = tuple[str, np.ndarray]
 def main() -> None:
     work, names = Path(sys.argv[1]), sys.argv[2:]
     work.mkdir(exist_ok=True)
-    for picture in (demo, depth):
+    for picture in (demo, depth, pictures):
         if not names or picture.__name__ in names:
             draw(picture.__name__, *picture(work))
 
@@ -61,6 +62,11 @@ def depth(work: Path) -> list[Panel]:
         (f"A depth for each pixel: {each:.1f} dB", lightness(image(work, "bag-image-map/image.exr"))),
         ("These depths [mm]", image(work, "bag-image-map/depth.exr", "depth_mm")),
     ]
+
+
+def pictures(_: Path) -> list[Panel]:
+    """What networks learn from."""
+    return [(f"Picture {number}", DrawnPictures(0).draw(number, 128) / 255) for number in (1, 3, 5, 8, 14)]
 
 
 def made(work: Path, *folders: str) -> None:

@@ -98,12 +98,14 @@ def pairs(
             define = [*(devices.define or ()), *(f"{name}={value}" for name, value in drawn.items())]
             return replace(devices, define=define).open(scene, limited.variant, job)
 
-        made = make_pairs(opening, wanted, Task(output, asked.resume, job))
-        payload = {**made.summary(), "seconds": job.clock.seconds(), "kernels": job.clock.kernels()}
+        made, cost = make_pairs(opening, wanted, Task(output, asked.resume, job))
+        payload = {**made.summary(), "predicted_seconds": cost.seconds, "predicted_bytes": cost.disk_bytes}
+        payload |= {"seconds": job.clock.seconds(), "kernels": job.clock.kernels()}
     rows, columns = payload["shape"]
     lines = [
         f"{payload['count']} pairs of {payload['frames']} frames of {rows}x{columns} in "
-        f"{payload['seconds']['total']:.1f} s, {payload['bytes'] / 2**20:.3g} MiB: {output}",
+        f"{payload['seconds']['total']:.1f} s ({cost.seconds:.3g} s predicted after the plan), "
+        f"{payload['bytes'] / 2**20:.3g} MiB: {output}",
         *([f"Light is traced for each picture: {payload['traced_anew']}"] if payload["traced_anew"] else []),
     ]
     return finish(limited.as_json, payload, lines, payload["warnings"])

@@ -70,7 +70,7 @@ class Shard(BaseModel):
     count: int = Field(ge=1)
     """Its pairs."""
     group: int = Field(ge=0)
-    """Number of its bench among :attr:`PairsManifest.groups`."""
+    """Number of its bench, among `groups`."""
 
 
 class PairsManifest(BaseModel):

@@ -308,8 +308,9 @@ def _shards(asked: PairsRequest) -> tuple[Shard, ...]:
     return tuple(found)
 
 
-def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> PairStore:
-    """Pairs of pictures on the prints of a scene, in a folder; with its exact factors where the model is idealised.
+def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
+    """Pairs of pictures on the prints of a scene, in a folder, idealised ones with their factors; and what they were
+    predicted to take.
 
     Parameters
     ----------
@@ -350,4 +351,4 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> PairStore:
             maker.factors().write(folder / CALIBRATION)
         manifest = maker.finish(PairStore(folder, begun))
         write_pairs_manifest(folder, manifest)
-    return PairStore(folder, manifest)
+    return PairStore(folder, manifest), cost
