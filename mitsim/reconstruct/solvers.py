@@ -535,5 +535,6 @@ class Convolutional:
         return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)
 
 
-SOLVERS: dict[str, Solver] = {solver.name: solver for solver in (Tikhonov(), Markov(), Nonnegative(), TotalVariation())}
+_ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()
+SOLVERS: dict[str, Solver] = {solver.name: solver for solver in _ALL}
 """By the method that an image is asked by."""
