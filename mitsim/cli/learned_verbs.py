@@ -145,11 +145,11 @@ def train(
     advise(RESUME)
     with limited.job() as job:
         made = train_model(method, pairs, output, calibration, resume, job, **vars(schedule))
-    payload = made.summary()
+        payload = {**made.summary(), "seconds": job.clock.seconds()}
     (_, before), (last, _) = made.curve[0], made.curve[-1]
     lines = [
-        f"{payload['model']}: {payload['weights']} weights, {last} of {schedule.steps} steps in {made.seconds:.0f} s "
-        f"(predicted {made.predicted_seconds:.0f}): {output}",
+        f"{payload['model']}: {payload['weights']} weights, {last} of {schedule.steps} steps in "
+        f"{payload['seconds']['total']:.0f} s (predicted {made.predicted_seconds:.0f}): {output}",
         f"PSNR of pairs that did not teach: {before:.2f} dB before, {payload['psnr_db']:.2f} dB after",
     ]
     return finish(limited.as_json, payload, lines, ())

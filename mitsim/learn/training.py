@@ -329,15 +329,14 @@ class Trained:
         the network.
     curve
         step, and mean PSNR [dB] of the pairs that do not teach after it; the first before any step.
-    seconds, predicted_seconds
-        of it all, and as they were predicted.
+    predicted_seconds
+        of it all.
     output
         its file.
     """
 
     model: Learned
     curve: tuple[tuple[int, float], ...]
-    seconds: float
     predicted_seconds: float
     output: str
 
@@ -350,7 +349,6 @@ class Trained:
             "psnr_before_db": self.curve[0][1],
             "psnr_db": max(psnr for _, psnr in self.curve),
             "steps": self.curve[-1][0],
-            "seconds": self.seconds,
             "predicted_seconds": self.predicted_seconds,
             "output": self.output,
         }
@@ -411,7 +409,7 @@ def train_network(
     model = Learned(manifest, network.eval(), factors.sides, store.patterns)
     model.save(output)
     unfinished.path.unlink(missing_ok=True)
-    return Trained(model, tuple(state.curve), time.perf_counter() - started, predicted, str(output))
+    return Trained(model, tuple(state.curve), predicted, str(output))
 
 
 def first_network(request: Training, shape: tuple[int, int]) -> Method:

@@ -9,6 +9,7 @@ from pydantic import Field
 from mitsim.core.configuration import Configuration, Positive
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import FORMAT, Plain
+from mitsim.core.seeds import check_root
 
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
     "unrolled",
@@ -59,6 +60,7 @@ class Training:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
                 raise ArgumentError(name, f"{value}: give a whole number, 1 to {most}")
+        check_root(self.seed)
         if not 0 < self.rate <= 1:
             raise ArgumentError("rate", f"{self.rate}: give a number above 0, at most 1")
 
