@@ -32,9 +32,9 @@ from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28
 """Of a file: 256 MiB, fifty times the largest that `mitsim train` writes for 128 pixels."""
-_SAME_CAMERA = 0.05
-"""Relative difference of two calibrations' models above which they are of two cameras: twenty sessions' noise; a sheet
-0.5 mm beside has more."""
+_SAME_CAMERA = 0.02
+"""Relative difference of two calibrations' models above which they are of two cameras: four times that of two sessions
+of 512 frames; a scene an eighth of a pixel aside has as much."""
 _OTHER_NOISE = 1.5
 """Factor by which noise may lie outside of what was trained with: that of half an exposure is 1.4."""
 _UNEXPLAINED = 3.5e-3

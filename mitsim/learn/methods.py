@@ -84,7 +84,7 @@ class Refined(Method):
     """
 
     WIDTH = 48
-    """0.5 million weights: 0.3 to 1 million gained alike where they were tried."""
+    """0.5 million weights; chosen: twice those that gained 0.2 dB over least squares at its best weight."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)

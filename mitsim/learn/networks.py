@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 LEVELS = (1.0, 1.5, 2.0)
-"""Channels of each level, over those of the first; a level has half the pixels a side of that before it. Chosen: three
-see 92 pixels of the image across, more than the point spread of least squares under uniform light."""
+"""Channels of each level, over those of the first; a level has half the pixels a side of that before it. Chosen: a
+pixel of the image then sees 50 others on either side."""
 
 
 class UNet(nn.Module):

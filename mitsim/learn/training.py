@@ -51,11 +51,12 @@ _RISING = 0.15
 _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
 """Of AdamW; and the norm to which gradients are cut, which keeps the first steps from running away."""
 _BASE_BYTES, _BYTES_A_PIXEL = 6e8, 1500.0
-"""Memory of torch; and of a pixel that goes through a network with its gradient, measured at widths of 32 and 48."""
+"""Memory of torch; and of a pixel that goes through a network with its gradient: 950 measured at a width of 32, half as
+much again for the wider ones."""
 _FRAME_PIXELS = 8
 """Pixels of a frame that take as much as one of an image: half the width, on a quarter of the squares."""
-_LOOK = 0.1
-"""What a look adds to the steps before it; measured of 48 pairs and 75 steps of 8."""
+_LOOK = 0.05
+"""What a look adds to the steps before it; measured of 56 pictures and 100 steps of 8."""
 _UNFINISHED = ".unfinished"
 """Ending of the file beside a model's that a training goes on from."""
 
