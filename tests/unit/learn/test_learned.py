@@ -108,12 +108,14 @@ def test_the_step_of_the_frames_is_the_closed_form() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns(method: str, tmp_path: Path) -> None:
-    """Of a few pairs, on pairs that did not teach. (Planted: truths of other pairs.)"""
+    """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
     made = train_network(
         FakeStore(), bench().calibrated(1), Training(method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
     )
-    (first, before), *_ = made.curve
-    assert first == 0 and max(psnr for _, psnr in made.curve) > before + 0.5
+    assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
+    blank = replace(made.model, network=training.first_network(Training(method), (16, 16)))
+    before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
+    assert after > before + 0.3
 
 
 @pytest.mark.parametrize("method", ["unrolled", "plug-and-play", "preprocessed"])
@@ -123,10 +125,10 @@ def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) 
     request = Training(method, steps=6, batch=4, seed=1)
 
     def weights(name: str, **more: Any) -> dict[str, np.ndarray]:
-        train_network(store, factors, request, tmp_path / name, **more)
+        made = train_network(store, factors, request, tmp_path / name, **more)
         assert not (tmp_path / f"{name}.unfinished").exists()
         state = read_network(tmp_path / name, "cpu").network.state_dict()
-        return {key: values.numpy() for key, values in state.items()}
+        return {"curve": np.array(made.curve), **{key: values.numpy() for key, values in state.items()}}
 
     whole = weights("a.pt")
     assert all(map(np.array_equal, whole.values(), weights("b.pt").values()))
