@@ -1,10 +1,11 @@
-# make setup | demo | paper | test | test-all | lint | docs | figures | robustness | mutants | wheel.  Everything lives in .venv;
-# PYTHON=python3.12 picks another Python.
+# make setup | learn | demo | paper | test | test-all | lint | docs | figures | robustness | mutants | wheel.  Everything
+# lives in .venv; PYTHON=python3.12 picks another Python.
 VENV := .venv
 PYTHON ?= python3
 READY := $(VENV)/.ready
 LINT_READY := $(VENV)/.lint-ready
 DOCS_READY := $(VENV)/.docs-ready
+LEARN_READY := $(VENV)/.learn-ready
 INSTALL := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 # Byte code is written also where the environment says not to: the suite starts some sixty programs, each of which would
@@ -16,7 +17,7 @@ test test-all robustness: export OMP_NUM_THREADS := 1
 # One test process a processor.
 PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: setup demo paper test test-all lint docs figures robustness mutants wheel
+.PHONY: setup learn demo paper test test-all lint docs figures robustness mutants wheel
 
 setup: $(READY)
 
@@ -30,6 +31,13 @@ $(LINT_READY): $(READY)
 
 $(DOCS_READY): $(READY)
 	@$(INSTALL) -e '.[docs]'
+	@touch $@
+
+# PyTorch, without which networks and their tests are left out: 5.7 GB.
+learn: $(LEARN_READY)
+
+$(LEARN_READY): $(READY)
+	@$(INSTALL) -e '.[learn]'
 	@touch $@
 
 demo: setup

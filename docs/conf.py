@@ -49,11 +49,13 @@ docs/architecture
 docs/physics
 docs/rare_light
 docs/reconstruction
+docs/learned
 docs/glossary
 docs/formats
 docs/exchange
 docs/bench
 docs/studies
+docs/learned
 docs/extending
 docs/robustness
 docs/growth

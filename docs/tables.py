@@ -38,6 +38,9 @@ from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 from mitsim.devices.session import BoardShape, Drift, SessionRecipe
 from mitsim.exchange.capture_list import CaptureList
+from mitsim.learn.pair_request import Variation
+from mitsim.learn.pair_store import PairsManifest, Shard
+from mitsim.learn.training_request import ModelManifest
 from mitsim.light.plan import PlanFile
 
 FORMATS = Path(__file__).with_name("formats.md")
@@ -51,6 +54,8 @@ MODELS = (
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
     PlanFile,
+    *(PairsManifest, Shard, Variation),
+    ModelManifest,
 )
 _PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from mitsim.core.runs import load_run as load_run
     from mitsim.devices.session import Modelling as Modelling
     from mitsim.devices.session import load_recipe as load_recipe
+    from mitsim.learn.pair_store import PairStore as PairStore
+    from mitsim.learn.verbs import load_network as load_network
+    from mitsim.learn.verbs import train as train
     from mitsim.light.plan import Plan as Plan
     from mitsim.metrics import psnr as psnr
     from mitsim.metrics import ssim as ssim
@@ -64,6 +67,8 @@ _HOMES = {
         "core.job": "Clock Job Limits",
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
+        "learn.pair_store": "PairStore",
+        "learn.verbs": "load_network train",
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",

@@ -49,7 +49,7 @@ NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
 
 REWRITTEN = ["README.md", *(f"docs/{name}.md" for name in ("architecture", "bench", "exchange", "formats", "glossary"))]
-REWRITTEN += [f"docs/{name}.md" for name in ("growth", "physics", "rare_light", "reconstruction", "studies")]
+REWRITTEN += [f"docs/{name}.md" for name in ("growth", "learned", "physics", "rare_light", "reconstruction", "studies")]
 """Pages that are held to short sentences and paragraphs."""
 
 ACCURACY = "0.02"

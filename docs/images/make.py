@@ -1,6 +1,6 @@
 """The pictures of README and docs/bench.md, from nothing but mitsim's own commands.
 
-    python docs/images/make.py WORK [demo] [depth] [bench]
+    python docs/images/make.py WORK [demo] [depth] [bench] [pictures]
     python docs/images/make.py WORK flatcam diffusercam
 
 All of the first line, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call
@@ -21,6 +21,7 @@ from PIL import Image
 
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
+from mitsim.learn.pictures import DrawnPictures
 
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),
@@ -37,8 +38,8 @@ Panel = tuple[str, np.ndarray]
 def main() -> None:
     work, names = Path(sys.argv[1]), sys.argv[2:]
     work.mkdir(exist_ok=True)
-    for picture in (demo, depth, bench, flatcam, diffusercam):
-        if picture.__name__ in (names or ("demo", "depth", "bench")):
+    for picture in (demo, depth, bench, pictures, flatcam, diffusercam):
+        if picture.__name__ in (names or ("demo", "depth", "bench", "pictures")):
             draw(picture.__name__, *picture(work))
 
 
@@ -110,6 +111,11 @@ def picture(path: Path) -> np.ndarray:
     """Numbers of a picture of 8 or 16 bits over the largest that it may hold."""
     values = np.array(Image.open(path))
     return values / np.iinfo(values.dtype).max
+
+
+def pictures(_: Path) -> list[Panel]:
+    """What networks learn from."""
+    return [(f"Picture {number}", DrawnPictures(0).draw(number, 128) / 255) for number in (1, 3, 5, 8, 14)]
 
 
 def made(work: Path, *folders: str) -> None:

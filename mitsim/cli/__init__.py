@@ -22,6 +22,7 @@ import mitsim
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.exchange_verbs import export, import_, patterns, transport
 from mitsim.cli.frame_verbs import characterise, reconstruct, sense
+from mitsim.cli.learned_verbs import pairs, train
 from mitsim.cli.options import (
     AUTO,
     MOSAIC,
@@ -511,5 +512,5 @@ def doctor(
 
 # In the order of the help.
 _SCENE = demo, plan, capture, calibrate, reconstruct, render, study
-for _verb in (*_SCENE, export, import_, patterns, transport, characterise, sense, doctor):
+for _verb in (*_SCENE, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
     app.command(_verb.__name__.rstrip("_"))(_verb)

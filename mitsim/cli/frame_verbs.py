@@ -32,7 +32,7 @@ from mitsim.core.spectral_manifests import (
     read_colours,
     read_mosaic,
 )
-from mitsim.reconstruct.request import MARKOV, METHODS, TIKHONOV
+from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
 
 if TYPE_CHECKING:
     from mitsim.report.quality import Judged
@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 def method_names() -> str:
     """Methods of solving, as the help lists them."""
     notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
-    *others, last = (notes.get(name, name) for name in METHODS)
-    return f"{', '.join(others)} or {last}"
+    return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a file of mitsim train"])
 
 
 @dataclass(frozen=True)
@@ -82,9 +81,14 @@ class Solving:
 
     def read(self) -> dict[str, Any]:
         """The options as the solver takes them, with numbers for words; MitsimError for words that are none."""
+        method: Any = self.method
+        if self.method.endswith(MODEL):
+            from mitsim.learn.verbs import load_network
+
+            method = load_network(self.method)
         return {
             "lam": number_of("lam", self.lam),
-            "method": self.method,
+            "method": method,
             "focus": None if self.focus is None else number_of("focus", self.focus, ("auto", "map")),
             "depth_range": None if self.depth_range is None else _two_depths(self.depth_range),
             "margin": self.margin,

@@ -26,6 +26,10 @@ _LONGEST_HEAD = 1 << 20
 """An unfinished manifest is a few kB; what is larger is not looked into."""
 FRAMES, PARTS = "frame_*.exr", "*.part.npz"
 """What an unfinished capture and an unfinished calibration have finished, as their folders name it."""
+PAIRS, SHARDS = "pairs.json", "pairs_*.h5"
+"""Manifest of a store of pairs, and what an unfinished one has finished."""
+_FINISHED = {"calibration": ("parts", PARTS), "pairs": ("shards", SHARDS)}
+"""What work of a kind finishes one after the other, and its files; frames of all others."""
 
 
 @contextmanager
@@ -253,15 +257,16 @@ def _prepare_folder(path: Path, overwrite: bool) -> None:
 
 
 def _unfinished_work(folder: Path) -> str:
-    """What a killed capture or calibration left in the folder, and how to go on; nothing when there is none."""
+    """What a killed work left in the folder, and how to go on; nothing when there is none."""
     try:
-        manifest = json.loads(read_text(folder / "manifest.json", _LONGEST_HEAD))
+        name = PAIRS if (folder / PAIRS).is_file() else "manifest.json"
+        manifest = json.loads(read_text(folder / name, _LONGEST_HEAD))
     except (MitsimError, ValueError, RecursionError):
         return ""
     if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
         return ""
     kind = manifest.get("kind")
-    name, pattern = ("parts", PARTS) if kind == "calibration" else ("frames", FRAMES)
+    name, pattern = _FINISHED.get(str(kind), ("frames", FRAMES))
     return f": an unfinished {kind} with {len([*folder.glob(pattern)])} finished {name}; go on with resume=True"
 
 

@@ -238,10 +238,6 @@ class FrameOptics:
         if places is not None:
             centres = [own[np.asarray(chosen)] for own, chosen in zip(centres, places, strict=True)]
         weights = anchor_weights(positions, centres[0]), anchor_weights(positions, centres[1])
-        self.anchors = anchors
-        self.frame_shape = len(centres[0]), len(centres[1])
-        self.cells = (len(rows.centres), len(columns.centres))
-        self.shape = (anchors * self.cells[0], anchors * self.cells[1])
 
         def layer(depth: float) -> _Raster | _Terms:
             if geometry.is_correlated(spectrum is not None):
@@ -250,7 +246,36 @@ class FrameOptics:
                 return _Raster(shadow, weights, places, None if summed is None else _Terms(summed, weights))
             return _Terms(_shadow(geometry, rows, columns, depth, spectrum, places), weights)
 
-        self._layers = [layer(depth) for depth in depths]
+        self._prepare([layer(depth) for depth in depths], (len(rows.centres), len(columns.centres)))
+
+    @classmethod
+    def of_terms(cls, layers: Sequence[SeparableTerms], weights: tuple[FloatArray, FloatArray]) -> FrameOptics:
+        """Optics whose shadow is known: what :attr:`terms` and :attr:`weights` of others were.
+
+        Parameters
+        ----------
+        layers
+            terms of each layer.
+        weights
+            of the anchors, (m, anchors) along rows and (m', anchors) along columns.
+        """
+        found = cls.__new__(cls)
+        cells = layers[0][0][0].shape[1], layers[0][0][1].shape[1]
+        found._prepare([_Terms(terms, weights) for terms in layers], cells)
+        return found
+
+    def _prepare(self, layers: Sequence[_Raster | _Terms], cells: tuple[int, int]) -> None:
+        self._layers, self.cells = layers, cells
+        self.weights = layers[0].weights
+        (rows, self.anchors), (columns, _) = (each.shape for each in self.weights)
+        self.frame_shape = rows, columns
+        self.shape = (self.anchors * cells[0], self.anchors * cells[1])
+
+    @property
+    def terms(self) -> list[SeparableTerms] | None:
+        """The shadow of each layer as separable terms; None where one is drawn on a raster."""
+        found = [layer.terms for layer in self._layers if isinstance(layer, _Terms)]
+        return found if len(found) == len(self._layers) else None
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""

@@ -213,7 +213,7 @@ class Accumulation:
 
     Attributes
     ----------
-    shots, factors, method
+    shots, factors, solver
         of which, and for what image.
     model
         that the frames are of, factorised.
@@ -227,17 +227,12 @@ class Accumulation:
 
     shots: Capture
     factors: Factors
-    method: str
+    solver: Solver
     model: Model
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
     iterative: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def solver(self) -> Solver:
-        """Of the method."""
-        return SOLVERS[self.method]
 
     @property
     def prepared(self) -> Prepared:
@@ -273,14 +268,14 @@ class Accumulation:
         return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
 
-def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, **iterative: Any) -> Accumulation:
+def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHONOV], **iterative: Any) -> Accumulation:
     """The model of shots and factors factorised, and every frame added.
 
     Parameters
     ----------
     shots, factors
         that fit each other.
-    method, **iterative
+    solver, **iterative
         of the image that they are for, as in :class:`Accumulation`.
 
     Raises
@@ -288,7 +283,6 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, **itera
     MitsimError
         when that takes more memory than is free, or a frame cannot be read.
     """
-    solver = SOLVERS[method]
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
     # The difference of a pair has no ambient frame.
@@ -304,7 +298,7 @@ def accumulate(shots: Capture, factors: Factors, method: str = TIKHONOV, **itera
         if few:
             kept.append(measurement)
     model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulation(shots, factors, method, model, frames, noise, tuple(kept), iterative)
+    return Accumulation(shots, factors, solver, model, frames, noise, tuple(kept), iterative)
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:

@@ -207,7 +207,7 @@ def reconstruct_psf_request(
         Cost(memory_bytes=4.0 * _NUMBERS * numbers).check(f"{shots.name}: its image", Limits())
         frames = seen.read()
     with clock.stage("solve"):
-        solution = solve_point_spread(camera, frames, request.method, request.lam, **request.iterative)
+        solution = solve_point_spread(camera, frames, request.name, request.lam, **request.iterative)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
     if seen.saturated:
         flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")

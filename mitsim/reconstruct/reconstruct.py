@@ -31,7 +31,7 @@ from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.misfit import Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
 from mitsim.reconstruct.solution import Solution, Verdict
-from mitsim.reconstruct.solvers import SOLVERS
+from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.subpixel import print_energy
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
@@ -59,8 +59,8 @@ class Reconstruction(Solution):
     misfit
         what of the measurements fits no image; None where there are no more data than unknowns.
     uncertainties
-        standard uncertainty of the image by source; None for ``nonnegative``, ``tv`` and with a depth for each pixel,
-        which are not linear in the frames, and by a point spread function.
+        standard uncertainty of the image by source; None for ``nonnegative``, ``tv``, a trained network and with a
+        depth for each pixel, which are not linear in the frames, and by a point spread function.
     seconds
         by stage.
     inputs
@@ -260,7 +260,7 @@ def reconstruct(
     shots: Capture,
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
-    method: str = TIKHONOV,
+    method: str | Solver = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
     depth_range: tuple[float, float] | None = None,
@@ -279,7 +279,8 @@ def reconstruct(
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
         :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
-        bounds, and iterations: :func:`reconstruct_request`) or ``tv`` (least total variation).
+        bounds, and iterations: :func:`reconstruct_request`), ``tv`` (least total variation), or a solver of one's own,
+        such as a trained network (:func:`mitsim.load_network`).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -312,8 +313,8 @@ def reconstruct_request(
     job
         of whose work it is a part: its watch is told of the stages, and the image has their seconds.
     """
-    solver, asked = SOLVERS[request.method], request.inputs(shots, factors)
-    lam, method, margin = request.lam, request.method, request.margin
+    method, asked = request.method, request.inputs(shots, factors)
+    solver, lam, margin = SOLVERS[method] if isinstance(method, str) else method, request.lam, request.margin
     factors.check_fit(shots)
     beside = Margin(margin) if margin else None
     if beside:
@@ -328,7 +329,7 @@ def reconstruct_request(
     clock.predict(cost.seconds if cost else {})
     depth, shots, factors, doubts = _focus(shots, factors, request, clock)
     with clock.stage("accumulate"):
-        data = accumulate(shots, factors, method, **request.iterative)
+        data = accumulate(shots, factors, solver, **request.iterative)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
@@ -426,7 +427,7 @@ def _without_defects(
 
     def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
         rest = defects.left_out(data)
-        without = accumulate(rest, data.factors, data.method, **data.iterative)
+        without = accumulate(rest, data.factors, data.solver, **data.iterative)
         return rest, without, without.solution(lam)
 
     found, now, without = None, misfit, data

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
 """Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+MODEL = ".pt"
+"""Ending of a trained network's file, which may stand for the name of a method."""
 MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 Bounds = tuple[float, float]
@@ -33,7 +35,8 @@ class ImageRequest:
         lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
         from the data.
     method
-        one of :data:`METHODS`.
+        one of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network, which has no
+        lambda.
     focus
         depth of the scene [mm]; ``auto``: that which leaves least of the measurements unexplained; ``map``: one for
         each projector pixel; None: the calibrated one.
@@ -50,7 +53,7 @@ class ImageRequest:
     """
 
     lam: float | Literal["auto"] = "auto"
-    method: str = TIKHONOV
+    method: Any = TIKHONOV
     focus: float | Literal["auto", "map"] | None = None
     margin: int = 0
     depth_range: tuple[float, float] | None = None
@@ -60,9 +63,14 @@ class ImageRequest:
     def __post_init__(self) -> None:
         lam: float | str = self.lam
         focus: float | str | None = self.focus
-        method, margin = self.method, self.margin
-        if method not in METHODS:
-            raise ArgumentError("method", f"{method!r}: use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        method, margin = self.name, self.margin
+        if isinstance(self.method, str) and method not in METHODS:
+            raise ArgumentError(
+                "method",
+                f"{method!r}: use {', '.join(METHODS)} or the file of a trained network, which ends in {MODEL}",
+            )
+        if lam != "auto" and not isinstance(self.method, str):
+            raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
         if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < math.inf):
             raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
         if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus < math.inf):
@@ -112,6 +120,11 @@ class ImageRequest:
         return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
+    def name(self) -> str:
+        """The method's."""
+        return str(self.method if isinstance(self.method, str) else self.method.name)
+
+    @property
     def looks_for_depth(self) -> bool:
         """Whether depths are found from the frames."""
         return self.focus in ("auto", "map")
@@ -125,10 +138,10 @@ class ImageRequest:
             value = getattr(self, name)
             if value != neutral:
                 raise ArgumentError(name, f"{value}: comes with a calibration, not with a point spread function")
-        if self.method not in (TIKHONOV, NONNEGATIVE, TV):
+        if self.name not in (TIKHONOV, NONNEGATIVE, TV):
             raise ArgumentError(
                 "method",
-                f"{self.method}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
+                f"{self.name}: comes with a calibration; by a point spread function use {TIKHONOV}, {NONNEGATIVE} or "
                 f"{TV}",
             )
 
@@ -138,7 +151,7 @@ class ImageRequest:
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
             "lambda": self.lam,
-            "method": self.method,
+            "method": self.name,
         }
         asked |= {} if self.focus is None else {"focus": self.focus}
         asked |= {} if self.depth_range is None else {"depth_range": list(self.depth_range)}

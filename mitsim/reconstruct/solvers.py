@@ -393,6 +393,11 @@ class Solver(Protocol):
     linear: bool
     whole: bool
 
+    @property
+    def name(self) -> str:
+        """The method's."""
+        ...
+
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
         ...
@@ -414,10 +419,10 @@ class Solver(Protocol):
         ...
 
 
-class Tikhonov:
+class Tikhonov(Solver):
     """Least squares with lambda ||X||^2: pixels are independent, the solution is in closed form."""
 
-    linear, whole = True, False
+    name, linear, whole = TIKHONOV, True, False
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised."""
@@ -443,7 +448,7 @@ class Tikhonov:
 class Markov(Tikhonov):
     """The same where neighbouring pixels are alike: lambda times X in the metric of their inverse covariance."""
 
-    whole = True
+    name, whole = MARKOV, True
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised in the basis of correlated pixels."""
@@ -453,7 +458,7 @@ class Markov(Tikhonov):
 class Nonnegative(Tikhonov):
     """Tikhonov's least squares among images within bounds, by iterations."""
 
-    linear = False
+    name, linear = NONNEGATIVE, False
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
@@ -471,7 +476,7 @@ class Nonnegative(Tikhonov):
 class TotalVariation(Tikhonov):
     """Least squares with lambda times the total variation of X, within bounds, by iterations."""
 
-    linear = False
+    name, linear = TV, False
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
@@ -521,10 +526,6 @@ class Convolutional:
         return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)
 
 
-SOLVERS: dict[str, Solver] = {
-    TIKHONOV: Tikhonov(),
-    MARKOV: Markov(),
-    NONNEGATIVE: Nonnegative(),
-    TV: TotalVariation(),
-}
+_ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()
+SOLVERS: dict[str, Solver] = {solver.name: solver for solver in _ALL}
 """By the method that an image is asked by."""

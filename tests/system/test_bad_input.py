@@ -79,6 +79,26 @@ def test_calibrate_refuses(refused: Refused, lab: Any, options: list[str], fragm
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
+        (["--count", "0"], ["--count 0", "give 1 to 1000000 pairs"]),
+        (["--count", "some"], ["'some'"]),
+        (["--pictures", "nowhere"], ["nowhere", "is no folder"]),
+        (["--vary", "nowhere.toml"], ["nowhere.toml"]),
+        (["--patterns", "dots:17"], ["dots:17", "16"]),
+        (["--exposure", "long"], ["--exposure 'long'"]),
+        (["--accuracy", "2"], ["--accuracy 2"]),
+        (["--max-seconds", "0.001"], ["allowed are 0.001 s", "--max-seconds"]),
+        (["--max-memory", "0.01"], ["5 pairs: would take about", "of memory"]),
+    ],
+    ids=lambda value: " ".join(value) if value[0].startswith("--") else None,
+)
+def test_pairs_refuses(refused: Refused, lab: Any, options: list[str], fragments: list[str]) -> None:
+    count = () if "--count" in options else ("--count", "5")
+    mentions(refused("pairs", *lab.arguments, *NEW, *count, *options), *fragments)
+
+
+@pytest.mark.parametrize(
+    ("options", "fragments"),
+    [
         (["--spp", "0"], ["--spp 0", "at least 4"]),
         (["--spp", "-64"], ["--spp -64"]),
         (["--spp", "many"], ["'many'"]),
@@ -105,7 +125,8 @@ def test_render_refuses(refused: Refused, lab: Any, options: list[str], fragment
         (["--lambda", "nan"], ["--lambda nan"]),
         (["--lambda", "inf"], ["--lambda inf"]),
         (["--lambda", "small"], ["'small'", "auto"]),
-        (["--method", "wiener"], ["'wiener'", "tikhonov, markov, nonnegative or tv"]),
+        (["--method", "wiener"], ["'wiener'", "tikhonov, markov, nonnegative, tv or the file of a trained network"]),
+        (["--method", "none.pt"], ["model none.pt: cannot be read"]),
         (["--method", "tv", "--lambda", "-1"], ["--lambda -1"]),
         (["--variant", "llvm_ad_grey"], ["llvm_ad_grey", "llvm_ad_mono"]),
     ],

@@ -25,7 +25,7 @@ from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
     *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
-    *("import", "patterns", "transport", "doctor"),
+    *("import", "patterns", "transport", "doctor", "pairs", "train"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
@@ -233,6 +233,44 @@ def test_characterise_and_sense(call: Callable[..., Any], tmp_path: Path) -> Non
     assert {"camera", "exposure_s", "wavelength_nm", "seed", "mean_dn", "largest_dn", "notes"} <= sensed.keys()
     refused = call("sense", tmp_path / "image.npy", "--camera", "imx477", "-o", tmp_path / "other.png")
     assert refused.code == 2 and "quantum_efficiency" in refused.err and not (tmp_path / "other.png").exists()
+
+
+def test_pairs(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    options = "--count", 3, "--patterns", "dots:4", "--json", "--quiet", "--variant", "llvm_ad_mono"
+    found = call("pairs", *lab.arguments, "-o", tmp_path / "pairs", *options).payload
+    assert found.keys() == {
+        *("count", "n", "frames", "shape", "patterns", "exposure_s", "idealised", "traced_anew", "seed", "pictures"),
+        *("groups", "ambient_shots", "predicted_seconds", "predicted_bytes", "bytes", "seconds", "kernels"),
+        *("warnings", "output"),
+    }
+    assert (found["count"], found["n"], found["frames"], found["shape"]) == (3, 16, 16, [64, 64])
+    assert (found["groups"], found["idealised"], found["traced_anew"]) == (1, False, "")
+    assert number(found["exposure_s"], 1e-6) and number(found["predicted_seconds"], 1e-6)
+    assert_seconds(found["seconds"], "plan", "pairs")
+    assert sorted(path.name for path in (tmp_path / "pairs").iterdir()) == ["pairs.json", "pairs_00000.h5"]
+    flagged = call("pairs", *lab.arguments, "-o", tmp_path / "bright", *options, "--exposure", "1000")
+    assert flagged.code == 1 and "3 pairs are expected to fill the full well" in flagged.payload["warnings"][0]
+
+
+def test_train(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """And the network asked for an image of frames that it was not trained for: it comes with the doubt."""
+    pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[learn]'")
+    common = "--json", "--quiet", "--variant", "llvm_ad_mono"
+    options = "--count", 8, "--patterns", "dots:4", "--idealised", *common
+    call("pairs", *lab.arguments, "-o", tmp_path / "pairs", *options)
+    found = call("train", "refined", tmp_path / "pairs", "-o", tmp_path / "m.pt", "--steps", 2, *common).payload
+    assert found.keys() == {
+        *("model", "weights", "curve", "psnr_before_db", "psnr_db", "steps", "predicted_seconds", "seconds", "output"),
+    }
+    assert found["model"].startswith("refined ") and found["steps"] == 2 and len(found["curve"]) == 3
+    assert_seconds(found["seconds"], "read", "train")
+    assert not (tmp_path / "m.pt.unfinished").exists()
+    asked = "reconstruct", lab.run, "--calibration", lab.calibration, "--method", tmp_path / "m.pt"
+    image = call(*asked, "-o", tmp_path / "image", *common)
+    assert image.payload["uncertainty"] is None and found["model"] in image.payload["status"]
+    assert image.code == 1 and "trained with" in image.payload["status"]
+    refused = call(*asked, "-o", tmp_path / "other", "--lambda", "1")
+    assert refused.code == 2 and "--lambda 1.0: refined" in refused.err and "has none" in refused.err
 
 
 # ---- exit statuses ---------------------------------------------------------------------------------------------------

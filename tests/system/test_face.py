@@ -375,6 +375,10 @@ TYPOS = (
     (["render", "nosuchscene", "-o", "frame.exr"], "nosuchscene"),
     (["reconstruct", "nosuchrun", "--calibration", "cal", "--lambda", "small"], "--lambda 'small'"),
     (["reconstruct", "nosuchrun", "--calibration", "cal"], "nosuchrun"),
+    (["train", "unroled", "pairs", "-o", "m.pt"], "did you mean unrolled?"),
+    (["train", "unrolled", "pairs", "-o", "m.txt"], "ends in .pt"),
+    (["train", "unrolled", "nosuch", "-o", "m.pt"], "calibration: nosuch holds none"),
+    (["train", "unrolled", "nosuch", "-o", "m.pt", "--rate", "0"], "--rate 0.0"),
 )
 
 
@@ -414,6 +418,7 @@ def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Call
     given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
     given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed", "psf"), "new")
     given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
+    given |= {"method": "unrolled", "pairs": "new"}
     given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
     parameters = inspect.signature(called).parameters.values()
     return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}

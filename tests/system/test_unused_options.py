@@ -48,6 +48,8 @@ CASES = [
     ("patterns stripes --camera imx249 --exposure 1 -o {out}", "--seed 1"),
     ("capture photograph --patterns dots:3 --exposure 0.1 -o {out}", "--exposure-fraction 0.5"),
     ("capture photograph --patterns dots:3 --ambient-frame no -o {out}", "--ambient-shots 4"),
+    ("pairs photograph --count 2 --exposure 0.1 -o {out}", "--exposure-fraction 0.5"),
+    ("pairs photograph --count 2 --ambient-frame no -o {out}", "--ambient-shots 4"),
     ("characterise imx249 -o {out}", "--wavelength 550"),
     ("sense {folder}/light.npy --camera imx249 --exposure 1 -o {out}.npy", "--exposure-fraction 0.8"),
     *(

@@ -112,7 +112,9 @@ def test_a_further_solver_is_a_class_and_its_name(
         and found.misfit.unexplained == (least.misfit and least.misfit.unexplained)
     )
     assert json.loads((found.save(tmp_path / "image") / "result.json").read_text())["inputs"]["method"] == "projected"
-    with pytest.raises(MitsimError, match=r"use tikhonov, markov, nonnegative, tv.* or projected"):
+    with pytest.raises(
+        MitsimError, match=r"use tikhonov, markov, nonnegative, tv.* projected or the file of a trained"
+    ):
         reconstruct(shots, factors, method="positive")
 
 

@@ -1,0 +1,271 @@
+"""A trained network with what it was trained for: its file in, a solver out that images are asked by.
+
+The file is what `torch.load` reads with `weights_only`: tensors, and a text of JSON. Nothing in it is run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+from zipfile import is_zipfile
+
+import numpy as np
+import torch
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import validate
+from mitsim.core.errors import MitsimError, cut, reason_of
+from mitsim.core.files import check_plain, json_text, whole_file
+from mitsim.core.manifests import SIDES
+from mitsim.learn.diagonal import Data, Diagonal
+from mitsim.learn.methods import CLASSES, Method
+from mitsim.learn.training_request import ModelManifest
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
+from mitsim.reconstruct.request import TIKHONOV
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
+
+_MOST_BYTES = 1 << 28
+"""Of a file: 256 MiB, fifty times the largest that `mitsim train` writes for 128 pixels."""
+_SAME_CAMERA = 0.02
+"""Relative difference of two calibrations' models above which they are of two cameras: four times that of two sessions
+of 512 frames; a scene an eighth of a pixel aside has as much."""
+_OTHER_NOISE = 1.5
+"""Factor by which noise may lie outside of what was trained with: that of half an exposure is 1.4."""
+_UNEXPLAINED = 3.5e-3
+"""Part of the frames, rms, that an image may leave beyond noise within the model's range: the limit of misfit outside
+of it (:mod:`mitsim.reconstruct.misfit`)."""
+_NO_NOISE = 1e-14
+"""Part of the frames' energy that counts as noise where there is none: rounding of single precision."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded(Prepared):
+    """A factorised model, with ``doubts`` on whether a network knows it; its frames are kept where they are read."""
+
+    doubts: tuple[str, ...] = ()
+    keeps: bool = False
+
+    def accumulator(self) -> Accumulator:
+        """An empty sum to add frames to."""
+        return _Keeping(self) if self.keeps else Accumulator(self)
+
+
+class _Keeping(Accumulator):
+    """A sum that keeps its frames."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        super().__init__(prepared)
+        self.kept: dict[tuple[int, int], FloatArray] = {}
+
+    def add(self, frame: Any, row: int, column: int) -> None:
+        super().add(frame, row, column)
+        self.kept[row, column] = np.asarray(frame)
+
+
+@dataclass(frozen=True, eq=False)
+class Learned(Solver):
+    """A trained network as a method of solving; :func:`read_network` reads one.
+
+    Attributes
+    ----------
+    manifest
+        what it was trained for.
+    network
+        in the state of its file.
+    sides, patterns
+        factors and patterns that it was trained with.
+    """
+
+    manifest: ModelManifest
+    network: Method
+    sides: tuple[FloatArray, FloatArray]
+    patterns: Patterns
+
+    linear, whole = False, False
+
+    @property
+    def name(self) -> str:
+        """The method, and the first digits of a fingerprint that equal networks share."""
+        digest = hashlib.sha256(self.manifest.model_dump_json().encode())
+        for name, values in self.network.state_dict().items():
+            digest.update(name.encode() + values.cpu().contiguous().numpy().tobytes())
+        return f"{self.manifest.method} {digest.hexdigest()[:12]}"
+
+    def init(self, camera: Factors, patterns: Patterns) -> Prepared:
+        """The ``camera``'s model under ``patterns``, factorised, with doubts where it is not what the network knows.
+
+        MitsimError for images of another size and other patterns.
+        """
+        shape = camera.left.shape[1], camera.right.shape[1]
+        if shape != self.network.shape:
+            raise MitsimError(
+                f"model {self.name}: makes images of {_size(self.network.shape)} pixels, but calibration {camera.name} "
+                f"has {_size(shape)}; train one for it"
+            )
+        if not all(np.array_equal(own, other) for own, other in zip(self.patterns, patterns, strict=True)):
+            raise MitsimError(
+                f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
+                "others; capture those, or train one for these"
+            )
+        return _Recorded(
+            **vars(SOLVERS[TIKHONOV].init(camera, patterns)),
+            doubts=self._doubts(camera),
+            keeps=self.network.reads_frames,
+        )
+
+    def _doubts(self, camera: Factors) -> tuple[str, ...]:
+        """Sentences on what a ``camera`` differs in from that of the pairs."""
+        ours, theirs = self.manifest.camera, camera.manifest.camera
+        others = [name for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]
+        if others:
+            return (f"The network was trained for another camera: {', '.join(map(cut, others))} differ.",)
+        difference = _difference(self.sides, camera.sides)
+        if difference > _SAME_CAMERA:
+            return (f"The network was trained with a calibration that differs by {difference:.1%}.",)
+        return ()
+
+    def compute(
+        self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
+    ) -> Solution:
+        """The image of ``frames``.
+
+        Parameters
+        ----------
+        prepared, frames
+            what :meth:`init` gives, and all frames, added up.
+        lam, **iterative
+            ``auto`` and nothing: a network has none.
+
+        Raises
+        ------
+        MitsimError
+            for missing frames, no more data than unknowns, and an image that is not finite.
+        """
+        problem = prepared.problem(frames)
+        variance = datum_variance(problem)
+        like = next(self.network.parameters())
+        data = Data.of(problem.projected[None], variance, like)
+        if isinstance(frames, _Keeping):
+            data = replace(data, frames=torch.as_tensor(_stack(frames)).to(like)[None])
+        with torch.no_grad():
+            found = self.network(data, Diagonal.of(prepared, like))[0, 0]
+        image = found.cpu().numpy().astype(np.float64)
+        if not np.isfinite(image).all():
+            raise MitsimError(f"model {self.name}: its image of these frames is not finite; train it anew")
+        missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
+        beyond = float(np.sqrt(max(missed - variance * prepared.rank, 0.0) / problem.energy))
+        outside = max(problem.energy - float(np.square(problem.projected).sum()), 0.0)
+        flags = [*(prepared.doubts if isinstance(prepared, _Recorded) else ())]
+        relative, (low, high) = relative_noise(problem), self.manifest.noise
+        if not low / _OTHER_NOISE <= relative <= high * _OTHER_NOISE:
+            flags.append(
+                f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, and here it is "
+                f"{relative:.1e}."
+            )
+        if beyond > _UNEXPLAINED:
+            flags.append(f"The image does not give the frames: {beyond:.1e} of them, beyond noise, are others.")
+        return Solution(
+            image=image,
+            lam=variance * float(torch.exp(self.network.log_start.detach())),
+            residual=float(np.sqrt((missed + outside) / problem.energy)),
+            status=Status(
+                Verdict.SOLVED,
+                f"Found by a trained network, {self.name}: what it adds to the frames is likely, not measured, and its "
+                "uncertainty is not known",
+                figures=f"{prepared.extent}.",
+                flags=tuple(flags),
+            ),
+        )
+
+    def save(self, path: Path | str) -> None:
+        """Write the file ``path``, whole or not at all. MitsimError when it cannot be written."""
+        tensors = {
+            **dict(zip(SIDES, self.sides, strict=True)),
+            **dict(zip(_PATTERNS, self.patterns, strict=True)),
+        }
+        state = {name: values.cpu() for name, values in self.network.state_dict().items()}
+        held = {
+            "manifest": json_text(self.manifest.model_dump()),
+            "tensors": {name: torch.as_tensor(np.asarray(values, np.float64)) for name, values in tensors.items()},
+            "weights": state,
+        }
+        with whole_file(path) as part:
+            torch.save(held, part)
+
+
+_PATTERNS = ("P_L", "P_R")
+"""Tensors of the patterns' factors."""
+
+
+def read_network(path: Path | str, device: str) -> Learned:
+    """The network in a file of `mitsim train`.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    device
+        of torch that it is to work on.
+
+    Raises
+    ------
+    MitsimError
+        for a file that cannot be read, is none of these, or has numbers that are not finite.
+    """
+    if check_plain(path, "model").st_size > _MOST_BYTES:
+        raise MitsimError(f"model {path}: is larger than {_MOST_BYTES >> 20} MiB; give a file of `mitsim train`")
+    try:
+        if not is_zipfile(path):  # torch reads older files with warnings
+            raise ValueError("no file of torch")
+        held = torch.load(path, map_location="cpu", weights_only=True)
+        manifest = validate(ModelManifest, json.loads(held["manifest"]), f"model {path}")
+        left, right, *patterns = (held["tensors"][name].numpy() for name in (*SIDES, *_PATTERNS))
+        network = CLASSES[manifest.method]((left.shape[1], right.shape[1]))
+        network.load_state_dict(held["weights"])
+        finite = all(bool(values.isfinite().all()) for values in network.state_dict().values())
+    except MitsimError:
+        raise
+    except Exception as error:  # torch.load raises of all kinds
+        raise MitsimError(
+            f"model {path}: is no file of `mitsim train` ({cut(reason_of(error), 200)}); train one"
+        ) from error
+    if not finite:
+        raise MitsimError(f"model {path}: has weights that are not finite; train it anew")
+    return Learned(manifest, network.to(device).eval(), (left, right), (patterns[0], patterns[1]))
+
+
+def datum_variance(problem: DiagonalProblem) -> float:
+    """Noise variance of a datum of a ``problem`` [(electrons / s)^2], at least rounding's."""
+    return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
+
+
+def relative_noise(problem: DiagonalProblem) -> float:
+    """Noise of a datum of a ``problem`` over the rms of all data."""
+    return float(np.sqrt(datum_variance(problem) * problem.data_count / problem.energy))
+
+
+def _stack(frames: _Keeping) -> FloatArray:
+    """(K, K', m, m') the frames that were kept."""
+    rows, columns = (side.pattern_count for side in (frames.prepared.left, frames.prepared.right))
+    return np.array([[frames.kept[row, column] for column in range(columns)] for row in range(rows)])
+
+
+def _difference(ours: Patterns, theirs: Patterns) -> float:
+    """||A - B|| / ||A|| of the models of two pairs of factors, as of Kronecker products."""
+    if any(a.shape != b.shape for a, b in zip(ours, theirs, strict=True)):
+        return 1.0
+    own, other, both = (
+        float(np.prod([np.vdot(a, b) for a, b in zip(first, second, strict=True)]))
+        for first, second in ((ours, ours), (theirs, theirs), (ours, theirs))
+    )
+    return float(np.sqrt(max(own + other - 2 * both, 0.0) / own))
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} x {shape[1]}"

@@ -1,0 +1,459 @@
+"""A store of pairs and its camera's factors in, a trained network out: batches, steps, judgement, and going on later.
+
+What frames say of an image is their sum W (:mod:`mitsim.learn.diagonal`), so the frames are read once, and a step takes
+as long under 49 patterns as under one. Every step draws from random streams of its own number, so a training that was
+cut short goes on bit-equal, at the same number of threads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import versions
+from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
+from mitsim.core.files import whole_file
+from mitsim.core.job import Cost, Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
+from mitsim.learn.diagonal import Data, Diagonal
+from mitsim.learn.learned_solver import Learned, datum_variance, relative_noise
+from mitsim.learn.methods import CLASSES, Method
+from mitsim.learn.pair_store import PairStore
+from mitsim.learn.training_request import FEWEST_PAIRS, ModelManifest, Training
+from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.request import TIKHONOV
+from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solvers import SOLVERS
+
+_JUDGING, _MOST_JUDGING = 16, 48
+"""One pair in so many judges and does not teach, up to so many: their mean PSNR is then known to 0.5 dB, and its change
+from step to step much better."""
+_LOOKS = 20
+"""Times that the training is judged; a look takes a twentieth of the steps between two."""
+_PATIENCE = 6
+"""Looks without a better one after which it stops: the rate falls over the last two thirds of the cycle."""
+_GAIN_DB = 0.01
+"""What counts as better."""
+_RISING = 0.15
+"""Part of the steps over which the learning rate rises; then it falls as a cosine to 0."""
+_DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
+"""Of AdamW; and the norm to which gradients are cut, which keeps the first steps from running away."""
+_BASE_BYTES, _BYTES_A_PIXEL = 6e8, 1500.0
+"""Memory of torch; and of a pixel that goes through a network with its gradient: 950 measured at a width of 32, half as
+much again for the wider ones."""
+_FRAME_PIXELS = 8
+"""Pixels of a frame that take as much as one of an image: half the width, on a quarter of the squares."""
+_LOOK = 0.05
+"""What a look adds to the steps before it; measured of 56 pictures and 100 steps of 8."""
+_UNFINISHED = ".unfinished"
+"""Ending of the file beside a model's that a training goes on from."""
+
+
+# -------- Pairs
+
+
+class PairDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Pairs of a store as a map-style data set of PyTorch: item -> (frames (K, m, m') [electrons / s], truth (1, n,
+    n')), single precision, read when it is asked for.
+
+    Parameters
+    ----------
+    store
+        the pairs.
+    """
+
+    def __init__(self, store: PairStore) -> None:
+        self.store = store
+
+    def __len__(self) -> int:
+        return len(self.store)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        return torch.from_numpy(self.store.frames(index)), torch.from_numpy(self.store.truth(index))[None]
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """What the frames of all pairs add up to.
+
+    Attributes
+    ----------
+    truths, weights, variances
+        (N, n, n'), (N, r, r') W, and (N,) of a datum's noise.
+    noise
+        least and largest noise of a datum over its rms.
+    """
+
+    truths: FloatArray
+    weights: FloatArray
+    variances: FloatArray
+    noise: tuple[float, float]
+
+    @classmethod
+    def of(cls, store: PairStore, prepared: Prepared, job: Job) -> Sums:
+        """Read all pairs.
+
+        Parameters
+        ----------
+        store, prepared
+            the pairs, and the model of their camera.
+        job
+            whose limits the time must keep, and who is told how far it is.
+        """
+        count, started = len(store), time.perf_counter()
+        truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
+        for index in range(count):
+            frames = prepared.accumulator()
+            for frame, (row, column) in zip(store.frames(index), store.indices, strict=True):
+                frames.add(frame, row, column)
+            problem = prepared.problem(frames)
+            variances[index], noise[index] = datum_variance(problem), relative_noise(problem)
+            weights.append(problem.projected.astype(np.float32))
+            truths.append(store.truth(index))
+            if not index:
+                each = time.perf_counter() - started
+                held = 4.0 * count * (problem.projected.size + truths[0].size)
+                Cost(each * count, held).check(f"{store.folder}: reading {count} pairs", job.limits)
+            job.progress("read", (index + 1) / count)
+        return cls(np.stack(truths), np.stack(weights), variances, (float(noise.min()), float(noise.max())))
+
+
+# -------- Steps
+
+
+@dataclass(eq=False)
+class Trainer:
+    """A network while it is trained.
+
+    Attributes
+    ----------
+    request, store, prepared, sums
+        how, and on what.
+    network
+        that is trained.
+    """
+
+    request: Training
+    store: PairStore
+    prepared: Prepared
+    sums: Sums
+    network: Method
+
+    def __post_init__(self) -> None:
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), betas=_BETAS, weight_decay=_DECAY)
+        self._like = next(self.network.parameters())
+        self.model = Diagonal.of(self.prepared, self._like)
+        count = len(self.sums.truths)
+        judging = min(max(count // _JUDGING, 1), _MOST_JUDGING)
+        order = stream(self.request.seed, "judging").permutation(count)
+        self.judging, self.teaching = np.sort(order[:judging]), np.sort(order[judging:])
+
+    def rate(self, number: int) -> float:
+        """Learning rate of step ``number``."""
+        part, rising = (number + 0.5) / self.request.steps, _RISING
+        if part < rising:
+            return self.request.rate * part / rising
+        return self.request.rate * 0.5 * (1 + math.cos(math.pi * (part - rising) / (1 - rising)))
+
+    def step(self, number: int) -> float:
+        """Take step ``number`` of all; what it made smaller."""
+        random = stream(self.request.seed, "step", number)
+        chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
+        truths, data = self.batch(chosen)
+        if not self.network.reads_frames:
+            truths, data = self._turn(truths, data, random)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate(number)
+        noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
+        loss = self.network.loss(truths, data, self.model, noise)
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
+        self.optimiser.step()
+        return float(loss.detach())
+
+    def batch(self, chosen: Any) -> tuple[Tensor, Data]:
+        """Truths (B, 1, n, n') and data of the pairs that are ``chosen``."""
+        truths = torch.as_tensor(self.sums.truths[chosen])[:, None].to(self._like)
+        data = Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
+        if not self.network.reads_frames:
+            return truths, data
+        shape = tuple(side.pattern_count for side in (self.prepared.left, self.prepared.right))
+        frames = np.stack([self.store.frames(int(index)) for index in chosen])
+        ordered = np.empty((len(chosen), *shape, *frames.shape[2:]), np.float32)
+        for number, (row, column) in enumerate(self.store.indices):
+            ordered[:, row, column] = frames[:, number]
+        return truths, Data(data.weights, data.deviation, torch.as_tensor(ordered).to(self._like))
+
+    def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
+        """The second half of a batch with turned pictures, and with what the frames held beside them: a store then
+        teaches as eight times as many pictures."""
+        half = len(truths) // 2
+        ways = [axis for axis in (-2, -1) if random.random() < 0.5]
+        turned = truths[half:].flip(ways)
+        if truths.shape[-1] == truths.shape[-2] and random.random() < 0.5:
+            turned = turned.transpose(-2, -1)
+        sigma = self.model.sigma / data.deviation[half:]
+        moved = data.weights[half:] + sigma * self.model.coefficients(turned - truths[half:])
+        weights = torch.cat([data.weights[:half], moved])
+        return torch.cat([truths[:half], turned]), Data(weights, data.deviation)
+
+    def seconds_a_step(self) -> float:
+        """Seconds that a step takes, by one that changes nothing; with its part of a look."""
+        truths, data = self.batch(self.teaching[: self.request.batch])
+        taken = []
+        for _ in range(2):  # the first makes what later ones find
+            started = time.perf_counter()
+            self.network.loss(truths, data, self.model, torch.Generator().manual_seed(0)).backward()
+            taken.append(time.perf_counter() - started)
+        self.optimiser.zero_grad()
+        return taken[-1] * (1 + _LOOK)
+
+    def judge(self) -> float:
+        """Mean PSNR [dB] of the pairs that do not teach."""
+        found = []
+        with torch.no_grad():
+            for index in self.judging:
+                truths, data = self.batch(np.array([index]))
+                found.append(-10 * math.log10(float((self.network(data, self.model) - truths).square().mean())))
+        return float(np.mean(found))
+
+
+# -------- A training
+
+
+@dataclass(eq=False)
+class State:
+    """Where a training is.
+
+    Attributes
+    ----------
+    step
+        steps that are done.
+    curve
+        step, and mean PSNR [dB] of the pairs that do not teach after it; the first before any step.
+    best
+        weights after the best of these.
+    network, optimiser
+        weights, and what AdamW knows of them.
+    """
+
+    step: int
+    curve: list[tuple[int, float]]
+    best: dict[str, Tensor]
+    network: dict[str, Tensor]
+    optimiser: dict[str, Any]
+
+    @classmethod
+    def first(cls, trainer: Trainer) -> State:
+        """Before any step of a ``trainer``."""
+        weights = _copy(trainer.network)
+        return cls(0, [(0, trainer.judge())], weights, weights, trainer.optimiser.state_dict())
+
+    def restore(self, trainer: Trainer) -> None:
+        """Put a ``trainer`` there."""
+        trainer.network.load_state_dict(self.network)
+        trainer.optimiser.load_state_dict(self.optimiser)
+
+    def is_over(self, steps: int) -> bool:
+        """Whether all ``steps`` are done, or the last looks brought nothing."""
+        psnr = [value for _, value in self.curve]
+        return self.step >= steps or max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
+
+    def go_on(self, trainer: Trainer, job: Job) -> None:
+        """Take the steps of a ``trainer`` up to its next look; ``job`` is told how far it is. MitsimError where numbers
+        run away."""
+        steps = trainer.request.steps
+        for number in range(self.step, min(self.step + max(steps // _LOOKS, 1), steps)):
+            if not math.isfinite(trainer.step(number)):
+                raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
+            self.step = number + 1
+            job.progress("train", self.step / steps)
+        self.curve.append((self.step, trainer.judge()))
+        job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.step / steps)
+        self.network, self.optimiser = _copy(trainer.network), trainer.optimiser.state_dict()
+        if self.curve[-1][1] >= max(value for _, value in self.curve):
+            self.best = self.network
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """The file at ``path`` that an interrupted training goes on from; ``digest`` tells which one it is."""
+
+    path: Path
+    digest: str
+
+    def write(self, state: State) -> None:
+        """Keep a ``state``, whole or not at all."""
+        with whole_file(self.path) as part:
+            torch.save({"digest": self.digest, **vars(state)}, part)
+
+    def read(self) -> State:
+        """The state that was kept; MitsimError where it is of another training, or cannot be read."""
+        try:
+            held = torch.load(self.path, map_location="cpu", weights_only=True)
+            own = held.pop("digest")
+            state = State(**held)
+        except Exception as error:  # torch.load raises of all kinds
+            raise MitsimError(f"{self.path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
+        if own != self.digest:
+            raise MitsimError(
+                f"{self.path}: is of a training of other pairs, factors or options; give those, or remove it"
+            )
+        return state
+
+
+def _copy(network: Method) -> dict[str, Tensor]:
+    """The weights of a ``network`` as they are now."""
+    return {name: values.detach().cpu().clone() for name, values in network.state_dict().items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A trained network, and how it came to be.
+
+    Attributes
+    ----------
+    model
+        the network.
+    curve
+        step, and mean PSNR [dB] of the pairs that do not teach after it; the first before any step.
+    predicted_seconds
+        of it all.
+    output
+        its file.
+    """
+
+    model: Learned
+    curve: tuple[tuple[int, float], ...]
+    predicted_seconds: float
+    output: str
+
+    def summary(self) -> dict[str, Any]:
+        """What the command line's JSON says of it."""
+        return {
+            "model": self.model.name,
+            "weights": sum(values.numel() for values in self.model.network.parameters()),
+            "curve": [list(point) for point in self.curve],
+            "psnr_before_db": self.curve[0][1],
+            "psnr_db": max(psnr for _, psnr in self.curve),
+            "steps": self.curve[-1][0],
+            "predicted_seconds": self.predicted_seconds,
+            "output": self.output,
+        }
+
+
+@single_threaded_blas()
+def train_network(
+    store: PairStore, factors: Factors, request: Training, output: Path | str, job: Job | None = None,
+    resume: bool = False,
+) -> Trained:  # fmt: skip
+    """Train a network and write its file.
+
+    Parameters
+    ----------
+    store, factors
+        the pairs, and the calibration of their camera that images will be made with.
+    request
+        the method, steps and seed.
+    output
+        the file; what a training goes on from stands beside it until it is over.
+    job
+        its limits, and who is told how far it is.
+    resume
+        whether to go on where an interrupted training of the same request stopped.
+
+    Raises
+    ------
+    MitsimError
+        for pairs and factors of two cameras, too few pairs, more time or memory than is allowed, another unfinished
+        training beside the output, or numbers that run away.
+    """
+    job, output = job or Job(), Path(output)
+    started = time.perf_counter()
+    _check(store, factors)
+    with job.clock.stage("read"):
+        prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
+        network = first_network(request, (factors.left.shape[1], factors.right.shape[1]))
+        _memory(store, network, request).check(f"{store.folder}: training {request.method}", job.limits)
+        sums = Sums.of(store, prepared, job)
+    trainer = Trainer(request, store, prepared, sums, network)
+    about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
+    unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), _digest(asdict(request), factors.fingerprint, about))
+    state = unfinished.read() if resume and unfinished.path.is_file() else State.first(trainer)
+    state.restore(trainer)
+    with job.clock.stage("train"):
+        predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - state.step)
+        Cost(predicted).check(f"{store.folder}: training {request.method}", job.limits)
+        job.clock.predict({"train": predicted})
+        while not state.is_over(request.steps):
+            state.go_on(trainer, job)
+            unfinished.write(state)
+    network.load_state_dict(state.best)
+    manifest = ModelManifest(
+        method=request.method, camera=factors.manifest.camera, factors=factors.fingerprint,
+        patterns=store.manifest.patterns, exposure_s=store.manifest.exposure_s, noise=sums.noise, pairs=about,
+        training={**asdict(request), "curve": state.curve}, versions={**versions(), "torch": str(torch.__version__)},
+    )  # fmt: skip
+    model = Learned(manifest, network.eval(), factors.sides, store.patterns)
+    model.save(output)
+    unfinished.path.unlink(missing_ok=True)
+    return Trained(model, tuple(state.curve), predicted, str(output))
+
+
+def first_network(request: Training, shape: tuple[int, int]) -> Method:
+    """The network before its first step.
+
+    Parameters
+    ----------
+    request, shape
+        the method, its seed and device, and (n, n') of its images. MitsimError for a device that there is not.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(integer(request.seed, "weights"))
+        network = CLASSES[request.method](shape)
+    try:
+        network.to(request.device)
+    except (RuntimeError, AssertionError) as error:
+        raise ArgumentError(
+            "device", f"{request.device!r}: cannot be used ({cut(reason_of(error))}); use cpu"
+        ) from error
+    return network
+
+
+def _check(store: PairStore, factors: Factors) -> None:
+    """MitsimError where a ``store`` has too few pairs, or the ``factors`` are of another camera."""
+    if len(store) < FEWEST_PAIRS:
+        raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
+    sizes = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
+    found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
+    if sizes != found:
+        raise MitsimError(
+            f"calibration {factors.name}: has frames of {sizes[0]} and images of {sizes[1]} pixels, but {store.folder} "
+            f"{found[0]} and {found[1]}; calibrate this camera"
+        )
+
+
+def _memory(store: PairStore, network: Method, request: Training) -> Cost:
+    """Memory that training takes: sums of all pairs of a ``store``, and what a ``network`` keeps of a batch."""
+    pixels = network.shape[0] * network.shape[1] * network.PASSES
+    if network.reads_frames:
+        pixels += store.manifest.frames * store.manifest.m[0] * store.manifest.m[1] // _FRAME_PIXELS
+    sums = 8.0 * len(store) * network.shape[0] * network.shape[1]
+    return Cost(memory_bytes=_BASE_BYTES + sums + _BYTES_A_PIXEL * request.batch * pixels)
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

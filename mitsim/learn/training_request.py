@@ -1,0 +1,90 @@
+"""How a network is asked to be trained in, a refusal out, before torch is imported; and what its file says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from mitsim.core.configuration import Configuration, Positive
+from mitsim.core.errors import ArgumentError, MitsimError, near_name
+from mitsim.core.manifests import FORMAT, Plain
+from mitsim.core.seeds import check_root
+
+UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
+    "unrolled",
+    "refined",
+    "flatnet",
+    "plug-and-play",
+    "preprocessed",
+)
+"""Names of the classes of :mod:`mitsim.learn.methods`."""
+_LARGEST_BATCH = 256
+"""Pairs a step: thirty times what is usual; chosen so that a slip of the keyboard is refused."""
+_LONGEST = 1_000_000
+"""Steps: ten days of the smallest network on two processors; chosen as the batch is."""
+FEWEST_PAIRS = 8
+"""Fewer cannot be parted into those that teach and those that judge; chosen so."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a network is trained. MitsimError for what none is trained by.
+
+    Attributes
+    ----------
+    method
+        one of :data:`METHODS`.
+    steps, batch
+        of the optimiser, and pairs of each of them.
+    rate
+        largest learning rate of the one cycle that the steps go through.
+    seed
+        root of first weights, order of the pairs and their noise.
+    device
+        of torch, such as ``cpu`` or ``cuda``.
+    """
+
+    method: str
+    steps: int = 1500
+    batch: int = 8
+    rate: float = 2e-3
+    seed: int = 0
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            near = near_name(str(self.method), METHODS)
+            raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        for name, most in (("steps", _LONGEST), ("batch", _LARGEST_BATCH)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+                raise ArgumentError(name, f"{value}: give a whole number, 1 to {most}")
+        check_root(self.seed)
+        if not 0 < self.rate <= 1:
+            raise ArgumentError("rate", f"{self.rate}: give a number above 0, at most 1")
+
+
+class ModelManifest(Configuration):
+    """What a network was trained for, and how."""
+
+    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
+    """Version of this format."""
+    method: str
+    """Name of the method, as `mitsim train` takes it."""
+    camera: Plain
+    """Identity of the camera, as its calibration states it."""
+    factors: str
+    """Fingerprint of the calibration's factors."""
+    patterns: str
+    """Name of the patterns' family."""
+    exposure_s: Positive
+    """Of the pairs' frames [s]."""
+    noise: tuple[float, float] = Field(strict=False)
+    """Noise of a datum over its rms, least and largest of the pairs."""
+    pairs: Plain
+    """What the store of the pairs says of itself."""
+    training: Plain
+    """Steps, batch, rate and seed; PSNR of pairs that did not teach, by step; seconds."""
+    versions: dict[str, str]
+    """Of mitsim, torch and others."""

@@ -1,0 +1,97 @@
+"""Training and trained networks for programs: folders and options in, a trained network out, or the line that says what
+is missing. torch, an extra, is imported when it is used.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.files import check_apart, check_plain, output_file
+from mitsim.core.job import Job
+from mitsim.learn.pair_request import CALIBRATION
+from mitsim.learn.training_request import Training
+
+if TYPE_CHECKING:
+    from mitsim.learn.learned_solver import Learned
+    from mitsim.learn.training import Trained
+
+
+def check_torch() -> None:
+    """MitsimError where torch is not installed."""
+    if find_spec("torch") is None:
+        raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
+
+
+@check_arguments
+def load_network(path: Path | str, device: str = "cpu") -> Learned:
+    """A trained network, to give as ``method`` of :func:`mitsim.reconstruct`.
+
+    Parameters
+    ----------
+    path
+        file of `mitsim train`.
+    device
+        of torch that it is to work on.
+
+    Raises
+    ------
+    MitsimError
+        where torch is not installed, or the file is none of these.
+    """
+    check_plain(path, "model")
+    check_torch()
+    from mitsim.learn.learned_solver import read_network
+
+    return read_network(path, device)
+
+
+@check_arguments
+def train(
+    method: str,
+    pairs: Path | str,
+    output: Path | str,
+    calibration: Path | str | None = None,
+    resume: bool = False,
+    job: Job | None = None,
+    **options: Any,
+) -> Trained:
+    """Train a network on pairs, and write its file.
+
+    Parameters
+    ----------
+    method
+        one of :data:`mitsim.learn.training_request.METHODS`.
+    pairs, output
+        folder of `mitsim pairs`, and the file, which ends in ``.pt``.
+    calibration
+        CAL folder of the pairs' camera; None: the folder ``calibration`` in that of the pairs.
+    resume
+        whether to go on where an interrupted training of the same options stopped.
+    job
+        its limits, and who is told how far it is.
+    **options
+        ``steps``, ``batch``, ``rate``, ``seed`` and ``device`` of :class:`mitsim.learn.training_request.Training`.
+
+    Raises
+    ------
+    MitsimError
+        where torch is not installed, for options that no network is trained by, folders that cannot be read or do not
+        fit each other, a file that is there, and more time or memory than is allowed.
+    """
+    request = Training(method, **options)
+    place = Path(pairs) / CALIBRATION if calibration is None else Path(calibration)
+    if calibration is None and not place.is_dir():
+        raise MitsimError(f"calibration: {pairs} holds none; give the folder of `mitsim calibrate`")
+    check_apart(output, [pairs, place])
+    check_torch()
+    with output_file(output) as file:
+        from mitsim.learn.pair_store import PairStore
+        from mitsim.reconstruct.factors import load_calibration
+
+        store, factors = PairStore.open(Path(pairs)), load_calibration(place)
+        from mitsim.learn.training import train_network  # only now: torch takes seconds to import
+
+        return train_network(store, factors, request, file, job, resume)

@@ -1,0 +1,306 @@
+"""Networks that make images of frames: their model, training, files, and what an image by them says of itself."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[learn]'")
+
+import torch
+
+from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.job import Job, Limits
+from mitsim.core.runs import Capture
+from mitsim.learn import training, verbs
+from mitsim.learn.diagonal import Data, Diagonal
+from mitsim.learn.learned_solver import Learned, read_network
+from mitsim.learn.methods import CLASSES
+from mitsim.learn.training import PairDataset, train_network
+from mitsim.learn.training_request import METHODS, Training
+from mitsim.metrics import psnr
+from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
+from mitsim.reconstruct.solvers import SOLVERS
+from tests.ideal_sessions import bench, picture
+from tests.unit.learn.pairs import FakeStore
+
+DOUBLE = torch.zeros((), dtype=torch.float64)
+STEPS = 40
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Any:
+    """Beside other test processes more threads of torch wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **more: Any) -> Learned:
+    request = Training(method, steps=more.pop("steps", STEPS), seed=3)
+    return train_network(FakeStore(patterns=patterns), bench().calibrated(1), request, path, **more).model
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Learned:
+    return trained(tmp_path_factory.mktemp("model") / "m.pt")
+
+
+# -------- The camera's model
+
+
+@pytest.mark.parametrize("patterns", ["uniform", "dots:3", "hadamard:2"])
+def test_the_model_and_its_adjoint(patterns: str) -> None:
+    """Dot tests to rounding, and the sums of the solver itself. (Planted: the basis of columns not transposed.)"""
+    camera = bench()
+    shots, factors = camera.run(patterns, picture(1), 1), camera.calibrated(1)
+    prepared = SOLVERS["tikhonov"].init(factors, shots.patterns)
+    own, random = Diagonal.of(prepared, DOUBLE), torch.Generator().manual_seed(1)
+    frames = np.zeros((*(side.shape[1] for side in shots.patterns), *(len(side) for side in factors.sides)))
+    sums = prepared.accumulator()
+    for each in shots.pattern_measurements():
+        frames[each.row, each.column] = each.frame
+        sums.add(each.frame, each.row, each.column)
+    assert_allclose(own.project(torch.as_tensor(frames)[None])[0], sums.sum, rtol=1e-12, atol=1e-12 * sums.sum.max())
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=random, dtype=torch.float64)
+
+    image, weights, other = draw(1, 1, 16, 16), draw(1, 1, *own.sigma.shape), draw(1, *frames.shape)
+    for there, back in (
+        ((own.coefficients(image) * weights).sum(), (image * own.images(weights)).sum()),
+        ((own.project(other) * weights[:, 0]).sum(), (other * own.frames(weights[:, 0])).sum()),
+    ):
+        assert abs(there - back) < 1e-12 * abs(there)
+
+
+def test_the_step_of_the_frames_is_the_closed_form() -> None:
+    """Of a black start the solver's own image at that lambda, of another the least squares written out. (Planted: rho
+    beside sigma, not beside its square.)"""
+    camera = bench()
+    shots, factors = camera.run("dots:3", picture(1), 1), camera.calibrated(1)
+    prepared = SOLVERS["tikhonov"].init(factors, shots.patterns)
+    sums = prepared.accumulator()
+    for each in shots.pattern_measurements():
+        sums.add(each.frame, each.row, each.column)
+    problem, variance, lam = prepared.problem(sums), 7.0, 3e3
+    data, own = Data.of(problem.projected[None], variance, DOUBLE), Diagonal.of(prepared, DOUBLE)
+    rho = torch.tensor(lam / variance, dtype=torch.float64)
+    found = own.nearest(data, torch.zeros(1, 1, 16, 16, dtype=torch.float64), rho)[0, 0]
+    assert_allclose(found, prepared.solve(sums, lam).image, rtol=1e-9, atol=1e-12)
+    start = np.random.default_rng(1).normal(size=(16, 16))
+    matrix = np.kron(prepared.left.basis.T, prepared.right.basis.T) * prepared.sigma.reshape(-1, 1)
+    stacked = np.vstack([matrix, np.sqrt(lam) * np.eye(256)])
+    right = np.concatenate([problem.projected.ravel(), np.sqrt(lam) * start.ravel()])
+    expected = np.linalg.lstsq(stacked, right, rcond=None)[0].reshape(16, 16)
+    assert_allclose(own.nearest(data, torch.as_tensor(start)[None, None], rho)[0, 0], expected, rtol=1e-8, atol=1e-9)
+
+
+# -------- Training
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_learns(method: str, tmp_path: Path) -> None:
+    """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
+    made = train_network(
+        FakeStore(), bench().calibrated(1), Training(method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
+    )
+    assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
+    blank = replace(made.model, network=training.first_network(Training(method), (16, 16)))
+    before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
+    assert after > before + 0.3
+
+
+@pytest.mark.parametrize("method", ["unrolled", "plug-and-play", "preprocessed"])
+def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) -> None:
+    """And one that was not interrupted twice the same. (Planted: weights without what the optimiser knows.)"""
+    store, factors = FakeStore(12), bench().calibrated(1)
+    request = Training(method, steps=6, batch=4, seed=1)
+
+    def weights(name: str, **more: Any) -> dict[str, np.ndarray]:
+        made = train_network(store, factors, request, tmp_path / name, **more)
+        assert not (tmp_path / f"{name}.unfinished").exists()
+        state = read_network(tmp_path / name, "cpu").network.state_dict()
+        return {"curve": np.array(made.curve), **{key: values.numpy() for key, values in state.items()}}
+
+    whole = weights("a.pt")
+    assert all(map(np.array_equal, whole.values(), weights("b.pt").values()))
+
+    def stop(stage: str, part: float) -> None:
+        if stage == "train" and part > 0.6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_network(store, factors, request, tmp_path / "c.pt", Job(progress=stop))
+    assert not (tmp_path / "c.pt").exists()
+    with pytest.raises(MitsimError, match="other pairs, factors or options"):
+        train_network(store, factors, replace(request, seed=2), tmp_path / "c.pt", resume=True)
+    again = weights("c.pt", resume=True)
+    assert all(map(np.array_equal, whole.values(), again.values()))
+
+
+def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
+    """Without noise and misfit, what a batch holds of a turned picture is what its frames would add up to. (Planted:
+    data turned and truth not.)"""
+    store, factors = FakeStore(8), bench().calibrated(1, error=0.0)
+    request = Training("unrolled", batch=8)
+    prepared = SOLVERS["tikhonov"].init(factors, store.patterns)
+    sums = training.Sums.of(store, prepared, Job())
+    exact = prepared.sigma * (prepared.left.basis.T @ sums.truths.astype(np.float64) @ prepared.right.basis)
+    network = training.first_network(request, (16, 16))
+    trainer = training.Trainer(request, store, prepared, replace(sums, weights=exact), network)
+    truths, data = trainer.batch(np.arange(8))
+    turned, moved = trainer._turn(truths, data, np.random.default_rng(2))
+    assert not torch.equal(turned[4:], truths[4:]) and torch.equal(turned[:4], truths[:4])
+    expected = trainer.model.sigma * trainer.model.coefficients(turned) / moved.deviation
+    assert_allclose(moved.weights, expected, rtol=2e-4, atol=2e-4 * float(expected.abs().max()))
+
+
+def test_pairs_are_a_data_set_of_torch() -> None:
+    store = FakeStore(8, "dots:2")
+    frames, truths = next(iter(torch.utils.data.DataLoader(PairDataset(store), batch_size=3)))
+    assert frames.shape == (3, 4, 96, 96) and truths.shape == (3, 1, 16, 16)
+    assert_array_equal(truths[1, 0], store.truth(1))
+
+
+def test_trainings_that_are_refused(tmp_path: Path) -> None:
+    factors, request = bench().calibrated(1), Training("unrolled", steps=2)
+    with pytest.raises(MitsimError, match="holds 7 pairs; give at least 8"):
+        train_network(FakeStore(7), factors, request, tmp_path / "m.pt")
+    other = replace(factors, left=factors.left[:, :8])
+    with pytest.raises(MitsimError, match="calibrate this camera"):
+        train_network(FakeStore(8), other, request, tmp_path / "m.pt")
+    with pytest.raises(MitsimError, match=r"would take about .* s; allowed are 0\.01 s"):
+        train_network(FakeStore(8), factors, request, tmp_path / "m.pt", Job(limits=Limits(seconds=0.01)))
+    with pytest.raises(ArgumentError, match="device 'abacus': cannot be used"):
+        train_network(FakeStore(8), factors, replace(request, device="abacus"), tmp_path / "m.pt")
+    with pytest.raises(MitsimError, match="ran away at step"):
+        train_network(HotStore(8), factors, request, tmp_path / "m.pt")
+    assert not (tmp_path / "m.pt").exists()
+
+
+class HotStore(FakeStore):
+    """Pairs with a truth that is no number."""
+
+    def truth(self, index: int) -> np.ndarray:
+        return np.full_like(super().truth(index), np.nan)
+
+
+# -------- Images by a network
+
+
+def image_of(model: Learned, patterns: str = "uniform", seed: int = 5, **changes: Any) -> Reconstruction:
+    camera = bench(**changes)
+    return reconstruct(camera.run(patterns, picture(seed), seed), camera.calibrated(1), method=model)
+
+
+def test_an_image_says_by_what_it_was_found(model: Learned, tmp_path: Path) -> None:
+    """Better than least squares at the best lambda, of a picture that never taught; without an uncertainty."""
+    camera = bench()
+    shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
+    found = reconstruct(shots, factors, method=model)
+    classical = max(psnr(reconstruct(shots, factors, lam).image, picture(5)) for lam in np.logspace(2, 9, 29))
+    assert psnr(found.image, picture(5)) > classical
+    assert found.ok and found.uncertainties is None and found.misfit is not None and not found.misfit.flagged
+    assert "Found by a trained network, unrolled " in str(found.status) and "uncertainty is not known" in str(
+        found.status
+    )
+    assert found.inputs["method"] == model.name
+    found.save(tmp_path / "image")
+    assert not (tmp_path / "image" / "uncertainty.exr").exists()
+    with pytest.raises(ArgumentError, match=r"lam 1\.0: unrolled .* has none"):
+        reconstruct(shots, factors, 1.0, method=model)
+
+
+def test_a_file_gives_the_same_image(model: Learned, tmp_path: Path) -> None:
+    model.save(tmp_path / "m.pt")
+    again = verbs.load_network(tmp_path / "m.pt")
+    assert again.name == model.name and again.manifest == model.manifest
+    assert_array_equal(image_of(again).image, image_of(model).image)
+
+
+def test_what_a_network_does_not_know_is_refused(model: Learned) -> None:
+    camera = bench()
+    with pytest.raises(MitsimError, match="trained under the patterns uniform, and these are others"):
+        reconstruct(camera.run("dots:2", picture(5), 5), camera.calibrated(1), method=model)
+    small = replace(camera, left=camera.left[:, :8], right=camera.right[:, :8])
+    with pytest.raises(MitsimError, match="makes images of 16 x 16 pixels, but calibration in memory has 8 x 8"):
+        reconstruct(small.run("uniform", picture(5, 8), 5), small.calibrated(1), method=model)
+
+
+def test_another_bench_is_flagged(model: Learned) -> None:
+    """(Planted: each of the four doubts left out.)"""
+    camera = bench()
+    shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
+    named = {"camera": {"mask": "other"}}
+    others = Capture(shots.manifest.model_copy(update=named), memory=shots._memory)
+    elsewhere = replace(factors, manifest=factors.manifest.model_copy(update=named))
+    assert "trained for another camera: mask differ" in str(reconstruct(others, elsewhere, method=model).status)
+    moved = image_of(model, shift=0.2)
+    assert not moved.ok and "trained with a calibration that differs by" in str(moved.status)
+    dim = image_of(model, peak=500.0)
+    assert not dim.ok and "trained with noise of" in str(dim.status)
+    blind = read_of_nothing(model)
+    assert "The image does not give the frames" in str(image_of(blind).status)
+
+
+def read_of_nothing(model: Learned) -> Learned:
+    """A network whose frames count for nothing at the end."""
+    network = CLASSES["unrolled"]((16, 16))
+    network.load_state_dict(model.network.state_dict())
+    with torch.no_grad():
+        network.log_rho += 30
+    return replace(model, network=network)
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "pickle", "tensors", "nan", "method", "folder", "none"])
+def test_a_file_that_is_none_is_refused(damage: str, model: Learned, tmp_path: Path) -> None:
+    path = tmp_path / "m.pt"
+    model.save(path)
+    held = torch.load(path, weights_only=True)
+    if damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "cut":
+        path.write_bytes(path.read_bytes()[:-5000])
+    elif damage == "pickle":
+        path.write_bytes(pickle.dumps(Path("x")))
+    elif damage == "tensors":
+        torch.save({"x": torch.zeros(3)}, path)
+    elif damage == "nan":
+        held["weights"]["log_start"][...] = float("nan")
+        torch.save(held, path)
+    elif damage == "method":
+        held["manifest"] = held["manifest"].replace('"unrolled"', '"rolled"')
+        torch.save(held, path)
+    else:
+        path.unlink()
+        if damage == "folder":
+            path.mkdir()
+    with pytest.raises(MitsimError, match=r"m\.pt") as refused:
+        verbs.load_network(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verbs, "find_spec", lambda name: None)
+    (tmp_path / "m.pt").touch()
+    (tmp_path / "calibration").mkdir()
+    for work in (
+        lambda: verbs.load_network(tmp_path / "m.pt"),
+        lambda: verbs.train("unrolled", tmp_path, tmp_path / "n.pt"),
+    ):
+        with pytest.raises(MitsimError, match="torch is not installed, which networks need; type: pip install"):
+            work()
+
+
+def test_a_request_says_what_no_network_is_trained_by() -> None:
+    for name, value in (("method", "unroled"), ("steps", 0), ("batch", 1000), ("rate", 0.0), ("rate", float("nan"))):
+        with pytest.raises(MitsimError, match=f"^{name} "):
+            Training(**{**asdict(Training("unrolled")), name: value})

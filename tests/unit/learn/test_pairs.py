@@ -1,0 +1,321 @@
+"""Pairs: light of white prints times a picture, against captures of the picture; and the store that keeps them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.acquire.exposure import Exposer
+from mitsim.api.bench import Bench, open_bench
+from mitsim.bench.prints import show_picture
+from mitsim.bench.request import Request, Task
+from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import integer
+from mitsim.devices.session import load_recipe
+from mitsim.learn import pairs as pairs_module
+from mitsim.learn.pair_request import PairsRequest, Variation
+from mitsim.learn.pair_store import PairStore
+from mitsim.learn.pairs import make_pairs
+from mitsim.learn.white_prints import electrons_per_joule
+from mitsim.optics.frames import Frame
+from mitsim.optics.shadow import Directions
+from mitsim.optics.terms import shadow_terms
+
+pytestmark = pytest.mark.usefixtures("kept_plans")
+
+N, TEXELS = 16, 256
+"""Projector pixels a side, and texels of the 128 mm sheet: 15 of these to a pixel, which begin at the window's edge."""
+LENS = 'name = "x"\neffective_wavelength_nm = 562.0\ncontrast_ratio = 50.0\n'
+LENS += "aperture_radius_mm = 2.0\nfocus_mm = 380.0\nblur_pixels = 0.7\nansi_contrast = 40.0\n"
+"""Of a projector that leaks, blurs and scatters."""
+POINT = '<emitter type="point"><point name="position" x="30" y="50" z="100"/>'
+POINT += '<spectrum name="intensity" value="300"/></emitter>'
+"""A lamp that the camera does not see."""
+SECOND = '<shape type="rectangle"><transform name="to_world"><scale x="20" y="20"/><rotate y="1" angle="90"/>'
+SECOND += '<translate x="-62" z="380"/></transform><bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>'
+"""A wall beside the sheet."""
+
+
+class Lab:
+    """A small scene with a print, and pairs of it."""
+
+    def __init__(self, write: Callable[..., Path], folder: Path, variant: str) -> None:
+        self._write, self._folder, self._variant = write, folder, variant
+
+    def bench(self, print_: np.ndarray | None = None, extra: str = "", projector: str = "", **defines: str) -> Bench:
+        """Before a sheet that shows ``print_`` (TEXELS, TEXELS)."""
+        shown = np.full((TEXELS, TEXELS), 128) if print_ is None else print_
+        scene = self._write("scene" if print_ is None else "shown", n=N, reflectance=shown, extra=extra)
+        path = self._folder / "projector.toml"
+        path.write_text(projector)
+        return open_bench(scene, self._variant, projector=path if projector else None, **defines)
+
+    def pairs(
+        self,
+        count: int = 2,
+        name: str = "store",
+        resume: bool = False,
+        scene: Mapping[str, str] | None = None,
+        **asked: Any,
+    ) -> PairStore:
+        """So many pairs in a folder of that ``name``; ``asked``: fields of a request, or of what pairs are."""
+        own = {key: asked.pop(key) for key in ("idealised", "folder", "variation") if key in asked}
+        request = Request.of(**{"patterns": "dots:2", "accuracy": 2e-3, "seed": 3, **asked})
+        bench_of = dict(scene or {})
+        store, _ = make_pairs(
+            lambda drawn: self.bench(**bench_of, **drawn), PairsRequest(request, count, **own),
+            Task(self._folder / name, resume),
+        )  # fmt: skip
+        return store
+
+
+@pytest.fixture
+def lab(small_scene: Callable[..., Path], tmp_path: Path, variant: str) -> Lab:
+    return Lab(small_scene, tmp_path, variant)
+
+
+def on_sheet(picture: np.ndarray) -> np.ndarray:
+    """(TEXELS, TEXELS) print that shows a picture in the window, and its edges beyond."""
+    pixel = np.clip((np.arange(TEXELS) - 8) // 15, 0, N - 1)
+    return picture[np.ix_(pixel, pixel)]
+
+
+# ---- Frames and truths are those of a capture ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("extra", "projector"),
+    [("", ""), pytest.param("", LENS, marks=pytest.mark.slow), pytest.param(POINT, "", marks=pytest.mark.slow)],
+    ids=["plain", "lens", "lamp"],
+)
+def test_frames_and_truth_are_those_of_a_capture_of_the_picture(lab: Lab, extra: str, projector: str) -> None:
+    """Both are Monte Carlo estimates of one expectation from streams of their own, each of at most 2e-3: the difference
+    stays below 3e-3, where four in a thousand pictures a tenth brighter would differ by more. (Planted: places of the
+    light taken for pixels one column on; the square of the reflectance.)"""
+    scene = {"extra": extra, "projector": projector}
+    store = lab.pairs(scene=scene)
+    for index in range(2):
+        bench = lab.bench(on_sheet(store.picture(index)), extra, projector)
+        shots = bench.capture("dots:2", accuracy=2e-3, seed=70 + index, exposure=1.0)
+        known = np.asarray(shots.electrons, dtype=np.float64)
+        if extra:
+            assert store.manifest.ambient_shots == 16 and shots.ambient is not None
+            known = known - np.asarray(shots.read("ambient.exr")[0]["electrons"], dtype=np.float64)
+        difference = np.linalg.norm(store.expected(index) - known) / np.linalg.norm(known)
+        assert difference < 3e-3
+        assert shots.truth is not None
+        assert np.sqrt(np.square(store.truth(index) - shots.truth).mean()) < (4e-3 if projector else 2e-4)
+
+
+def test_the_projectors_own_light_does_not_tell_another_picture(lab: Lab) -> None:
+    """What the test above would see: two pictures of one store differ a hundred times as much."""
+    store = lab.pairs()
+    frames = store.expected(0), store.expected(1)
+    assert np.linalg.norm(frames[0] - frames[1]) > 0.1 * np.linalg.norm(frames[0])
+
+
+def test_light_over_two_surfaces_is_traced_for_each_picture(lab: Lab) -> None:
+    """It says why, keeps frames, and these are a capture's. (Planted: the picture of pair 0 on all prints.)"""
+    store = lab.pairs(scene={"extra": SECOND})
+    assert "2 surfaces" in store.manifest.traced_anew
+    shots = lab.bench(on_sheet(store.picture(1)), SECOND).capture("dots:2", accuracy=2e-3, seed=70, exposure=1.0)
+    known = np.asarray(shots.electrons, dtype=np.float64)
+    assert np.linalg.norm(store.expected(1) - known) < 3e-3 * np.linalg.norm(known)
+    assert shots.truth is not None and abs(store.truth(1) - shots.truth).max() < 5e-3
+    assert store.frames(1).shape == (4, 64, 64)
+
+
+def test_idealised_frames_are_the_separable_model(lab: Lab) -> None:
+    """P o X between the geometric shadow's factors, by plain products: to single precision. (Planted: the picture's
+    transpose; diffraction left on.)"""
+    store, bench = lab.pairs(idealised=True, exposure=0.01), lab.bench()
+    geometry = bench.geometry
+    sides = [Directions.cells(np.linspace(*edges, N + 1)) for edges in bench.windows]
+    terms = shadow_terms(geometry, *sides, geometry.scene_distance, None)
+    left, right = store.patterns
+    truth = store.truth(1).astype(np.float64)
+    frames = np.stack([
+        sum(one @ (truth * np.outer(left[:, i], right[:, j])) @ other.T for one, other in terms)
+        for i, j in store.indices
+    ])  # fmt: skip
+    expected = store.expected(1)
+    scale = float(np.vdot(expected, frames) / np.vdot(frames, frames))
+    assert abs(expected - scale * frames).max() < 1e-6 * expected.max()
+    # A pixel of a white board puts E A on the sensor; the projector's light is even to 1 %.
+    board = bench.with_board(load_recipe().board_reflectance).light("uniform", accuracy=1e-2).flux.mean()
+    assert scale == pytest.approx(board * electrons_per_joule(bench), rel=0.01)
+    assert np.array_equal(store.truth(1) == store.truth(1).max(), store.picture(1) == store.picture(1).max())
+
+
+# ---- Noise -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drawn(shared_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory, variant: str) -> PairStore:
+    """Four pairs of a small scene."""
+    lab = Lab(lambda name, **more: shared_scene(f"drawn_{name}", **more), tmp_path_factory.mktemp("drawn"), variant)
+    return lab.pairs(4)
+
+
+def test_frames_are_what_the_camera_exposes_of_what_is_expected(drawn: PairStore, lab: Lab) -> None:
+    """Of a run's own exposure with this pair's seed, but for the rounding of what is expected to 32 bits. (Planted:
+    one stream for all shots; dark current left in.)"""
+    bench, pair = lab.bench(), 2
+    exposer = Exposer(bench.devices, drawn.exposure_s(pair), integer(3, "pair", pair))
+    unit = electrons_per_joule(bench)
+    light = [Frame(frame.astype(np.float64) / unit, 0.0, 0.0, 0.0) for frame in drawn.expected(pair)]
+    shots = [
+        (frame, exposer.electrons(frame), shot.names)
+        for frame, shot in zip(light, drawn.manifest.family.shots, strict=True)
+    ]
+    exposed = np.stack([exposer.rate(exposer.digital(electrons, *names)) for _, electrons, names in shots])
+    frames = drawn.frames(pair)
+    assert frames.dtype == np.float32
+    step = 1 / drawn.manifest.digital.gain_dn_per_e / drawn.exposure_s(pair)
+    assert (abs(frames - exposed) > 0.01 * step).mean() < 1e-3, "a count here and there lies between two"
+    assert drawn.exposure_s(pair) == pytest.approx(
+        bench.devices.sensor.superpixel_full_well_e * 0.8 / exposed.max(), rel=0.02
+    )
+
+
+def test_noise_is_drawn_anew_by_its_seed(drawn: PairStore) -> None:
+    """60 draws of 16 384 numbers: their mean within 5 standard errors of what is expected, and their variance within
+    1 % of what the manifest states. (Planted: the seed not heeded; noise of the shots' mean.)"""
+    assert np.array_equal(drawn.frames(1), drawn.draw(1, drawn.manifest.seed))
+    draws = np.stack([drawn.draw(1, 100 + seed) for seed in range(60)]).astype(np.float64)
+    expected = drawn.expected(1).astype(np.float64)
+    digital = drawn.manifest.digital.model_copy(update={"exposure_s": drawn.exposure_s(1)})
+    variance = digital.variance(expected)
+    z = (draws.mean(axis=0) - expected) / np.sqrt(variance / 60)
+    assert abs(z).max() < 5.5 and abs(z.mean()) < 5 / np.sqrt(z.size)
+    assert draws.var(axis=0, ddof=1).mean() == pytest.approx(variance.mean(), rel=0.01)
+
+
+def test_signed_patterns_are_differences(lab: Lab) -> None:
+    """Of what Hadamard patterns measure, sums over all of them are the light of one pixel. (Planted: the negative
+    halves alone.)"""
+    store = lab.pairs(1, patterns="hadamard:2")
+    assert store.manifest.frames == 4 and store.frames(0).shape == (4, 64, 64)
+    assert [tuple(each) for each in store.indices] == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    expected = store.expected(0)
+    assert expected[0].min() >= 0 and expected[1].min() < 0
+    assert abs(store.frames(0) - expected).max() < 0.2 * expected.max()
+
+
+# ---- Benches that vary -----------------------------------------------------------------------------------------------
+
+
+def test_benches_vary_by_group(lab: Lab) -> None:
+    """Scene, mask and exposure are drawn for each group of pairs. (Planted: what was drawn for the first.)"""
+    variation = Variation.model_validate(
+        {
+            "groups": 2,
+            "exposure_fraction": [0.2, 0.8],
+            "scene": {"albedo": [1, 3]},
+            "mask": {"mask_rows_um": [-50, 50]},
+        }
+    )
+    scene = {"extra": POINT.replace("300", "$albedo"), "albedo": "2"}
+    still = lab.pairs(4, "still", scene=scene)
+    store = lab.pairs(4, variation=variation, scene={"extra": scene["extra"]})
+    first, second = store.manifest.groups
+    assert first != second and first.keys() == {"exposure_fraction", "mask.mask_rows_um", "scene.albedo"}
+    assert [(shard.first, shard.count, shard.group) for shard in store.manifest.shards] == [(0, 2, 0), (2, 2, 1)]
+    for index, group in ((1, first), (3, second)):
+        assert np.array_equal(store.picture(index), still.picture(index))
+        filled = store.expected(index).max() * store.exposure_s(index) / lab.bench().sensor.superpixel_full_well_e
+        assert filled == pytest.approx(group["exposure_fraction"], rel=0.02), "lamps and dark current bring the rest"
+        moved = store.expected(index) - still.expected(index)
+        off = np.linalg.norm(moved) / np.linalg.norm(still.expected(index))
+        # A shift of the mask by s um moves the shadow, of features of 60 um; noise of light alone is 2e-3.
+        assert off > 0.3 * abs(group["mask.mask_rows_um"]) / 60
+
+
+# ---- The folder ------------------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_store_is_resumed_bit_equal(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: pictures numbered within their shard; a resumed store that begins anew.)"""
+    monkeypatch.setattr(pairs_module, "SHARD", 2)
+    whole = lab.pairs(5, "whole")
+    draw = pairs_module.DrawnPictures.draw
+
+    def fail(self: Any, number: int, n: int) -> Any:
+        if number == 3:
+            raise KeyboardInterrupt
+        return draw(self, number, n)
+
+    with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):
+        broken.setattr(pairs_module.DrawnPictures, "draw", fail)
+        lab.pairs(5, "cut")
+    folder = whole.folder.parent / "cut"
+    assert sorted(path.name for path in folder.glob("pairs*")) == ["pairs.json", "pairs_00000.h5"]
+    with pytest.raises(MitsimError, match="its pairs are incomplete"):
+        PairStore.open(folder)
+    kept = (folder / "pairs_00000.h5").stat().st_mtime_ns
+    again = lab.pairs(5, "cut", resume=True)
+    assert (folder / "pairs_00000.h5").stat().st_mtime_ns == kept and len(again) == 5
+    files = [{path.name: path.read_bytes() for path in each.iterdir()} for each in (whole.folder, folder)]
+    assert files[0].keys() == files[1].keys() == {"pairs.json", *(f"pairs_0000{k}.h5" for k in range(3))}
+    assert files[0] == files[1]
+
+
+def test_a_store_of_another_request_is_not_resumed(lab: Lab) -> None:
+    lab.pairs(1)
+    with pytest.raises(MitsimError, match=r"another configuration \(count differ\)"):
+        lab.pairs(2, resume=True)
+    with pytest.raises(MitsimError, match="holds files already"):
+        lab.pairs(1)
+
+
+def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match=r"holds no pairs\.json"):
+        PairStore.open(tmp_path)
+    with pytest.raises(MitsimError, match="index 4: the store holds pairs 0 to 3"):
+        drawn.frames(4)
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    (copy / "pairs.json").write_bytes((drawn.folder / "pairs.json").read_bytes())
+    with pytest.raises(MitsimError, match=r"lacks pairs_00000\.h5"):
+        PairStore.open(copy)
+    data = bytearray((drawn.folder / "pairs_00000.h5").read_bytes())
+    data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
+    (copy / "pairs_00000.h5").write_bytes(data)
+    with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
+        PairStore.open(copy).frames(3)
+    (copy / "pairs.json").write_text("{}")
+    with pytest.raises(MitsimError, match="is no manifest of pairs"):
+        PairStore.open(copy)
+
+
+@pytest.mark.parametrize(
+    ("own", "words"),
+    [
+        ({"count": 0}, "count 0: give 1 to"),
+        ({"seconds": 5.0, "accuracy": None}, "pairs share their light"),
+        ({"idealised": True, "variation": Variation(groups=1)}, "the idealised model has no bench"),
+        ({"variation": Variation(groups=3)}, "3 groups of 2 pairs"),
+        ({"exposure": 0.1, "variation": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
+    ],
+)
+def test_a_request_that_cannot_be_served_is_refused(own: dict[str, Any], words: str) -> None:
+    kept = {key: own.pop(key) for key in ("count", "idealised", "variation") if key in own}
+    request = Request.of(**{key: value for key, value in own.items() if value is not None})
+    with pytest.raises(MitsimError, match=words):
+        PairsRequest(request, **{"count": 2, **kept}).check()
+
+
+def test_prints_show_what_a_bitmap_of_the_picture_shows(lab: Lab) -> None:
+    """Texel by texel of a sheet whose texels divide the pixels. (Planted: rows and columns changed.)"""
+    import mitsuba as mi
+
+    picture = np.arange(N * N).reshape(N, N) % 251
+    bench = lab.bench()
+    show_picture(bench, picture / 255)
+    (shape,) = bench.loaded.scene.shapes()
+    texels = np.array(mi.traverse(shape)["bsdf.reflectance.data"])[..., 0]
+    assert np.array_equal(texels, on_sheet(picture))
