@@ -3,7 +3,7 @@ frames and truths.
 
 The folder holds `pairs.json` and shards `pairs_00000.h5` and so on. A shard keeps its pairs' pictures and truths, and
 the light of a white print, which times a picture is the light of that picture: so a thousand pairs of 49 frames take
-some 50 MB in place of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps
+some 100 MB in place of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps
 each pair's expected frames. Noise is drawn when a pair is read, by the sensor's own chain, always the same for the same
 seed.
 """

@@ -26,6 +26,7 @@ from mitsim.bench.prints import show_picture, show_white, traced_anew
 from mitsim.bench.request import Exposure, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
+from mitsim.core.errors import ArgumentError
 from mitsim.core.files import PAIRS, output_folder, plain, sweep
 from mitsim.core.job import Cost, Job
 from mitsim.core.seeds import integer
@@ -55,8 +56,11 @@ SHARD = 100
 """Pairs of a shard at most; chosen: an interrupted work loses a minute, and light is kept once for a hundred pairs."""
 _PICTURE_S = 3e-6
 """Seconds of processor time that a pixel of a drawn picture takes; measured of 128 x 128 pixels, 50 ms each."""
-_PAIR_BYTES, _FRAME_BYTES = 3, 4
+_PAIR_BYTES, _FRAME_BYTES = 4, 4
 """Bytes of a pixel of picture and truth, packed, and of one of a frame that is kept; measured."""
+_SHADOW_BYTES = 40
+"""Bytes that a shard keeps of the shadow for a pixel of the frame's sides and a pixel of the projector's: some five
+factors of 8 bytes; measured 27 to 30 (photograph)."""
 
 Opening = Callable[[Mapping[str, str]], Bench]
 """Opens the bench with some parameters of the scene."""
@@ -155,6 +159,10 @@ class _Maker:
     def write(self, shard: Shard, path: Path, digest: str) -> None:
         """Write the file of a ``shard`` to a ``path``, marked with a ``digest``."""
         bench, plan = self._bench_of(shard.group)
+        if not self.why_anew and (why := self._why(bench)):
+            raise ArgumentError(
+                "vary", f"bench {shard.group}: {why}, other than before the first; keep one kind of scene"
+            )
         moved, asked, light = self._drifted(bench, shard.group), self._asked, None
         if self.why_anew:
             shown = self._traced(shard, bench, moved)
@@ -219,7 +227,8 @@ class _Maker:
         seconds = pairs * (each + (tracing if self.why_anew else 0.0))
         seconds += (benches - 1) * taken["plan"] + (0.0 if self.why_anew else benches * tracing)
         memory = frames_cost(self.bench, self._plan.settings, self._family.lighting).memory_bytes
-        return Cost(seconds, memory, pairs * stored)
+        shadow = len(left) * _SHADOW_BYTES * sum(self.bench.geometry.frame_shape) * self.bench.n
+        return Cost(seconds, memory, pairs * stored + shadow)
 
     def begin(self, configuration: Mapping[str, Any], shards: tuple[Shard, ...]) -> PairsManifest:
         """The manifest of an unfinished store of that ``configuration`` and these ``shards``."""

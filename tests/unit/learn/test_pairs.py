@@ -299,6 +299,8 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
         ({"seconds": 5.0, "accuracy": None}, "pairs share their light"),
         ({"idealised": True, "variation": Variation(groups=1)}, "the idealised model has no bench"),
         ({"variation": Variation(groups=3)}, "3 groups of 2 pairs"),
+        ({"variation": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
+        ({"variation": Variation(groups=1, mask={"mask_rows_um": (0.0, 1e5)})}, "mask_rows_um: got 100000.0"),
         ({"exposure": 0.1, "variation": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
     ],
 )
