@@ -206,9 +206,23 @@ def exchanged_file() -> dict[str, object]:
     return {}
 
 
+def stored_pairs() -> dict[str, object]:
+    """The store that docs/learned.md reads."""
+    from mitsim.api.bench import open_bench
+    from mitsim.bench.request import Request, Task
+    from mitsim.learn.pair_request import PairsRequest
+    from mitsim.learn.pairs import make_pairs
+
+    scene = write_small_scene(Path("scenes"))
+    asked = PairsRequest(Request.of(patterns="uniform", accuracy=0.1), 2)
+    make_pairs(lambda _: open_bench(scene), asked, Task(Path("pairs")))
+    return {}
+
+
 GIVEN: dict[str, Callable[[], dict[str, object]]] = {
     "docs/formats.md": measured_responses,
     "docs/exchange.md": exchanged_file,
+    "docs/learned.md": stored_pairs,
 }
 SLOW = {"README.md"}
 

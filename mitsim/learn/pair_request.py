@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from mitsim.bench.request import Request
-from mitsim.core.configuration import Configuration
+from mitsim.bench.request import Exposure, Request
+from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.imagelist import FORMATS
 from mitsim.core.seeds import stream
@@ -102,6 +102,11 @@ class PairsRequest:
         if self.folder is not None:
             picture_files(self.folder)
         vary = self.variation
+        for limit in (vary and vary.exposure_fraction) or ():
+            Exposure(None, limit)
+        for name, limits in vary.mask.items() if vary else ():
+            for limit in limits:
+                validate(Drift, {name: limit}, "vary: [mask]")
         if vary is not None and self.idealised:
             raise ArgumentError("vary", "the idealised model has no bench that varies; leave out one of the two")
         if vary is not None and vary.groups > self.count:

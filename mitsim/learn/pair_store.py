@@ -3,7 +3,7 @@ frames and truths.
 
 The folder holds `pairs.json` and shards `pairs_00000.h5` and so on. A shard keeps its pairs' pictures and truths, and
 the light of a white print, which times a picture is the light of that picture: so a thousand pairs of 49 frames take
-some 50 MB in place of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps
+some 100 MB in place of 25 GB. Where light is no such product, or the mask's shadow no sum of few terms, a shard keeps
 each pair's expected frames. Noise is drawn when a pair is read, by the sensor's own chain, always the same for the same
 seed.
 """
@@ -197,7 +197,7 @@ class PrintLight:
         """Whether the mask's shadow is a sum of few terms, which a file can hold."""
         return all(part.optics.terms is not None for part in self.parts)
 
-    def expected(self, reflectance: FloatArray) -> ExpectedFrames:
+    def frames_of(self, reflectance: FloatArray) -> ExpectedFrames:
         """Expected frames [electrons/s] of a picture of ``reflectance`` (n, n)."""
         lights = [part.times(reflectance) for part in self.parts if not part.lamps]
         lamps = [part.times(reflectance) for part in self.parts if part.lamps]
@@ -415,12 +415,12 @@ class PairStore:
         return float(self._rows(index, "exposure_s")["exposure_s"])
 
     @check_arguments
-    def expected(self, index: int) -> Frames:
+    def expected_frames(self, index: int) -> Frames:
         """(K, m, m') frames of pair ``index`` without noise, and without light of lamps where that is taken off
         [electrons/s]."""
         rates, lamps, _, _ = self._light_of(index)
         off = lamps if self.manifest.ambient_shots else 0.0
-        return self._measured(rates, off)
+        return self._measurements(rates, off)
 
     def frames(self, index: int) -> Frames:
         """(K, m, m') noisy frames of pair ``index`` [electrons/s], as a run's measurements are: always the same."""
@@ -450,7 +450,7 @@ class PairStore:
         if made.ambient_shots:
             off = sum(shoot(lamps, "ambient", shot) for shot in range(made.ambient_shots)) / made.ambient_shots
         shots = zip(rates, made.family.shots, strict=True)
-        return self._measured(
+        return self._measurements(
             (
                 shoot(add_speckle(rate, speckle, stream(root, "speckle", *shot.names)), *shot.names)
                 for rate, shot in shots
@@ -458,7 +458,7 @@ class PairStore:
             off,
         )
 
-    def _measured(self, rates: Iterable[FloatArray], off: FloatArray | float) -> Frames:
+    def _measurements(self, rates: Iterable[FloatArray], off: FloatArray | float) -> Frames:
         """Measurements of shots: differences of the halves of signed patterns, others less what is taken ``off``."""
         found, shots = [], self.manifest.family.shots
         positive: FloatArray | float = 0.0
@@ -479,7 +479,7 @@ class PairStore:
             rates: Iterator[FloatArray] = (np.asarray(frame, dtype=np.float64) for frame in rows["expected"])
             return rates, np.asarray(rows["lamps"], dtype=np.float64), float(rows["exposure_s"]), speckle
         rows = self._rows(index, "picture", "exposure_s")
-        expected = light.expected(rows["picture"] / LARGEST_CODE)
+        expected = light.frames_of(rows["picture"] / LARGEST_CODE)
         rates = (frame.irradiance for frame in expected)
         return rates, expected.projector_off.irradiance, float(rows["exposure_s"]), speckle
 

@@ -26,6 +26,7 @@ from mitsim.bench.prints import show_picture, show_white, traced_anew
 from mitsim.bench.request import Exposure, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
+from mitsim.core.errors import ArgumentError
 from mitsim.core.files import PAIRS, output_folder, plain, sweep
 from mitsim.core.job import Cost, Job
 from mitsim.core.manifests import CalibrationManifest
@@ -59,8 +60,11 @@ SHARD = 100
 """Pairs of a shard at most; chosen: an interrupted work loses a minute, and light is kept once for a hundred pairs."""
 _PICTURE_S = 3e-6
 """Seconds of processor time that a pixel of a drawn picture takes; measured of 128 x 128 pixels, 50 ms each."""
-_PAIR_BYTES, _FRAME_BYTES = 3, 4
+_PAIR_BYTES, _FRAME_BYTES = 4, 4
 """Bytes of a pixel of picture and truth, packed, and of one of a frame that is kept; measured."""
+_SHADOW_BYTES = 40
+"""Bytes that a shard keeps of the shadow for a pixel of the frame's sides and a pixel of the projector's: some five
+factors of 8 bytes; measured 27 to 30 (photograph)."""
 
 Opening = Callable[[Mapping[str, str]], Bench]
 """Opens the bench with some parameters of the scene."""
@@ -137,7 +141,7 @@ class _Maker:
                 self._open = parameters, bench, plan_request(bench, self._asked.capture)
         return self._open[1:]
 
-    def _drifted(self, bench: Bench, group: int) -> Apparatus:
+    def _with_moved_mask(self, bench: Bench, group: int) -> Apparatus:
         """The ``bench`` of a ``group`` with its mask where it has moved to."""
         drawn = self._groups[group].items()
         moved = {name.partition(".")[2]: value for name, value in drawn if name.startswith("mask.")}
@@ -159,28 +163,32 @@ class _Maker:
     def write(self, shard: Shard, path: Path, digest: str) -> None:
         """Write the file of a ``shard`` to a ``path``, marked with a ``digest``."""
         bench, plan = self._bench_of(shard.group)
-        moved, asked, light = self._drifted(bench, shard.group), self._asked, None
+        if not self.why_anew and (why := self._why(bench)):
+            raise ArgumentError(
+                "vary", f"bench {shard.group}: {why}, other than before the first; keep one kind of scene"
+            )
+        moved, asked, light = self._with_moved_mask(bench, shard.group), self._asked, None
         if self.why_anew:
-            shown = self._traced(shard, bench, moved)
+            shown = self._in_own_light(shard, bench, moved)
         else:
             white = self._white_of(shard.group)
-            light = white.idealised(self._family) if asked.idealised else white.rendered(moved, self._family)
-            shown = self._multiplied(shard, white, light)
+            light = white.ideal_light(self._family) if asked.idealised else white.rendered_light(moved, self._family)
+            shown = self._in_white_light(shard, white, light)
         speckled = "speckle" in plan.settings.effects and not asked.idealised
         speckle = bench.speckle(self._family) if speckled else 0.0
         kept = light if light is not None and light.few else None
         with self._job.clock.stage("pairs"):
-            write_shard(path, digest, self._exposed(shard, moved, shown, kept is None), speckle, kept)
+            write_shard(path, digest, self._expose(shard, moved, shown, kept is None), speckle, kept)
 
-    def _multiplied(self, shard: Shard, white: WhitePrints, light: PrintLight) -> Iterator[_Shown]:
+    def _in_white_light(self, shard: Shard, white: WhitePrints, light: PrintLight) -> Iterator[_Shown]:
         """Pictures of a ``shard`` in the ``light`` of ``white`` prints."""
         for index in range(shard.first, shard.first + shard.count):
             picture = self._pictures.draw(index, self.bench.n)
             reflectance = picture / LARGEST_CODE
             truth = white.white * reflectance if self._asked.idealised else white.truth(reflectance)
-            yield _Shown(picture, truth, light.expected(reflectance), 1.0, white.warnings)
+            yield _Shown(picture, truth, light.frames_of(reflectance), 1.0, white.warnings)
 
-    def _traced(self, shard: Shard, bench: Bench, moved: Apparatus) -> Iterator[_Shown]:
+    def _in_own_light(self, shard: Shard, bench: Bench, moved: Apparatus) -> Iterator[_Shown]:
         """Pictures of a ``shard`` on the prints of a ``bench``, in light that is traced for each; ``moved``: the same
         with its mask moved."""
         _, plan = self._bench_of(shard.group)
@@ -193,7 +201,7 @@ class _Maker:
             warnings = *light.warnings, *light.unreached
             yield _Shown(picture, light.truth, expected, electrons_per_joule(bench), warnings)
 
-    def _exposed(self, shard: Shard, bench: Apparatus, shown: Iterable[_Shown], keep: bool) -> Iterator[Pair]:
+    def _expose(self, shard: Shard, bench: Apparatus, shown: Iterable[_Shown], keep: bool) -> Iterator[Pair]:
         """Pairs of what is ``shown``, each with its exposure; ``keep``: with its frames."""
         timing, sensor, unit = self._timing(shard.group), bench.sensor, electrons_per_joule(bench)
         for number, each in enumerate(shown):
@@ -223,7 +231,8 @@ class _Maker:
         seconds = pairs * (each + (tracing if self.why_anew else 0.0))
         seconds += (benches - 1) * taken["plan"] + (0.0 if self.why_anew else benches * tracing)
         memory = frames_cost(self.bench, self._plan.settings, self._family.lighting).memory_bytes
-        return Cost(seconds, memory, pairs * stored)
+        shadow = len(left) * _SHADOW_BYTES * sum(self.bench.geometry.frame_shape) * self.bench.n
+        return Cost(seconds, memory, pairs * stored + shadow)
 
     def begin(self, configuration: Mapping[str, Any], shards: tuple[Shard, ...]) -> PairsManifest:
         """The manifest of an unfinished store of that ``configuration`` and these ``shards``."""

@@ -70,7 +70,7 @@ class WhitePrints:
         """(n, n) apparent reflectance of prints that show a picture of ``reflectance`` (n, n)."""
         return np.asarray(self.white * (self.shares @ reflectance.ravel()).reshape(self.white.shape))
 
-    def rendered(self, bench: Apparatus, family: PatternFamily) -> PrintLight:
+    def rendered_light(self, bench: Apparatus, family: PatternFamily) -> PrintLight:
         """The light by the classes of a ``family``, before the mask of a ``bench``."""
         light = self.light.behind(bench)
         simulation, estimate, pixels = light.simulation, light.groups[0], bench.n**2
@@ -90,7 +90,7 @@ class WhitePrints:
                 parts.append(PrintPart(grid.optics, own, *picture_axes(light, grid.bundle), row is not None))
         return PrintLight(tuple(parts), emission(simulation.physics, lighting))
 
-    def idealised(self, family: PatternFamily) -> PrintLight:
+    def ideal_light(self, family: PatternFamily) -> PrintLight:
         """The light of the separable model by the classes of a ``family``: even on all pixels, the mask without
         diffraction."""
         bench, lighting = self.light.bench, family.lighting

@@ -105,7 +105,7 @@ def test_frames_and_truth_are_those_of_a_capture_of_the_picture(lab: Lab, extra:
         if extra:
             assert store.manifest.ambient_shots == 16 and shots.ambient is not None
             known = known - np.asarray(shots.read("ambient.exr")[0]["electrons"], dtype=np.float64)
-        difference = np.linalg.norm(store.expected(index) - known) / np.linalg.norm(known)
+        difference = np.linalg.norm(store.expected_frames(index) - known) / np.linalg.norm(known)
         assert difference < 3e-3
         assert shots.truth is not None
         assert np.sqrt(np.square(store.truth(index) - shots.truth).mean()) < (4e-3 if projector else 2e-4)
@@ -114,7 +114,7 @@ def test_frames_and_truth_are_those_of_a_capture_of_the_picture(lab: Lab, extra:
 def test_the_projectors_own_light_does_not_tell_another_picture(lab: Lab) -> None:
     """What the test above would see: two pictures of one store differ a hundred times as much."""
     store = lab.pairs()
-    frames = store.expected(0), store.expected(1)
+    frames = store.expected_frames(0), store.expected_frames(1)
     assert np.linalg.norm(frames[0] - frames[1]) > 0.1 * np.linalg.norm(frames[0])
 
 
@@ -124,7 +124,7 @@ def test_light_over_two_surfaces_is_traced_for_each_picture(lab: Lab) -> None:
     assert "2 surfaces" in store.manifest.traced_anew
     shots = lab.bench(on_sheet(store.picture(1)), SECOND).capture("dots:2", accuracy=2e-3, seed=70, exposure=1.0)
     known = np.asarray(shots.electrons, dtype=np.float64)
-    assert np.linalg.norm(store.expected(1) - known) < 3e-3 * np.linalg.norm(known)
+    assert np.linalg.norm(store.expected_frames(1) - known) < 3e-3 * np.linalg.norm(known)
     assert shots.truth is not None and abs(store.truth(1) - shots.truth).max() < 5e-3
     assert store.frames(1).shape == (4, 64, 64)
 
@@ -142,7 +142,7 @@ def test_idealised_frames_are_the_separable_model(lab: Lab) -> None:
         sum(one @ (truth * np.outer(left[:, i], right[:, j])) @ other.T for one, other in terms)
         for i, j in store.indices
     ])  # fmt: skip
-    expected = store.expected(1)
+    expected = store.expected_frames(1)
     scale = float(np.vdot(expected, frames) / np.vdot(frames, frames))
     assert abs(expected - scale * frames).max() < 1e-6 * expected.max()
     # A pixel of a white board puts E A on the sensor; the projector's light is even to 1 %.
@@ -167,7 +167,7 @@ def test_frames_are_what_the_camera_exposes_of_what_is_expected(drawn: PairStore
     bench, pair = lab.bench(), 2
     exposer = Exposer(bench.devices, drawn.exposure_s(pair), integer(3, "pair", pair))
     unit = electrons_per_joule(bench)
-    light = [Frame(frame.astype(np.float64) / unit, 0.0, 0.0, 0.0) for frame in drawn.expected(pair)]
+    light = [Frame(frame.astype(np.float64) / unit, 0.0, 0.0, 0.0) for frame in drawn.expected_frames(pair)]
     shots = [
         (frame, exposer.electrons(frame), shot.names)
         for frame, shot in zip(light, drawn.manifest.family.shots, strict=True)
@@ -187,7 +187,7 @@ def test_noise_is_drawn_anew_by_its_seed(drawn: PairStore) -> None:
     1 % of what the manifest states. (Planted: the seed not heeded; noise of the shots' mean.)"""
     assert np.array_equal(drawn.frames(1), drawn.draw(1, drawn.manifest.seed))
     draws = np.stack([drawn.draw(1, 100 + seed) for seed in range(60)]).astype(np.float64)
-    expected = drawn.expected(1).astype(np.float64)
+    expected = drawn.expected_frames(1).astype(np.float64)
     digital = drawn.manifest.digital.model_copy(update={"exposure_s": drawn.exposure_s(1)})
     variance = digital.variance(expected)
     z = (draws.mean(axis=0) - expected) / np.sqrt(variance / 60)
@@ -201,7 +201,7 @@ def test_signed_patterns_are_differences(lab: Lab) -> None:
     store = lab.pairs(1, patterns="hadamard:2")
     assert store.manifest.frames == 4 and store.frames(0).shape == (4, 64, 64)
     assert [tuple(each) for each in store.indices] == [(0, 0), (0, 1), (1, 0), (1, 1)]
-    expected = store.expected(0)
+    expected = store.expected_frames(0)
     assert expected[0].min() >= 0 and expected[1].min() < 0
     assert abs(store.frames(0) - expected).max() < 0.2 * expected.max()
 
@@ -210,7 +210,8 @@ def test_signed_patterns_are_differences(lab: Lab) -> None:
 
 
 def test_benches_vary_by_group(lab: Lab) -> None:
-    """Scene, mask and exposure are drawn for each group of pairs. (Planted: what was drawn for the first.)"""
+    """Scene, mask and exposure are drawn for each group of pairs. (Planted: the mask, or the exposure,
+    of the first.)"""
     variation = Variation.model_validate(
         {
             "groups": 2,
@@ -227,12 +228,25 @@ def test_benches_vary_by_group(lab: Lab) -> None:
     assert [(shard.first, shard.count, shard.group) for shard in store.manifest.shards] == [(0, 2, 0), (2, 2, 1)]
     for index, group in ((1, first), (3, second)):
         assert np.array_equal(store.picture(index), still.picture(index))
-        filled = store.expected(index).max() * store.exposure_s(index) / lab.bench().sensor.superpixel_full_well_e
+        filled = (
+            store.expected_frames(index).max() * store.exposure_s(index) / lab.bench().sensor.superpixel_full_well_e
+        )
         assert filled == pytest.approx(group["exposure_fraction"], rel=0.02), "lamps and dark current bring the rest"
-        moved = store.expected(index) - still.expected(index)
-        off = np.linalg.norm(moved) / np.linalg.norm(still.expected(index))
-        # A shift of the mask by s um moves the shadow, of features of 60 um; noise of light alone is 2e-3.
-        assert off > 0.3 * abs(group["mask.mask_rows_um"]) / 60
+        # The shadow of a sheet at 400 mm behind a mask at 2 mm moves by 400 / 398 of what the mask moves.
+        pixels = group["mask.mask_rows_um"] / 11.72 * 400 / 398
+        assert shift_of(store.expected_frames(index), still.expected_frames(index)) == pytest.approx(pixels, abs=0.1)
+
+
+def shift_of(moved: np.ndarray, still: np.ndarray) -> float:
+    """Rows by which frames (K, m, m') have moved, to a twentieth: where they are most alike away from the edges."""
+    rows, tried = np.arange(8, still.shape[1] - 8), np.arange(-6, 6, 0.05)
+    line = np.arange(still.shape[1])
+
+    def off(shift: float) -> float:
+        guess = np.apply_along_axis(lambda column: np.interp(rows - shift, line, column), 1, still)
+        return float(np.square(moved[:, rows] - guess).sum())
+
+    return float(tried[np.argmin([off(shift) for shift in tried])])
 
 
 # ---- The folder ------------------------------------------------------------------------------------------------------
@@ -299,6 +313,8 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
         ({"seconds": 5.0, "accuracy": None}, "pairs share their light"),
         ({"idealised": True, "variation": Variation(groups=1)}, "the idealised model has no bench"),
         ({"variation": Variation(groups=3)}, "3 groups of 2 pairs"),
+        ({"variation": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
+        ({"variation": Variation(groups=1, mask={"mask_rows_um": (0.0, 1e5)})}, "mask_rows_um: got 100000.0"),
         ({"exposure": 0.1, "variation": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
     ],
 )
