@@ -34,6 +34,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
+from mitsim.learn.pictures import WHITE
 from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 """Version of the store's layout."""
-LARGEST_CODE = 255
-"""Code of reflectance 1 in a picture of eight bits."""
 _PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
 """Filters that every HDF5 library has, and a checksum for each chunk."""
 _LIGHTS_KEPT = 32
@@ -479,7 +478,7 @@ class PairStore:
             rates: Iterator[FloatArray] = (np.asarray(frame, dtype=np.float64) for frame in rows["expected"])
             return rates, np.asarray(rows["lamps"], dtype=np.float64), float(rows["exposure_s"]), speckle
         rows = self._rows(index, "picture", "exposure_s")
-        expected = light.frames_of(rows["picture"] / LARGEST_CODE)
+        expected = light.frames_of(rows["picture"] / WHITE)
         rates = (frame.irradiance for frame in expected)
         return rates, expected.projector_off.irradiance, float(rows["exposure_s"]), speckle
 

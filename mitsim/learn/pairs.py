@@ -35,7 +35,6 @@ from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift
 from mitsim.learn.pair_request import CALIBRATION, PairsRequest
 from mitsim.learn.pair_store import (
-    LARGEST_CODE,
     Pair,
     PairsManifest,
     PairStore,
@@ -46,7 +45,7 @@ from mitsim.learn.pair_store import (
     write_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.pictures import Codes, DrawnPictures, FolderPictures, Pictures
+from mitsim.learn.pictures import WHITE, Codes, DrawnPictures, FolderPictures, Pictures
 from mitsim.learn.white_prints import WhitePrints, electrons_per_joule
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.memory import first_shadow, frames_cost
@@ -135,7 +134,7 @@ class _Maker:
             self._asked.capture.timing.check(bench.sensor, bench.devices.camera_file)
             with self._job.planning("pairs", first_shadow(bench, self._asked.capture.effects)):
                 if self._why(bench):
-                    show_picture(bench, self._pictures.draw(0, bench.n) / LARGEST_CODE)
+                    show_picture(bench, self._pictures.draw(0, bench.n) / WHITE)
                 else:
                     show_white(bench)
                 self._open = parameters, bench, plan_request(bench, self._asked.capture)
@@ -184,7 +183,7 @@ class _Maker:
         """Pictures of a ``shard`` in the ``light`` of ``white`` prints."""
         for index in range(shard.first, shard.first + shard.count):
             picture = self._pictures.draw(index, self.bench.n)
-            reflectance = picture / LARGEST_CODE
+            reflectance = picture / WHITE
             truth = white.white * reflectance if self._asked.idealised else white.truth(reflectance)
             yield _Shown(picture, truth, light.frames_of(reflectance), 1.0, white.warnings)
 
@@ -194,7 +193,7 @@ class _Maker:
         _, plan = self._bench_of(shard.group)
         for index in range(shard.first, shard.first + shard.count):
             picture = self._pictures.draw(index, bench.n)
-            show_picture(bench, picture / LARGEST_CODE)
+            show_picture(bench, picture / WHITE)
             seed = integer(self._asked.capture.seed, "prints", index)
             light = trace_light(bench, plan, self._family.lighting, seed, Sampling(by_pixel=False))
             expected = light.merge().behind(moved).frames(self._family.lighting, seed)

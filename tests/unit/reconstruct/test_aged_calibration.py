@@ -142,11 +142,14 @@ def test_standard_errors_are_those_of_repeated_sessions(tmp_path: Path, error: f
 
 
 def test_a_mask_that_has_moved_by_features_is_found(tmp_path: Path) -> None:
-    """By two of them, 120 um; what comes into view at the sensor's edge is flagged."""
-    aged = Aged(tmp_path, 2, {**STILL, "mask_rows_um": 120.0})
+    """By some of them, along both axes; what comes into view at the sensor's edge is flagged. (Planted: steps that begin
+    at no shift.)"""
+    aged = Aged(tmp_path, 2, {**STILL, "mask_rows_um": -200.0, "mask_columns_um": 150.0})
     factors = aged.mended()
     assert factors.status.verdict == Verdict.NOT_SEPARABLE
-    assert factors.manifest.result["moved"]["mask_rows_um"]["value"] == pytest.approx(120, rel=0.01)
+    moved = factors.manifest.result["moved"]
+    assert moved["mask_rows_um"]["value"] == pytest.approx(-200, rel=0.01)
+    assert moved["mask_columns_um"]["value"] == pytest.approx(150, rel=0.01)
 
 
 def test_without_parallax_the_shadow_is_told_in_pixels(tmp_path: Path) -> None:
