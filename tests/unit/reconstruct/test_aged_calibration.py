@@ -142,8 +142,10 @@ def test_standard_errors_are_those_of_repeated_sessions(tmp_path: Path, error: f
 
 
 def test_a_mask_that_has_moved_by_features_is_found(tmp_path: Path) -> None:
-    """By some of them, along both axes; what comes into view at the sensor's edge is flagged. (Planted: steps begin at no
-    shift.)"""
+    """By some of them, along both axes; what comes into view at the sensor's edge is flagged.
+
+    (Planted: steps begin at no shift.)
+    """
     aged = Aged(tmp_path, 2, {**STILL, "mask_rows_um": -200.0, "mask_columns_um": 150.0})
     factors = aged.mended()
     assert factors.status.verdict == Verdict.NOT_SEPARABLE
