@@ -190,6 +190,14 @@ def kept_plans(variant: str) -> Iterator[None]:
 
 
 @pytest.fixture
+def soon_dark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pilot calls a scene dark after a million rays in place of 67, for tests of what it then says.
+
+    That it sends as many where few meet a small target is held by ``physics/test_small_targets.py``."""
+    monkeypatch.setattr("mitsim.planner.pilot._MOST_RAYS", 2**20)
+
+
+@pytest.fixture
 def other_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock says another number of compiled kernels each time, as where Dr.Jit's cache is empty at first.
 

@@ -206,6 +206,7 @@ EMPTY = {
 }
 
 
+@pytest.mark.usefixtures("soon_dark")
 @pytest.mark.parametrize("what", EMPTY)
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path], tmp_path: Path, what: str) -> None:
     """Frames of noise alone would look like a success; nothing is left behind."""

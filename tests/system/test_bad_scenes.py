@@ -118,6 +118,7 @@ def test_a_scene_without_projector(refused: Refused, small_scene: Callable[..., 
     mentions(refused("capture", path, *NEW, "--patterns", "dots:4"), str(path), '0 emitters of type "projector"')
 
 
+@pytest.mark.usefixtures("soon_dark")
 def test_a_scene_that_sends_no_light_back(refused: Refused, small_scene: Callable[..., Path]) -> None:
     path = small_scene()
     render = "render", "--estimator", "factored", "-o", "new.exr"

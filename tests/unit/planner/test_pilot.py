@@ -519,6 +519,7 @@ def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callabl
     )
 
 
+@pytest.mark.usefixtures("soon_dark")
 def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> None:
     away = open_bench(small_scene(projector_turn='<rotate y="1" angle="180"/>'))
     with pytest.raises(MitsimError, match="no light of the projector reaches the camera"):
