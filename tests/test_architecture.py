@@ -13,7 +13,8 @@ import subprocess
 import sys
 import tokenize
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -74,11 +75,25 @@ CHECKS_A_REQUEST = (
 """What looks at words, manifests and lists before work begins."""
 
 
+@cache
+def parsed(source: str) -> ast.Module:
+    """The tree of a text, which several tests walk; nobody changes it."""
+    return ast.parse(source)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _trees_are_let_go() -> Iterator[None]:
+    """All trees together take hundreds of megabytes, over which every later collection of garbage would go."""
+    yield
+    parsed.cache_clear()
+
+
+@cache
 def imports_of(module: str, source: str, is_package: bool) -> list[str]:
     """Absolute dotted names of everything a module imports, anywhere in its text."""
     package = module.split(".") if is_package else module.split(".")[:-1]
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -500,14 +515,14 @@ def named(tree: ast.AST) -> list[str]:
 
 
 def names_a_backend(module: str, source: str) -> bool:
-    return module not in KNOWS_BACKENDS and any(BACKENDS.search(name) for name in named(ast.parse(source)))
+    return module not in KNOWS_BACKENDS and any(BACKENDS.search(name) for name in named(parsed(source)))
 
 
 def sums_lanes(module: str, source: str) -> list[str]:
     """Sums that Dr.Jit would add up over lanes, in the lanes' own 32 bits."""
     if module in OF_A_LANE:
         return []
-    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    calls = (node for node in ast.walk(parsed(source)) if isinstance(node, ast.Call))
     narrow = (call.func for call in calls if not in_double_precision(call))
     found = (call for call in narrow if isinstance(call, ast.Attribute) and call.attr in SUMS)
     return [call.attr for call in found if isinstance(call.value, ast.Name) and call.value.id in ("dr", "drjit")]
@@ -563,7 +578,7 @@ TOKENS_WITHOUT_CODE = {
 def lines_of_code(source: str) -> int:
     """Lines that hold more than a docstring, a comment or nothing."""
     texts: set[int] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             texts |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     lines: set[int] = set()
@@ -584,7 +599,7 @@ def rooms_by_file(names: list[str]) -> dict[str, set[str]]:
 
 def participles(source: str) -> list[str]:
     """Functions and methods of one word, which is a participle; properties are what they give."""
-    found = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
+    found = [node for node in ast.walk(parsed(source)) if isinstance(node, ast.FunctionDef)]
     plain = (node for node in found if not any("property" in ast.unparse(each) for each in node.decorator_list))
     return [node.name for node in plain if PARTICIPLE.fullmatch(node.name.strip("_"))]
 

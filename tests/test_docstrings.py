@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from numpydoc.docscrape import NumpyDocString
 
-from tests.test_architecture import modules
+from tests.test_architecture import modules, parsed
 
 IN_TEXT = 2
 """The most parameters that a sentence may name; chosen: more are easier found in a list."""
@@ -45,7 +45,7 @@ def public_functions(source: str) -> Iterator[tuple[str, list[str], str]]:
             text = ast.get_docstring(node) or (ast.get_docstring(owner) if constructor and owner else "") or ""
             yield prefix + node.name, [name for name in names if not name.startswith("_")], text
 
-    yield from walk(ast.parse(source).body, None)
+    yield from walk(parsed(source).body, None)
 
 
 def parameters(node: Function) -> list[str]:
@@ -156,7 +156,7 @@ def test_no_function_takes_more_than_seven_parameters() -> None:
     long = [
         f"{module}.{node.name}: {len(names)}"
         for module, path in modules()
-        for node in ast.walk(ast.parse(Path(path).read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(Path(path).read_text(encoding="utf-8")))
         if isinstance(node, Function) and len(names := {*parameters(node)} - {"self", "cls"}) > MOST_PARAMETERS
     ]
     assert not long, long
