@@ -281,8 +281,15 @@ def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
 MITSIM = [sys.executable, "-m", "mitsim"]
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.02, 0.1])
-@pytest.mark.parametrize("moment", [0.0, 0.05, 0.1, 0.2, 0.4])
+MOMENTS = [
+    pytest.param(moment, gap, marks=[] if (number + other) % 3 == 0 else [pytest.mark.slow])
+    for number, moment in enumerate((0.0, 0.05, 0.1, 0.2, 0.4))
+    for other, gap in enumerate((0.0, 0.02, 0.1))
+]
+"""Every moment with every gap; the quick ones have each at least once."""
+
+
+@pytest.mark.parametrize(("moment", "gap"), MOMENTS)
 def test_control_c_during_start_up_is_one_line(moment: float, gap: float) -> None:
     """Twice, as a terminal sends it: to both processes. ``moment`` is what the worker has taken of a processor [s], so
     that it stands at the same place on a busy machine.
