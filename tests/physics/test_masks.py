@@ -399,7 +399,11 @@ def test_drawing_the_first_shadow_is_held_against_limits_before_anything_is_look
 
 
 @pytest.mark.parametrize(
-    ("drawing", "refused"), [("random", False), ("turned", False), ("ring", False), ("bar", True), ("cross", False)]
+    ("drawing", "refused"),
+    [
+        *(pytest.param(drawing, False, marks=pytest.mark.slow) for drawing in ("random", "ring")),
+        *(("turned", False), ("bar", True), ("cross", False)),
+    ],
 )
 def test_a_mask_is_refused_where_its_session_would_be(
     small_scene: Callable[..., Path], variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
