@@ -74,7 +74,7 @@ robustness: setup
 	@$(VENV)/bin/python -m pytest -m robustness $(PARALLEL) --robustness=docs/robustness.md
 
 # Planted bugs that the quick tests must see; not part of any test run.
-mutants: setup
+mutants: learn
 	@$(VENV)/bin/python benchmarks/mutants.py
 
 wheel: setup
