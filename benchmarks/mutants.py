@@ -31,6 +31,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = json.loads(Path(__file__).with_name("mutants.json").read_text(encoding="utf-8"))
 PRELOADED = ("numpy", "pydantic", "mpmath", "skimage.data")
 PRELOADED += tuple(f"scipy.{part}" for part in ("special", "stats", "optimize", "signal", "sparse.linalg"))
+PRELOADED += ("torch",) if find_spec("torch") else ()
 """What else takes long to import and is no part of mitsim: each mutant's process is forked off one that has it."""
 WHOLE = ("sensor", "optics", "reconstruct")
 """Rooms of which every module must be listed, or left out for a reason."""

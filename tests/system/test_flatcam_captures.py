@@ -56,6 +56,7 @@ def half(row: int, column: int) -> str:
     return f"{{row = {row}, column = {column}, rows = 340, columns = 420}}"
 
 
+@pytest.mark.slow
 def test_half_of_one_plane_tells_the_code_and_where_the_mask_is(call: Callable[..., Any], tmp_path: Path) -> None:
     """Correlations were 0.933 and 0.963. Then the capture that was not learned from, and the same one a pixel further
     down and two to the right: the difference of the two fits is that, to 0.01 pixels of the frame that they share."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -120,7 +121,8 @@ def test_every_method_learns(method: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["unrolled", "plug-and-play", "preprocessed"])
 def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) -> None:
-    """And one that was not interrupted twice the same. (Planted: weights without what the optimiser knows.)"""
+    """And one that was not interrupted twice the same. (Planted: weights without what the optimiser knows; progress
+    by the steps squared.)"""
     store, factors = FakeStore(12), bench().calibrated(1)
     request = Training(method, steps=6, batch=4, seed=1)
 
@@ -133,13 +135,16 @@ def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) 
     whole = weights("a.pt")
     assert all(map(np.array_equal, whole.values(), weights("b.pt").values()))
 
+    parts = list[float]()
+
     def stop(stage: str, part: float) -> None:
+        parts.extend([part] if stage == "train" else [])
         if stage == "train" and part > 0.6:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         train_network(store, factors, request, tmp_path / "c.pt", Job(progress=stop))
-    assert not (tmp_path / "c.pt").exists()
+    assert not (tmp_path / "c.pt").exists() and parts == [step / 6 for step in (1, 2, 3, 4)]
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
         train_network(store, factors, replace(request, seed=2), tmp_path / "c.pt", resume=True)
     again = weights("c.pt", resume=True)
@@ -163,6 +168,25 @@ def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
     assert_allclose(moved.weights, expected, rtol=2e-4, atol=2e-4 * float(expected.abs().max()))
 
 
+def test_oblong_pictures_are_turned_to_their_own_shape_alone() -> None:
+    """(Planted: taken for square.)"""
+    model = SimpleNamespace(sigma=torch.ones(()), coefficients=lambda images: images)
+    trainer: Any = SimpleNamespace(model=model)
+    truths, data = torch.rand(4, 1, 6, 8), Data(torch.zeros(4, 1, 6, 8), torch.ones(4, 1, 1, 1))
+    for seed in range(8):
+        turned, moved = training.Trainer._turn(trainer, truths, data, np.random.default_rng(seed))
+        assert turned.shape == moved.weights.shape == truths.shape
+
+
+def test_the_rate_goes_over_one_cycle() -> None:
+    """Up to the one that is asked for and down to nothing, by half a cosine: either has half of it for its mean.
+    (Planted: another phase of the fall.)"""
+    trainer: Any = SimpleNamespace(request=Training("unrolled", steps=1000, rate=1e-3))
+    rates = [training.Trainer.rate(trainer, number) for number in range(1000)]
+    assert max(rates) == pytest.approx(1e-3, rel=0.01) and 100 < int(np.argmax(rates)) < 200
+    assert rates[0] < 1e-5 and rates[-1] < 1e-8 and np.mean(rates) == pytest.approx(0.5e-3, rel=1e-3)
+
+
 def test_pairs_are_a_data_set_of_torch() -> None:
     store = FakeStore(8, "dots:2")
     frames, truths = next(iter(torch.utils.data.DataLoader(PairDataset(store), batch_size=3)))
@@ -179,6 +203,11 @@ def test_trainings_that_are_refused(tmp_path: Path) -> None:
         train_network(FakeStore(8), other, request, tmp_path / "m.pt")
     with pytest.raises(MitsimError, match=r"would take about .* s; allowed are 0\.01 s"):
         train_network(FakeStore(8), factors, request, tmp_path / "m.pt", Job(limits=Limits(seconds=0.01)))
+    prepared = SOLVERS["tikhonov"].init(factors, FakeStore(8).patterns)
+    held = 8 * (256 + prepared.sigma.size) * 4  # truths and data of 8 pairs in 32 bits
+    training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=1.01 * held)))
+    with pytest.raises(MitsimError, match=r"reading 8 pairs: would take about .* of memory"):
+        training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
     with pytest.raises(ArgumentError, match="device 'abacus': cannot be used"):
         train_network(FakeStore(8), factors, replace(request, device="abacus"), tmp_path / "m.pt")
     with pytest.raises(MitsimError, match="ran away at step"):

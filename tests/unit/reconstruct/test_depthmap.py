@@ -205,7 +205,7 @@ def test_depths_that_may_all_be_a_period_away(
     assert (image.depths is None) == named
 
 
-@pytest.mark.parametrize("patterns", ["dots:4", "dots:8"])
+@pytest.mark.parametrize("patterns", ["dots:4", pytest.param("dots:8", marks=pytest.mark.slow)])
 def test_a_range_may_be_narrower_than_the_period(patterns: str) -> None:
     """Of a pixel of parallax; a sheet beside it is flagged. (Planted: two pixels spared as if the dots' period were
     the limit.)"""

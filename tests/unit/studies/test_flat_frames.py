@@ -20,8 +20,15 @@ from mitsim.studies.characterise import CAMERA_FILE, characterise_frames
 from mitsim.studies.emva_results import FIELDS, Characterisation, _set_field
 from tests.real_flats import CAMERAS, Light, camera, write_flats
 
-SLOW = ("few bits", "dark current", "high gain", "saturating ADC")
-"""Cameras of the slow tests: the quick ones are one of each kind of fault."""
+pytestmark = pytest.mark.usefixtures("draft_figures")
+SLOW = (
+    *("few bits", "dark current", "high gain", "saturating ADC", "no black level"),
+    *("high read noise, cut darks", "six bits, next to no noise"),
+)
+"""Cameras of the slow tests: the quick ones are one of each kind of fault. What cut darks and few bits do to the gain
+is looked at by a test of its own."""
+SLOW_LAMPS = "random walk", "step"
+"""Light that scatters, as that of the quick "scattering"."""
 
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
@@ -109,7 +116,9 @@ LAMPS: dict[str, tuple[Light, int, str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_LAMPS else []) for name in LAMPS]
+)
 def test_a_lamp_that_drifts_is_said_and_in_the_errors_of_what_depends_on_it(name: str, tmp_path: Path) -> None:
     """All fields and figures within five standard errors, and a line that names those which are known the less.
 

@@ -95,6 +95,7 @@ def twin(seed: int) -> Twin:
     return Twin(measured, measured.frame, measured.level, 1.0, 0.7, parts, 0.02)
 
 
+@pytest.mark.usefixtures("draft_figures")
 def test_findings_have_a_page_a_table_and_figures(tmp_path: Path) -> None:
     """Every figure that the page names is there, and what cannot be known stands on it."""
     learned = {"fc_6": Learned(Pose("turned", (0.6, 0.7)), made_codes())}
