@@ -177,6 +177,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
         noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
+        self.network.train()
         loss = self.network.loss(truths, data, self.model, noise)
         self.optimiser.zero_grad()
         loss.backward()
@@ -224,6 +225,7 @@ class Trainer:
     def judge(self) -> float:
         """Mean PSNR [dB] of the pairs that do not teach."""
         found = []
+        self.network.eval()
         with torch.no_grad():
             for index in self.judging:
                 truths, data = self.batch(np.array([index]))
