@@ -89,7 +89,7 @@ def has_half(device: torch.device) -> bool:
     """Whether a ``device`` computes with bfloat16, and does not only know it."""
     if device.type == "cpu":
         return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", bool)())
-    return device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return device.type == "cuda" and bool(torch.cuda.is_bf16_supported())
 
 
 def _turned(images: Tensor, way: int) -> Tensor:

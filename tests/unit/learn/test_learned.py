@@ -74,7 +74,12 @@ def test_a_network_looks_at_images_in_eight_ways() -> None:
             elif values.ndim == 4:
                 values.copy_(values.mean(dim=(-2, -1), keepdim=True).expand_as(values))
         for up, size in zip(network.up, (4, 8, 16), strict=True):
-            up.weight.copy_(up.weight.reshape(size, 4, -1, 1, 1).mean(1, keepdim=True).expand(-1, 4, -1, -1, -1).reshape(up.weight.shape))
+            up.weight.copy_(
+                up.weight.reshape(size, 4, -1, 1, 1)
+                .mean(1, keepdim=True)
+                .expand(-1, 4, -1, -1, -1)
+                .reshape(up.weight.shape)
+            )
             up.bias.copy_(up.bias.reshape(size, 4).mean(1, keepdim=True).expand(-1, 4).reshape(up.bias.shape))
         square = images[..., :8, :8]
         for way in range(WAYS):
