@@ -154,7 +154,7 @@ class Learned(Solver):
         if isinstance(frames, _Keeping):
             data = replace(data, frames=torch.as_tensor(_stack(frames)).to(like)[None])
         with torch.no_grad():
-            found = self.network(data, Diagonal.of(prepared, like))[0, 0]
+            found = self.network.images(data, Diagonal.of(prepared, like))[0, 0]
         image = found.cpu().numpy().astype(np.float64)
         if not np.isfinite(image).all():
             raise MitsimError(f"model {self.name}: its image of these frames is not finite; train it anew")

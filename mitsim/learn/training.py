@@ -30,6 +30,7 @@ from mitsim.core.seeds import integer, stream
 from mitsim.learn.diagonal import Data, Diagonal
 from mitsim.learn.learned_solver import Learned, datum_variance, relative_noise
 from mitsim.learn.methods import CLASSES, Method
+from mitsim.learn.networks import has_half
 from mitsim.learn.pair_store import PairStore
 from mitsim.learn.training_request import FEWEST_PAIRS, ModelManifest, Training
 from mitsim.reconstruct.factors import Factors
@@ -50,9 +51,9 @@ _RISING = 0.15
 """Part of the steps over which the learning rate rises; then it falls as a cosine to 0."""
 _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
 """Of AdamW; and the norm to which gradients are cut, which keeps the first steps from running away."""
-_BASE_BYTES, _BYTES_A_PIXEL = 6e8, 1500.0
-"""Memory of torch; and of a pixel that goes through a network with its gradient: 950 measured at a width of 32, half as
-much again for the wider ones."""
+_BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
+"""Memory of torch; of a pixel that goes through a network with its gradient, a channel of the first level (76 measured
+at a width of 16, 96 at 24); and the part of it where half precision is used (0.55 measured)."""
 _FRAME_PIXELS = 8
 """Pixels of a frame that take as much as one of an image: half the width, on a quarter of the squares."""
 _LOOK = 0.05
@@ -177,6 +178,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
         noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
+        self.network.train()
         loss = self.network.loss(truths, data, self.model, noise)
         self.optimiser.zero_grad()
         loss.backward()
@@ -224,6 +226,7 @@ class Trainer:
     def judge(self) -> float:
         """Mean PSNR [dB] of the pairs that do not teach."""
         found = []
+        self.network.eval()
         with torch.no_grad():
             for index in self.judging:
                 truths, data = self.batch(np.array([index]))
@@ -452,7 +455,8 @@ def _memory(store: PairStore, network: Method, request: Training) -> Cost:
     if network.reads_frames:
         pixels += store.manifest.frames * store.manifest.m[0] * store.manifest.m[1] // _FRAME_PIXELS
     sums = 8.0 * len(store) * network.shape[0] * network.shape[1]
-    return Cost(memory_bytes=_BASE_BYTES + sums + _BYTES_A_PIXEL * request.batch * pixels)
+    a_pixel = _CHANNEL_BYTES * network.WIDTH * (_HALF if has_half(next(network.parameters()).device) else 1.0)
+    return Cost(memory_bytes=_BASE_BYTES + sums + a_pixel * request.batch * pixels)
 
 
 def _digest(*parts: object) -> str:

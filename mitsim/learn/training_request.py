@@ -46,8 +46,8 @@ class Training:
     """
 
     method: str
-    steps: int = 1500
-    batch: int = 8
+    steps: int = 4000
+    batch: int = 4
     rate: float = 2e-3
     seed: int = 0
     device: str = "cpu"

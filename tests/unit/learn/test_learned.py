@@ -23,6 +23,7 @@ from mitsim.learn import training, verbs
 from mitsim.learn.diagonal import Data, Diagonal
 from mitsim.learn.learned_solver import Learned, read_network
 from mitsim.learn.methods import CLASSES
+from mitsim.learn.networks import WAYS, UNet
 from mitsim.learn.training import PairDataset, train_network
 from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
@@ -52,6 +53,60 @@ def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **m
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Learned:
     return trained(tmp_path_factory.mktemp("model") / "m.pt")
+
+
+# -------- The network
+
+
+def test_a_network_looks_at_images_in_eight_ways() -> None:
+    """A network that sees corners alike sees each image eight ways, all other; one of a single kernel that is as
+    symmetric as a square sees it one way. (Planted: turned back before it is mirrored back; half of the ways alike.)"""
+    random = torch.Generator().manual_seed(4)
+    network, images = UNet(1, 1, 4).eval(), torch.randn((2, 1, 13, 18), generator=random)
+    torch.nn.init.normal_(network.last.weight, generator=random)
+    with torch.no_grad():
+        seen = [network(images, way) for way in range(WAYS)]
+        assert all(each.shape == images.shape for each in seen)
+        assert min(float((a - b).abs().max()) for n, a in enumerate(seen) for b in seen[:n]) > 1e-3
+        for values in network.parameters():
+            if values.ndim == 4 and values.shape[-1] == 3:
+                ring = values.mean(dim=(-2, -1), keepdim=True).expand_as(values)
+                values.copy_(ring)
+            elif values.ndim == 4:
+                values.copy_(values.mean(dim=(-2, -1), keepdim=True).expand_as(values))
+        for up, size in zip(network.up, (4, 8, 16), strict=True):
+            up.weight.copy_(
+                up.weight.reshape(size, 4, -1, 1, 1)
+                .mean(1, keepdim=True)
+                .expand(-1, 4, -1, -1, -1)
+                .reshape(up.weight.shape)
+            )
+            up.bias.copy_(up.bias.reshape(size, 4).mean(1, keepdim=True).expand(-1, 4).reshape(up.bias.shape))
+        square = images[..., :8, :8]
+        for way in range(WAYS):
+            assert_allclose(network(square, way), network(square), atol=1e-5)
+
+
+def test_an_image_is_the_mean_over_all_ways(model: Learned) -> None:
+    """And single precision makes it, whatever made the network. (Planted: seven of eight.)"""
+    network = model.network
+    data, diagonal = _problem(model)
+    with torch.no_grad():
+        each = [network(data, diagonal, way) for way in range(WAYS)]
+        assert_allclose(network.images(data, diagonal), torch.stack(each).mean(0), atol=1e-6)
+    assert float((each[1] - each[6]).abs().max()) > 1e-6
+    assert not network.training
+
+
+def _problem(model: Learned) -> tuple[Data, Diagonal]:
+    """Data of a picture, and its camera's model."""
+    camera = bench()
+    prepared = model.init(camera.calibrated(1), camera.run("uniform", picture(1), 1).patterns)
+    sums = prepared.accumulator()
+    for shot in camera.run("uniform", picture(1), 1).pattern_measurements():
+        sums.add(shot.frame, shot.row, shot.column)
+    problem, like = prepared.problem(sums), next(model.network.parameters())
+    return Data.of(problem.projected[None], training.datum_variance(problem), like), Diagonal.of(prepared, like)
 
 
 # -------- The camera's model
