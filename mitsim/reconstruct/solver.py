@@ -267,8 +267,8 @@ class Prepared:
         if self.rank < self.unknowns and lam == 0:
             return Status(
                 Verdict.RANK_DEFICIENT,
-                f"Rank deficient: {self.unknowns - self.rank} of {self.unknowns} directions are not measured and left at zero by the "
-                "pseudo-inverse",
+                f"Rank deficient: {self.unknowns - self.rank} of {self.unknowns} directions are not measured and left "
+                "at zero by the pseudo-inverse",
                 "use more patterns, or lambda above 0",
                 figures,
             )

@@ -266,8 +266,8 @@ def test_a_truth_is_a_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["tikhonov", "markov", "tv"])
 def test_an_image_has_no_more_directions_than_its_calibration_states(method: str, tmp_path: Path) -> None:
-    """One dim picture tells some directions of the codes alone; under nine patterns the same factors tell all. (Planted:
-    the rank of the factors' own numbers.)"""
+    """One dim picture tells some directions of the codes alone; under nine patterns the same factors tell all.
+    (Planted: the rank of the factors' own numbers.)"""
     camera = KnownCamera(4, light=300.0)
     factors = one(camera.write_session(tmp_path / "cal", 1, orientation="upright", terms=1))
     rows, columns = factors.manifest.result["rank"]
