@@ -248,7 +248,7 @@ def on_device(network: Method, device: str) -> Method:
     """A ``network`` on a ``device`` of torch; ArgumentError for one that there is not, or that holds no numbers."""
     try:
         network.to(device)
-        float(network.log_start)
+        float(network.log_start.detach())
     except (RuntimeError, AssertionError) as error:  # of torch: no device, none built in, and `meta`
         raise ArgumentError("device", f"{device!r}: cannot be used ({cut(reason_of(error))}); use cpu") from error
     return network

@@ -196,7 +196,7 @@ def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) 
 
 def test_a_critic_tells_images_from_truths() -> None:
     """Features of equal images are as near as counts; an adversary that learns gives truths the higher numbers.
-    (Planted: the adversary's two halves exchanged; features of truths alone.)"""
+    (Planted: the adversary's two halves exchanged.)"""
     like = torch.zeros(())
     random = torch.Generator().manual_seed(1)
     truths = torch.as_tensor(np.stack([picture(seed, 32) for seed in range(8)]))[:, None].to(like)
