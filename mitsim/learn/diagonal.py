@@ -76,7 +76,7 @@ class Diagonal:
         return self.left @ coefficients @ self.right.T
 
     def project(self, frames: Tensor) -> Tensor:
-        """(B, r, r') W = sum_ij U_Li^T Y_ij U_Rj of frames Y that are even over each bin, (B, K, K', b, b')."""
+        """(B, r, r') W = sum_ij U_Li^T Y_ij U_Rj of ``frames`` Y (B, K, K', b, b') that are even over each bin."""
         left, right = self.slabs
         return (left.transpose(1, 2) @ (frames @ right).sum(2)).sum(1)
 
@@ -148,7 +148,13 @@ class Binning(Accumulator):
         self.frames = np.zeros((*(side.pattern_count for side in sides), *bins), np.float32)
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
-        """See :class:`mitsim.reconstruct.solver.Accumulator`; of ``frame``, ``row`` and ``column``."""
+        """Add one frame.
+
+        Parameters
+        ----------
+        frame, row, column
+            as :class:`mitsim.reconstruct.solver.Accumulator` takes them.
+        """
         super().add(frame, row, column)
         values = np.asarray(frame)
         pixels = np.outer(*(_binned(np.ones(size)) for size in values.shape))

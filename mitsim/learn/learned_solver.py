@@ -236,8 +236,8 @@ def read_network(path: Path | str, device: str) -> Learned:
 
 
 def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
-    """Write what ``torch.load`` reads with ``weights_only``, whole or not at all. MitsimError when it cannot be
-    written: of a full disk torch itself says so in pages."""
+    """Write what is ``held`` to the file ``path``, for ``torch.load`` with ``weights_only``, whole or not at all.
+    MitsimError when it cannot be written: of a full disk torch itself says so in pages."""
     buffer = BytesIO()
     torch.save(held, buffer)
     with whole_file(path) as part:

@@ -113,8 +113,8 @@ def test_the_step_of_the_frames_is_the_closed_form() -> None:
 @pytest.mark.slow
 def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
     """Its physics of the camera has an exact adjoint, our step of the frames is its proximal step, and its loop with
-    our denoiser, as docs/learned.md writes it, gives our image: conjugate gradients leave 1e-8 of white. (Planted: the
-    variance of the noise left out of a step; grey not taken off before the denoiser.)"""
+    our denoiser, as docs/learned.md writes it, gives our image: conjugate gradients leave 1e-8 of white. (Planted:
+    grey not taken off before the denoiser.)"""
     deepinv = pytest.importorskip("deepinv", reason="deepinv is an extra: pip install 'mitsim[deepinv]'")
     camera = bench(peak=300.0)
     shots, factors = camera.run("dots:2", picture(1), 1), camera.calibrated(1)
