@@ -104,7 +104,7 @@ def pairs(
     rows, columns = payload["shape"]
     lines = [
         f"{payload['count']} pairs of {payload['frames']} frames of {rows}x{columns} in "
-        f"{payload['seconds']['total']:.1f} s ({cost.seconds:.3g} s predicted after the plan), "
+        f"{payload['seconds']['total']:.1f} s ({cost.seconds:.3g} s predicted), "
         f"{payload['bytes'] / 2**20:.3g} MiB: {output}",
         *([f"Light is traced for each picture: {payload['traced_anew']}"] if payload["traced_anew"] else []),
     ]
@@ -120,6 +120,8 @@ class Schedule:
     rate: float = option(Training.rate, "largest learning rate of the cycle")
     seed: Seed = 0
     device: str = option(Training.device, "that torch works on")
+    feature_weight: float = option(Training.feature_weight, "of differences of features, beside the squared error")
+    adversary_weight: float = option(Training.adversary_weight, "of what an adversary tells from truths, beside it")
 
 
 @verb

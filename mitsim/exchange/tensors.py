@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, RunManifest
 from mitsim.core.recorders import TRUTH
@@ -65,8 +65,12 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
     else:
         arrays = _join_lines(path, run, calibration)
         arrays["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}
     with whole_file(path) as part:
-        torch.save({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, part)
+        try:
+            torch.save(tensors, part)
+        except RuntimeError as error:  # torch's own words for a full disk, in pages
+            raise OSError(f"torch: {cut(reason_of(error))}") from error
     return ()
 
 

@@ -15,12 +15,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from mitsim.core.arrays import FloatArray
 from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.solver import Prepared
+from mitsim.reconstruct.solver import Accumulator, Prepared
+
+BIN = 4
+"""Sensor pixels a side that a network which reads frames sees as one, 47 um of the shipped camera: features of the mask
+are 60 um. Frames of a pair under 49 patterns are then 3 MB, which memory holds for a thousand pairs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +39,8 @@ class Diagonal:
     sigma
         (r, r') singular values of the whole model [electrons / s].
     slabs
-        (K, m, r) and (K', m', r') U_L and U_R of every pattern, 0 where a pattern lights no pixel of a direction.
+        (K, b, r) and (K', b', r') sums of U_L and U_R over the sensor pixels of a bin, for every pattern; 0 where a
+        pattern lights no pixel of a direction.
     """
 
     left: Tensor
@@ -70,14 +76,9 @@ class Diagonal:
         return self.left @ coefficients @ self.right.T
 
     def project(self, frames: Tensor) -> Tensor:
-        """(B, r, r') W = sum_ij U_Li^T Y_ij U_Rj of ``frames`` (B, K, K', m, m')."""
+        """(B, r, r') W = sum_ij U_Li^T Y_ij U_Rj of ``frames`` Y (B, K, K', b, b') that are even over each bin."""
         left, right = self.slabs
         return (left.transpose(1, 2) @ (frames @ right).sum(2)).sum(1)
-
-    def frames(self, weights: Tensor) -> Tensor:
-        """(B, K, K', m, m') frames of ``weights`` (B, r, r'); the adjoint of :meth:`project`."""
-        left, right = self.slabs
-        return (left @ weights[:, None])[:, :, None] @ right.transpose(1, 2)
 
     def nearest(self, data: Data, images: Tensor, rho: Tensor) -> Tensor:
         """The images nearest to both the data and ``images``.
@@ -106,7 +107,7 @@ class Data:
     deviation
         (B, 1, 1, 1) standard deviation of that noise [electrons / s].
     frames
-        (B, K, K', m, m') the frames [electrons / s]; None: for methods that read none.
+        (B, K, K', b, b') the frames, binned [electrons / s]; None: for methods that read none.
     """
 
     weights: Tensor
@@ -131,9 +132,43 @@ class Data:
         return cls(scaled[:, None].to(like), torch.as_tensor(deviation)[:, None].to(like))
 
 
+class Binning(Accumulator):
+    """A sum of frames that keeps them, binned: ``frames`` (K, K', b, b') of single precision.
+
+    Parameters
+    ----------
+    prepared
+        the model that they are of.
+    """
+
+    def __init__(self, prepared: Prepared) -> None:
+        super().__init__(prepared)
+        sides = prepared.left, prepared.right
+        bins = (-(-side.sensor_size // BIN) for side in sides)
+        self.frames = np.zeros((*(side.pattern_count for side in sides), *bins), np.float32)
+
+    def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
+        """Add one frame.
+
+        Parameters
+        ----------
+        frame, row, column
+            as :class:`mitsim.reconstruct.solver.Accumulator` takes them.
+        """
+        super().add(frame, row, column)
+        values = np.asarray(frame)
+        pixels = np.outer(*(_binned(np.ones(size)) for size in values.shape))
+        self.frames[row, column] = _binned(_binned(values).T).T / pixels
+
+
+def _binned(values: FloatArray) -> FloatArray:
+    """(b, ...) sums of ``values`` (m, ...) over bins; the last may have fewer."""
+    return np.asarray(np.add.reduceat(values, np.arange(0, len(values), BIN)))
+
+
 def _slabs(side: Side) -> FloatArray:
-    """(K, m, r) U of every pattern of a ``side``."""
-    stack = np.zeros((side.pattern_count, side.sensor_size, side.accumulated_size))
+    """(K, b, r) sums over bins of U of every pattern of a ``side``."""
+    stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), side.accumulated_size))
     for whole, slab in zip(stack, side.slabs, strict=True):
-        whole[:, slab.columns] = slab.matrix
+        whole[:, slab.columns] = _binned(slab.matrix)
     return stack

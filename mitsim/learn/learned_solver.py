@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 from zipfile import is_zipfile
@@ -17,12 +18,12 @@ import torch
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validate
-from mitsim.core.errors import MitsimError, cut, reason_of
+from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
-from mitsim.learn.diagonal import Data, Diagonal
-from mitsim.learn.methods import CLASSES, Method
-from mitsim.learn.training_request import ModelManifest
+from mitsim.learn.diagonal import Binning, Data, Diagonal
+from mitsim.learn.methods import CLASSES, Denoiser, Method, PlugAndPlay
+from mitsim.learn.training_request import PLUG_AND_PLAY, ModelManifest
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
 from mitsim.reconstruct.request import TIKHONOV
@@ -45,27 +46,15 @@ _NO_NOISE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
-class _Recorded(Prepared):
-    """A factorised model, with ``doubts`` on whether a network knows it; its frames are kept where they are read."""
+class _Doubted(Prepared):
+    """A factorised model, with ``doubts`` on whether a network knows it, and whether this ``reads_frames``."""
 
     doubts: tuple[str, ...] = ()
-    keeps: bool = False
+    reads_frames: bool = False
 
     def accumulator(self) -> Accumulator:
         """An empty sum to add frames to."""
-        return _Keeping(self) if self.keeps else Accumulator(self)
-
-
-class _Keeping(Accumulator):
-    """A sum that keeps its frames."""
-
-    def __init__(self, prepared: Prepared) -> None:
-        super().__init__(prepared)
-        self.kept: dict[tuple[int, int], FloatArray] = {}
-
-    def add(self, frame: Any, row: int, column: int) -> None:
-        super().add(frame, row, column)
-        self.kept[row, column] = np.asarray(frame)
+        return Binning(self) if self.reads_frames else Accumulator(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +102,10 @@ class Learned(Solver):
                 f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
                 "others; capture those, or train one for these"
             )
-        return _Recorded(
+        return _Doubted(
             **vars(SOLVERS[TIKHONOV].init(camera, patterns)),
             doubts=self._doubts(camera),
-            keeps=self.network.reads_frames,
+            reads_frames=self.network.reads_frames,
         )
 
     def _doubts(self, camera: Factors) -> tuple[str, ...]:
@@ -151,8 +140,8 @@ class Learned(Solver):
         variance = datum_variance(problem)
         like = next(self.network.parameters())
         data = Data.of(problem.projected[None], variance, like)
-        if isinstance(frames, _Keeping):
-            data = replace(data, frames=torch.as_tensor(_stack(frames)).to(like)[None])
+        if isinstance(frames, Binning):
+            data = replace(data, frames=torch.as_tensor(frames.frames).to(like)[None])
         with torch.no_grad():
             found = self.network.images(data, Diagonal.of(prepared, like))[0, 0]
         image = found.cpu().numpy().astype(np.float64)
@@ -161,7 +150,7 @@ class Learned(Solver):
         missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
         beyond = float(np.sqrt(max(missed - variance * prepared.rank, 0.0) / problem.energy))
         outside = max(problem.energy - float(np.square(problem.projected).sum()), 0.0)
-        flags = [*(prepared.doubts if isinstance(prepared, _Recorded) else ())]
+        flags = [*(prepared.doubts if isinstance(prepared, _Doubted) else ())]
         relative, (low, high) = relative_noise(problem), self.manifest.noise
         if not low / _OTHER_NOISE <= relative <= high * _OTHER_NOISE:
             flags.append(
@@ -183,6 +172,13 @@ class Learned(Solver):
             ),
         )
 
+    def denoiser(self) -> Denoiser:
+        """What a plug-and-play network takes noise away by, for programs that call one as deepinv does. MitsimError of
+        other methods."""
+        if not isinstance(self.network, PlugAndPlay):
+            raise MitsimError(f"model {self.name}: has no denoiser; train {PLUG_AND_PLAY}")
+        return Denoiser(self.network)
+
     def save(self, path: Path | str) -> None:
         """Write the file ``path``, whole or not at all. MitsimError when it cannot be written."""
         tensors = {
@@ -195,8 +191,7 @@ class Learned(Solver):
             "tensors": {name: torch.as_tensor(np.asarray(values, np.float64)) for name, values in tensors.items()},
             "weights": state,
         }
-        with whole_file(path) as part:
-            torch.save(held, part)
+        write_tensors(path, held)
 
 
 _PATTERNS = ("P_L", "P_R")
@@ -216,7 +211,7 @@ def read_network(path: Path | str, device: str) -> Learned:
     Raises
     ------
     MitsimError
-        for a file that cannot be read, is none of these, or has numbers that are not finite.
+        for a file that cannot be read, is none of these, or has numbers that are not finite, and another device.
     """
     if check_plain(path, "model").st_size > _MOST_BYTES:
         raise MitsimError(f"model {path}: is larger than {_MOST_BYTES >> 20} MiB; give a file of `mitsim train`")
@@ -237,7 +232,26 @@ def read_network(path: Path | str, device: str) -> Learned:
         ) from error
     if not finite:
         raise MitsimError(f"model {path}: has weights that are not finite; train it anew")
-    return Learned(manifest, network.to(device).eval(), (left, right), (patterns[0], patterns[1]))
+    return Learned(manifest, on_device(network, device).eval(), (left, right), (patterns[0], patterns[1]))
+
+
+def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
+    """Write what is ``held`` to the file ``path``, for ``torch.load`` with ``weights_only``, whole or not at all.
+    MitsimError when it cannot be written: of a full disk torch itself says so in pages."""
+    buffer = BytesIO()
+    torch.save(held, buffer)
+    with whole_file(path) as part:
+        part.write_bytes(buffer.getbuffer())
+
+
+def on_device(network: Method, device: str) -> Method:
+    """A ``network`` on a ``device`` of torch; ArgumentError for one that there is not, or that holds no numbers."""
+    try:
+        network.to(device)
+        float(network.log_start.detach())
+    except (RuntimeError, AssertionError) as error:  # of torch: no device, none built in, and `meta`
+        raise ArgumentError("device", f"{device!r}: cannot be used ({cut(reason_of(error))}); use cpu") from error
+    return network
 
 
 def datum_variance(problem: DiagonalProblem) -> float:
@@ -248,12 +262,6 @@ def datum_variance(problem: DiagonalProblem) -> float:
 def relative_noise(problem: DiagonalProblem) -> float:
     """Noise of a datum of a ``problem`` over the rms of all data."""
     return float(np.sqrt(datum_variance(problem) * problem.data_count / problem.energy))
-
-
-def _stack(frames: _Keeping) -> FloatArray:
-    """(K, K', m, m') the frames that were kept."""
-    rows, columns = (side.pattern_count for side in (frames.prepared.left, frames.prepared.right))
-    return np.array([[frames.kept[row, column] for column in range(columns)] for row in range(rows)])
 
 
 def _difference(ours: Patterns, theirs: Patterns) -> float:

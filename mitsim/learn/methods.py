@@ -7,12 +7,13 @@ image well they keep it; a network fills in what the camera does not tell.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from mitsim.learn.diagonal import Data, Diagonal
-from mitsim.learn.networks import WAYS, UNet
+from mitsim.learn.networks import WAYS, UNet, drawn_way
 from mitsim.learn.training_request import FLATNET, PLUG_AND_PLAY, PREPROCESSED, REFINED, UNROLLED
 
 _GREY = 0.5
@@ -84,7 +85,7 @@ class Method(nn.Module):
         noise
             draws the way, and what a method draws of its own.
         """
-        return _decibels(self(data, model, _way(noise)), truths)
+        return decibels(self(data, model, drawn_way(noise)), truths)
 
 
 class Refined(Method):
@@ -182,10 +183,15 @@ class PlugAndPlay(Method):
         in a ``way``."""
         return images + self.network(torch.cat([images, deviation.expand_as(images)], 1), way)
 
+    @property
+    def deviations(self) -> Tensor:
+        """(steps,) standard deviations of the noise that the steps take away."""
+        return torch.logspace(math.log10(self.NOISIEST), math.log10(self.CLEANEST), self.STEPS)
+
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
         """See :class:`Method`; of ``data`` and ``model``, looked at in a ``way``."""
         images = self.start(data, model)
-        for deviation in torch.logspace(math.log10(self.NOISIEST), math.log10(self.CLEANEST), self.STEPS).to(images):
+        for deviation in self.deviations.to(images):
             images = self.denoise(images, deviation.reshape(1, 1, 1, 1), way)
             images = model.nearest(data, images + _GREY, 1 / deviation**2) - _GREY
         return images + _GREY
@@ -204,12 +210,26 @@ class PlugAndPlay(Method):
         part = torch.rand((len(truths), 1, 1, 1), generator=noise).to(truths)
         deviation = torch.exp(low + (high - low) * part)
         noisy = truths - _GREY + deviation * torch.randn(truths.shape, generator=noise).to(truths)
-        return _decibels(self.denoise(noisy, deviation, _way(noise)), truths - _GREY)
+        return decibels(self.denoise(noisy, deviation, drawn_way(noise)), truths - _GREY)
+
+
+class Denoiser(nn.Module):
+    """Images with white noise in, without it out, as `deepinv.models.Denoiser` is called: that of a ``network``, a
+    plug-and-play one."""
+
+    def __init__(self, network: PlugAndPlay) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor, sigma: Tensor | float, **_: Any) -> Tensor:
+        """Images ``x`` (B, 1, n, n'), white at 1, less noise of a standard deviation ``sigma``: one, or (B,)."""
+        deviation = torch.as_tensor(sigma).to(x).reshape(-1, 1, 1, 1)
+        return self.network.denoise(x - _GREY, deviation.expand(len(x), 1, 1, 1)) + _GREY
 
 
 class Preprocessed(Refined):
     """A network on every frame, least squares of what it gives, and a U-Net after that: modular reconstruction (Bezzam
-    et al., arXiv 2502.01102).
+    et al., arXiv 2502.01102). The network sees frames binned, and what it changes is even over a bin.
 
     Parameters
     ----------
@@ -219,7 +239,7 @@ class Preprocessed(Refined):
 
     reads_frames = True
     FRAME_WIDTH, FRAME_STACKED = 16, 4
-    """On squares of 4 x 4 pixels, as frames have sixteen times the pixels of an image."""
+    """On squares of 4 x 4 bins, as there are many frames; chosen so."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)
@@ -235,12 +255,7 @@ class Preprocessed(Refined):
         return super().start(Data(data.weights + added, data.deviation), model)
 
 
-def _way(noise: torch.Generator) -> int:
-    """One that is drawn."""
-    return int(torch.randint(WAYS, (), generator=noise))
-
-
-def _decibels(images: Tensor, truths: Tensor) -> Tensor:
+def decibels(images: Tensor, truths: Tensor) -> Tensor:
     """Mean logarithm of the squared error of ``images`` against ``truths``, (B, 1, n, n') each."""
     return torch.log((images - truths).square().mean(dim=(1, 2, 3)) + _LEAST_ERROR).mean()
 

@@ -67,22 +67,33 @@ class UNet(nn.Module):
 
     def _changed(self, images: Tensor) -> Tensor:
         rows, columns = images.shape[-2:]
-        whole = self.stacked * 2 ** (len(LEVELS) - 1)
-        padded = functional.pad(images, (0, -columns % whole, 0, -rows % whole), mode="replicate")
-        values = self.first(
-            functional.pixel_unshuffle(padded, self.stacked).contiguous(memory_format=torch.channels_last)
-        )
-        levels: list[Tensor] = []
-        for level, block in enumerate(self.before):
-            values = self.down[level - 1](values) if level else values
-            values = values + block(values)
-            levels.append(values)
+        levels = self.levels(images)
         values = levels.pop()
         for level in reversed(range(len(self.up))):
             values = functional.pixel_shuffle(self.up[level](values), 2) + levels.pop()
             values = values + self.after[level](values)
         changed = functional.pixel_shuffle(self.last(functional.relu(values)), self.stacked)
         return changed[..., :rows, :columns]
+
+    def levels(self, images: Tensor) -> list[Tensor]:
+        """What the first half makes of ``images`` (B, channels_in, n, n'): channels of each level, of half the pixels a
+        side of that before it."""
+        rows, columns = images.shape[-2:]
+        whole = self.stacked * 2 ** (len(LEVELS) - 1)
+        padded = functional.pad(images, (0, -columns % whole, 0, -rows % whole), mode="replicate")
+        squares = functional.pixel_unshuffle(padded, self.stacked)
+        values = self.first(squares.contiguous(memory_format=torch.channels_last))
+        found: list[Tensor] = []
+        for level, block in enumerate(self.before):
+            values = self.down[level - 1](values) if level else values
+            values = values + block(values)
+            found.append(values)
+        return found
+
+
+def drawn_way(noise: torch.Generator) -> int:
+    """One of the ways, drawn by ``noise``."""
+    return int(torch.randint(WAYS, (), generator=noise))
 
 
 def has_half(device: torch.device) -> bool:

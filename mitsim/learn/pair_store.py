@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray, hdf5_errors, whole_hdf5
@@ -123,6 +123,13 @@ class PairsManifest(BaseModel):
     """Why the store is flagged."""
     versions: dict[str, str] = {}
     """Of mitsim, Python and packages."""
+
+    @model_validator(mode="after")
+    def _every_pair_has_a_shard(self) -> PairsManifest:
+        ends = [0, *(shard.first + shard.count for shard in self.shards)]
+        if [shard.first for shard in self.shards] != ends[:-1] or ends[-1] != self.count:
+            raise ValueError(f"shards do not hold pairs 0 to {self.count - 1}, each once; make or copy them again")
+        return self
 
     @property
     def mask(self) -> Any:

@@ -125,10 +125,36 @@ class _Maker:
         """Why light on a ``bench`` is traced anew for each picture."""
         return "" if self._asked.idealised else traced_anew(bench)
 
+    def check_pictures(self, shards: Iterable[Shard]) -> None:
+        """Read the files of pictures of all ``shards``: a store is not resumed with others. MitsimError for one that
+        cannot be shown."""
+        if isinstance(self._pictures, FolderPictures):
+            files = len(self._pictures.files)
+            for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:
+                self._pictures.draw(number, self.bench.n)
+
+    def check_benches(self, groups: Iterable[int]) -> None:
+        """Open the benches of all ``groups`` before any light is traced. MitsimError for one that cannot be opened, and
+        where light is to be traced anew for each picture before some benches and not before the first."""
+        if self.why_anew:
+            return
+        of_groups = {tuple(self._parameters(group).items()): group for group in groups}
+        for parameters, group in of_groups.items():
+            if parameters and (why := self._why(self._opening(dict(parameters)))):
+                raise ArgumentError(
+                    "vary",
+                    f"bench {group} ({', '.join(f'{name} {value}' for name, value in parameters)}): {why}, other than "
+                    "before bench 0; vary it less, or leave out what turns or hides the sheet",
+                )
+
+    def _parameters(self, group: int) -> dict[str, str]:
+        """Parameters of the scene that are drawn for a ``group``."""
+        drawn = self._groups[group].items()
+        return {name.partition(".")[2]: repr(value) for name, value in drawn if name.startswith("scene.")}
+
     def _bench_of(self, group: int) -> tuple[Bench, Plan]:
         """The bench of a ``group``, its prints white where one tracing serves all pictures, and its plan."""
-        drawn = self._groups[group].items()
-        parameters = {name.partition(".")[2]: repr(value) for name, value in drawn if name.startswith("scene.")}
+        parameters = self._parameters(group)
         if self._open is None or self._open[0] != parameters:
             bench = self._opening(parameters)
             self._asked.capture.timing.check(bench.sensor, bench.devices.camera_file)
@@ -162,10 +188,6 @@ class _Maker:
     def write(self, shard: Shard, path: Path, digest: str) -> None:
         """Write the file of a ``shard`` to a ``path``, marked with a ``digest``."""
         bench, plan = self._bench_of(shard.group)
-        if not self.why_anew and (why := self._why(bench)):
-            raise ArgumentError(
-                "vary", f"bench {shard.group}: {why}, other than before the first; keep one kind of scene"
-            )
         moved, asked, light = self._with_moved_mask(bench, shard.group), self._asked, None
         if self.why_anew:
             shown = self._in_own_light(shard, bench, moved)
@@ -215,7 +237,7 @@ class _Maker:
             yield Pair(each.picture, each.truth, exposure_s, saturated, each.warnings, frames)
 
     def cost(self, left: Sequence[Shard]) -> Cost:
-        """What the shards that are ``left`` take."""
+        """What the shards that are ``left`` take, with the first plan, which is made."""
         pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)
         of_benches = {tuple(sorted(self._groups[shard.group].items())) for shard in left}
         varied = self._asked.variation is not None and bool(self._asked.variation.scene)
@@ -228,7 +250,7 @@ class _Maker:
         )
         benches = len(of_benches) if varied else 1
         seconds = pairs * (each + (tracing if self.why_anew else 0.0))
-        seconds += (benches - 1) * taken["plan"] + (0.0 if self.why_anew else benches * tracing)
+        seconds += benches * (taken["plan"] + (0.0 if self.why_anew else tracing))
         memory = frames_cost(self.bench, self._plan.settings, self._family.lighting).memory_bytes
         shadow = len(left) * _SHADOW_BYTES * sum(self.bench.geometry.frame_shape) * self.bench.n
         return Cost(seconds, memory, pairs * stored + shadow)
@@ -346,6 +368,8 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairS
     shards = _shards(asked)
     with output_folder(task.output, overwrite=again) as folder:
         left = [shard for shard in shards if not is_shard(folder / shard.file, digest, shard.count)]
+        maker.check_pictures(left)
+        maker.check_benches(shard.group for shard in left)
         cost = maker.cost(left)
         cost.check(f"{asked.count} pairs", job.limits, folder)
         job.clock.predict({"pairs": cost.seconds})

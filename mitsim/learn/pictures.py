@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import check_plain
 from mitsim.core.imagelist import Wanted
 from mitsim.core.images import read_image
 from mitsim.core.seeds import stream
@@ -216,7 +217,7 @@ class FolderPictures:
         """What a store says that they are."""
         digest = hashlib.sha256()
         for path in self.files:
-            digest.update(f"{path.name} {path.stat().st_size}\n".encode())
+            digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())
         return f"{len(self.files)} files of {self.folder}, names and sizes {digest.hexdigest()[:16]}"
 
     def draw(self, number: int, n: int) -> Codes:
@@ -246,6 +247,8 @@ def _read_grey(path: Path) -> FloatArray:
     most = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     grey = np.asarray(values, dtype=np.float64) / most
     if grey.ndim == 3:
+        if (grey[..., 3:] < 1).any():
+            raise MitsimError(f"picture {path}: has transparent pixels; lay it on a ground, and save it without")
         grey = grey[..., :3].mean(axis=2)
     if not (np.isfinite(grey).all() and grey.min() >= 0 and grey.max() <= 1):
         raise MitsimError(f"picture {path}: its numbers reach from {grey.min():g} to {grey.max():g}; give 0 to 1")

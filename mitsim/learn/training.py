@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,15 @@ from torch.utils.data import Dataset
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
-from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
-from mitsim.core.files import whole_file
+from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
-from mitsim.learn.diagonal import Data, Diagonal
-from mitsim.learn.learned_solver import Learned, datum_variance, relative_noise
-from mitsim.learn.methods import CLASSES, Method
-from mitsim.learn.networks import has_half
+from mitsim.learn.critic import Critic
+from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
+from mitsim.learn.learned_solver import Learned, datum_variance, on_device, relative_noise, write_tensors
+from mitsim.learn.methods import CLASSES, Method, decibels
+from mitsim.learn.networks import drawn_way, has_half
 from mitsim.learn.pair_store import PairStore
 from mitsim.learn.training_request import FEWEST_PAIRS, ModelManifest, Training
 from mitsim.reconstruct.factors import Factors
@@ -55,7 +55,7 @@ _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
 """Memory of torch; of a pixel that goes through a network with its gradient, a channel of the first level (76 measured
 at a width of 16, 96 at 24); and the part of it where half precision is used (0.55 measured)."""
 _FRAME_PIXELS = 8
-"""Pixels of a frame that take as much as one of an image: half the width, on a quarter of the squares."""
+"""Bins of frames that take as much as a pixel of an image: half the width, on a quarter of the squares."""
 _LOOK = 0.05
 """What a look adds to the steps before it; measured of 56 pictures and 100 steps of 8."""
 _UNFINISHED = ".unfinished"
@@ -95,40 +95,50 @@ class Sums:
         (N, n, n'), (N, r, r') W, and (N,) of a datum's noise.
     noise
         least and largest noise of a datum over its rms.
+    frames
+        (N, K, K', b, b') the frames, binned; None: for methods that read none.
     """
 
     truths: FloatArray
     weights: FloatArray
     variances: FloatArray
     noise: tuple[float, float]
+    frames: FloatArray | None = None
 
     @classmethod
-    def of(cls, store: PairStore, prepared: Prepared, job: Job) -> Sums:
+    def of(cls, store: PairStore, prepared: Prepared, job: Job, keep: bool = False) -> Sums:
         """Read all pairs.
 
         Parameters
         ----------
         store, prepared
             the pairs, and the model of their camera.
+        keep
+            whether frames are kept.
         job
             whose limits the time must keep, and who is told how far it is.
         """
         count, started = len(store), time.perf_counter()
         truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
+        kept: FloatArray | None = None
         for index in range(count):
-            frames = prepared.accumulator()
+            frames = Binning(prepared) if keep else prepared.accumulator()
             for frame, (row, column) in zip(store.frames(index), store.indices, strict=True):
                 frames.add(frame, row, column)
             problem = prepared.problem(frames)
             variances[index], noise[index] = datum_variance(problem), relative_noise(problem)
             weights.append(problem.projected.astype(np.float32))
             truths.append(store.truth(index))
+            if isinstance(frames, Binning):
+                kept = np.empty((count, *frames.frames.shape), np.float32) if kept is None else kept
+                kept[index] = frames.frames
             if not index:
                 each = time.perf_counter() - started
-                held = 4.0 * count * (problem.projected.size + truths[0].size)
+                held = 4.0 * count * (problem.projected.size + truths[0].size) + (0 if kept is None else kept.nbytes)
                 Cost(each * count, held).check(f"{store.folder}: reading {count} pairs", job.limits)
             job.progress("read", (index + 1) / count)
-        return cls(np.stack(truths), np.stack(weights), variances, (float(noise.min()), float(noise.max())))
+        limits = float(noise.min()), float(noise.max())
+        return cls(np.stack(truths), np.stack(weights), variances, limits, kept)
 
 
 # -------- Steps
@@ -140,14 +150,13 @@ class Trainer:
 
     Attributes
     ----------
-    request, store, prepared, sums
+    request, prepared, sums
         how, and on what.
     network
         that is trained.
     """
 
     request: Training
-    store: PairStore
     prepared: Prepared
     sums: Sums
     network: Method
@@ -156,6 +165,8 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(self.network.parameters(), betas=_BETAS, weight_decay=_DECAY)
         self._like = next(self.network.parameters())
         self.model = Diagonal.of(self.prepared, self._like)
+        weighted = self.request.feature_weight or self.request.adversary_weight
+        self.critic = Critic(self.request, self._like) if weighted else None
         count = len(self.sums.truths)
         judging = min(max(count // _JUDGING, 1), _MOST_JUDGING)
         order = stream(self.request.seed, "judging").permutation(count)
@@ -179,25 +190,33 @@ class Trainer:
             group["lr"] = self.rate(number)
         noise = torch.Generator().manual_seed(integer(self.request.seed, "noise", number))
         self.network.train()
-        loss = self.network.loss(truths, data, self.model, noise)
-        self.optimiser.zero_grad()
-        loss.backward()
+        loss = self._gradients(truths, data, noise)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
         self.optimiser.step()
+        if self.critic:
+            self.critic.optimiser.step()
+        return loss
+
+    def _gradients(self, truths: Tensor, data: Data, noise: torch.Generator) -> float:
+        """Leave the gradients of what a step makes smaller with the weights; return it."""
+        self.optimiser.zero_grad()
+        if self.critic is None:
+            loss = self.network.loss(truths, data, self.model, noise)
+            loss.backward()
+            return float(loss.detach())
+        images = self.network(data, self.model, drawn_way(noise))
+        loss = decibels(images, truths) + self.critic.loss(images, truths)
+        loss.backward()
+        self.critic.learn(images, truths)
         return float(loss.detach())
 
     def batch(self, chosen: Any) -> tuple[Tensor, Data]:
         """Truths (B, 1, n, n') and data of the pairs that are ``chosen``."""
         truths = torch.as_tensor(self.sums.truths[chosen])[:, None].to(self._like)
         data = Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
-        if not self.network.reads_frames:
+        if self.sums.frames is None:
             return truths, data
-        shape = tuple(side.pattern_count for side in (self.prepared.left, self.prepared.right))
-        frames = np.stack([self.store.frames(int(index)) for index in chosen])
-        ordered = np.empty((len(chosen), *shape, *frames.shape[2:]), np.float32)
-        for number, (row, column) in enumerate(self.store.indices):
-            ordered[:, row, column] = frames[:, number]
-        return truths, Data(data.weights, data.deviation, torch.as_tensor(ordered).to(self._like))
+        return truths, replace(data, frames=torch.as_tensor(self.sums.frames[chosen]).to(self._like))
 
     def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
         """The second half of a batch with turned pictures, and with what the frames held beside them: a store then
@@ -218,7 +237,7 @@ class Trainer:
         taken = []
         for _ in range(2):  # the first makes what later ones find
             started = time.perf_counter()
-            self.network.loss(truths, data, self.model, torch.Generator().manual_seed(0)).backward()
+            self._gradients(truths, data, torch.Generator().manual_seed(0))
             taken.append(time.perf_counter() - started)
         self.optimiser.zero_grad()
         return taken[-1] * (1 + _LOOK)
@@ -251,6 +270,8 @@ class State:
         weights after the best of these.
     network, optimiser
         weights, and what AdamW knows of them.
+    critic
+        the same of an adversary; empty where there is none.
     """
 
     step: int
@@ -258,17 +279,21 @@ class State:
     best: dict[str, Tensor]
     network: dict[str, Tensor]
     optimiser: dict[str, Any]
+    critic: dict[str, Any]
 
     @classmethod
     def first(cls, trainer: Trainer) -> State:
         """Before any step of a ``trainer``."""
         weights = _copy(trainer.network)
-        return cls(0, [(0, trainer.judge())], weights, weights, trainer.optimiser.state_dict())
+        curve = [(0, trainer.judge())]
+        return cls(0, curve, weights, weights, trainer.optimiser.state_dict(), _critic(trainer))
 
     def restore(self, trainer: Trainer) -> None:
         """Put a ``trainer`` there."""
         trainer.network.load_state_dict(self.network)
         trainer.optimiser.load_state_dict(self.optimiser)
+        if trainer.critic:
+            trainer.critic.restore(self.critic)
 
     def is_over(self, steps: int) -> bool:
         """Whether all ``steps`` are done, or the last looks brought nothing."""
@@ -287,6 +312,7 @@ class State:
         self.curve.append((self.step, trainer.judge()))
         job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.step / steps)
         self.network, self.optimiser = _copy(trainer.network), trainer.optimiser.state_dict()
+        self.critic = _critic(trainer)
         if self.curve[-1][1] >= max(value for _, value in self.curve):
             self.best = self.network
 
@@ -300,8 +326,7 @@ class Unfinished:
 
     def write(self, state: State) -> None:
         """Keep a ``state``, whole or not at all."""
-        with whole_file(self.path) as part:
-            torch.save({"digest": self.digest, **vars(state)}, part)
+        write_tensors(self.path, {"digest": self.digest, **vars(state)})
 
     def read(self) -> State:
         """The state that was kept; MitsimError where it is of another training, or cannot be read."""
@@ -316,6 +341,11 @@ class Unfinished:
                 f"{self.path}: is of a training of other pairs, factors or options; give those, or remove it"
             )
         return state
+
+
+def _critic(trainer: Trainer) -> dict[str, Any]:
+    """State of what judges the images of a ``trainer`` beside their squared error."""
+    return trainer.critic.state() if trainer.critic else {}
 
 
 def _copy(network: Method) -> dict[str, Tensor]:
@@ -391,8 +421,8 @@ def train_network(
         prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
         network = first_network(request, (factors.left.shape[1], factors.right.shape[1]))
         _memory(store, network, request).check(f"{store.folder}: training {request.method}", job.limits)
-        sums = Sums.of(store, prepared, job)
-    trainer = Trainer(request, store, prepared, sums, network)
+        sums = Sums.of(store, prepared, job, network.reads_frames)
+    trainer = Trainer(request, prepared, sums, network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), _digest(asdict(request), factors.fingerprint, about))
     state = unfinished.read() if resume and unfinished.path.is_file() else State.first(trainer)
@@ -426,14 +456,7 @@ def first_network(request: Training, shape: tuple[int, int]) -> Method:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(integer(request.seed, "weights"))
-        network = CLASSES[request.method](shape)
-    try:
-        network.to(request.device)
-    except (RuntimeError, AssertionError) as error:
-        raise ArgumentError(
-            "device", f"{request.device!r}: cannot be used ({cut(reason_of(error))}); use cpu"
-        ) from error
-    return network
+        return on_device(CLASSES[request.method](shape), request.device)
 
 
 def _check(store: PairStore, factors: Factors) -> None:
@@ -452,9 +475,11 @@ def _check(store: PairStore, factors: Factors) -> None:
 def _memory(store: PairStore, network: Method, request: Training) -> Cost:
     """Memory that training takes: sums of all pairs of a ``store``, and what a ``network`` keeps of a batch."""
     pixels = network.shape[0] * network.shape[1] * network.PASSES
+    kept = 2 * network.shape[0] * network.shape[1]
     if network.reads_frames:
-        pixels += store.manifest.frames * store.manifest.m[0] * store.manifest.m[1] // _FRAME_PIXELS
-    sums = 8.0 * len(store) * network.shape[0] * network.shape[1]
+        bins = store.manifest.frames * math.prod(-(-size // BIN) for size in store.manifest.m)
+        pixels, kept = pixels + bins // _FRAME_PIXELS, kept + bins
+    sums = 4.0 * len(store) * kept
     a_pixel = _CHANNEL_BYTES * network.WIDTH * (_HALF if has_half(next(network.parameters()).device) else 1.0)
     return Cost(memory_bytes=_BASE_BYTES + sums + a_pixel * request.batch * pixels)
 

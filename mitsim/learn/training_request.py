@@ -23,6 +23,8 @@ _LARGEST_BATCH = 256
 """Pairs a step: thirty times what is usual; chosen so that a slip of the keyboard is refused."""
 _LONGEST = 1_000_000
 """Steps: ten days of the smallest network on two processors; chosen as the batch is."""
+_LARGEST_WEIGHT = 100
+"""Of a loss beside the squared error: then that counts for nothing; chosen so."""
 FEWEST_PAIRS = 8
 """Fewer cannot be parted into those that teach and those that judge; chosen so."""
 
@@ -43,6 +45,8 @@ class Training:
         root of first weights, order of the pairs and their noise.
     device
         of torch, such as ``cpu`` or ``cuda``.
+    feature_weight, adversary_weight
+        of the losses of :class:`mitsim.learn.critic.Critic`, beside the logarithm of the squared error.
     """
 
     method: str
@@ -51,6 +55,8 @@ class Training:
     rate: float = 2e-3
     seed: int = 0
     device: str = "cpu"
+    feature_weight: float = 0.0
+    adversary_weight: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -63,6 +69,12 @@ class Training:
         check_root(self.seed)
         if not 0 < self.rate <= 1:
             raise ArgumentError("rate", f"{self.rate}: give a number above 0, at most 1")
+        for name in ("feature_weight", "adversary_weight"):
+            value = getattr(self, name)
+            if not 0 <= value <= _LARGEST_WEIGHT:
+                raise ArgumentError(name, f"{value}: give a number, 0 to {_LARGEST_WEIGHT}")
+            if value and self.method == PLUG_AND_PLAY:
+                raise ArgumentError(name, f"{value}: {PLUG_AND_PLAY} learns from noise alone; leave it out")
 
 
 class ModelManifest(Configuration):
@@ -85,6 +97,6 @@ class ModelManifest(Configuration):
     pairs: Plain
     """What the store of the pairs says of itself."""
     training: Plain
-    """Steps, batch, rate and seed; PSNR of pairs that did not teach, by step; seconds."""
+    """Steps, batch, rate, seed and weights of losses; PSNR of pairs that did not teach, by step; seconds."""
     versions: dict[str, str]
     """Of mitsim, torch and others."""

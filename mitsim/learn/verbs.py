@@ -73,7 +73,8 @@ def train(
     job
         its limits, and who is told how far it is.
     **options
-        ``steps``, ``batch``, ``rate``, ``seed`` and ``device`` of :class:`mitsim.learn.training_request.Training`.
+        ``steps``, ``batch``, ``rate``, ``seed``, ``device``, ``feature_weight`` and ``adversary_weight`` of
+        :class:`mitsim.learn.training_request.Training`.
 
     Raises
     ------

@@ -90,6 +90,15 @@ class Factors:
         return max(squared_condition(self.left), squared_condition(self.right))
 
     @property
+    def stated_rank(self) -> tuple[int, int] | None:
+        """Directions of scene rows and of columns that the calibration states to be above its noise; None: not stated,
+        as of sessions, which are flagged where they lack any."""
+        match self.manifest.result.get("rank"):
+            case [int(rows), int(columns)]:
+                return rows, columns
+        return None
+
+    @property
     def sides(self) -> tuple[FloatArray, FloatArray]:
         """Both factors as the solver takes them: without their columns' means where frames are centred."""
         if not self.manifest.centre:

@@ -33,6 +33,7 @@ columns F V' that make an image of coefficients: all that was a closed form stay
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -71,12 +72,14 @@ _UNSEEN = 1e-60
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Factorised model, ready for any number of scenes; applying it changes nothing in it."""
+    """Factorised model, ready for any number of scenes; applying it changes nothing in it. ``stated``: directions of
+    either factor that its calibration states to be above its noise, where it does."""
 
     left: Side
     right: Side
     method: Method
     centre: bool
+    stated: tuple[int, int] | None = None
 
     @property
     def condition(self) -> float:
@@ -92,6 +95,15 @@ class Prepared:
     def rank(self) -> int:
         """Numerical rank of the whole model."""
         return self.left.rank * self.right.rank
+
+    @property
+    def lost(self) -> tuple[int, str]:
+        """Directions of the image that are not measured, and above what: a factor of a stated rank tells at most that
+        many under each pattern."""
+        sides = zip((self.left, self.right), self.stated or (), strict=False)
+        told = [min(side.rank, side.pattern_count * rank) for side, rank in sides] or [self.rank]
+        limit = "rounding" if math.prod(told) == self.rank else "the calibration's noise"
+        return self.unknowns - math.prod(told), limit
 
     @property
     def spare(self) -> float:
@@ -243,7 +255,7 @@ class Prepared:
     def _status(self, lam: float, rounding: float, scale: float) -> Status:
         """Whether the image is complete, and what to do where it is not."""
         figures = f"{self.extent}, rounding below {rounding:.0e}."
-        lost = self.unknowns - self.rank
+        lost, limit = self.lost
         for name, side in (("row", self.left), ("column", self.right)):
             if side.data_rows < side.scene_size:
                 return Status(
@@ -252,11 +264,11 @@ class Prepared:
                     "use more patterns, more sensor pixels or fewer scene pixels",
                     figures,
                 )
-        if lost and lam == 0:
+        if self.rank < self.unknowns and lam == 0:
             return Status(
                 Verdict.RANK_DEFICIENT,
-                f"Rank deficient: {lost} of {self.unknowns} directions are not measured and left at zero by the "
-                "pseudo-inverse",
+                f"Rank deficient: {self.unknowns - self.rank} of {self.unknowns} directions are not measured and left "
+                "at zero by the pseudo-inverse",
                 "use more patterns, or lambda above 0",
                 figures,
             )
@@ -272,9 +284,9 @@ class Prepared:
         if lost:
             return Status(
                 Verdict.PARTLY_MEASURED,
-                f"Solved, but {lost} of {self.unknowns} directions are not measured above rounding and follow from "
+                f"Solved, but {lost} of {self.unknowns} directions are not measured above {limit} and follow from "
                 "lambda alone",
-                "use more patterns",
+                "use more patterns" if limit == "rounding" else "calibrate with more frames, or use more patterns",
                 figures,
             )
         return Status(Verdict.SOLVED, "Solved: every direction of the image is measured", "", figures)

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -340,7 +340,7 @@ def _solution(
     modelled = problem.sigma * prepared.coefficients(image)
     outside = max(problem.energy - float(np.sum(np.square(problem.projected))), 0.0)
     misfit = outside + float(np.sum(np.square(problem.projected - modelled)))
-    lost = prepared.unknowns - prepared.rank
+    lost, limit = prepared.lost
     figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
     if not converged:
         status = Status(
@@ -353,8 +353,8 @@ def _solution(
     elif lost:
         status = Status(
             Verdict.PARTLY_MEASURED,
-            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured and "
-            f"follow from {name} alone",
+            f"Solved in {iterations} iterations, but {lost} of {prepared.unknowns} directions are not measured above "
+            f"{limit} and follow from {name} alone",
             "use more patterns",
             figures,
         )
@@ -426,7 +426,8 @@ class Tikhonov(Solver):
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised."""
-        return prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
+        prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
+        return replace(prepared, stated=camera.stated_rank)
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any

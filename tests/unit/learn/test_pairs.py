@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -44,13 +45,13 @@ class Lab:
     """A small scene with a print, and pairs of it."""
 
     def __init__(self, write: Callable[..., Path], folder: Path, variant: str) -> None:
-        self._write, self._folder, self._variant = write, folder, variant
+        self._write, self.folder, self._variant = write, folder, variant
 
     def bench(self, print_: np.ndarray | None = None, extra: str = "", projector: str = "", **defines: str) -> Bench:
         """Before a sheet that shows ``print_`` (TEXELS, TEXELS)."""
         shown = np.full((TEXELS, TEXELS), 128) if print_ is None else print_
         scene = self._write("scene" if print_ is None else "shown", n=N, reflectance=shown, extra=extra)
-        path = self._folder / "projector.toml"
+        path = self.folder / "projector.toml"
         path.write_text(projector)
         return open_bench(scene, self._variant, projector=path if projector else None, **defines)
 
@@ -68,7 +69,7 @@ class Lab:
         bench_of = dict(scene or {})
         store, _ = make_pairs(
             lambda drawn: self.bench(**bench_of, **drawn), PairsRequest(request, count, **own),
-            Task(self._folder / name, resume),
+            Task(self.folder / name, resume),
         )  # fmt: skip
         return store
 
@@ -238,6 +239,21 @@ def test_benches_vary_by_group(lab: Lab) -> None:
         assert shift_of(store.expected_frames(index), still.expected_frames(index)) == pytest.approx(pixels, abs=0.1)
 
 
+def test_a_bench_that_cannot_share_its_light_is_refused_before_any_work(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked are the first bench twice, and then all. (Planted: benches looked at when their turn comes.)"""
+    answers = iter(["", "", "", "", "the sheet is turned"])
+    monkeypatch.setattr(pairs_module, "traced_anew", lambda _: next(answers))
+    variation = Variation(groups=3, scene={"albedo": (1.0, 3.0)})
+    scene = {"extra": POINT.replace("300", "$albedo")}
+    with pytest.raises(
+        MitsimError, match=r"bench 2 \(albedo [12]\..*\): the sheet is turned, other than before bench 0"
+    ):
+        lab.pairs(3, variation=variation, scene=scene)
+    assert not (lab.folder / "store").exists()
+
+
 def shift_of(moved: np.ndarray, still: np.ndarray) -> float:
     """Rows by which frames (K, m, m') have moved, to a twentieth: where they are most alike away from the edges."""
     rows, tried = np.arange(8, still.shape[1] - 8), np.arange(-6, 6, 0.05)
@@ -287,6 +303,18 @@ def test_a_store_of_another_request_is_not_resumed(lab: Lab) -> None:
         lab.pairs(1)
 
 
+def test_a_picture_that_cannot_be_shown_is_refused_before_any_work(lab: Lab) -> None:
+    """As a store of other pictures is not resumed. (Planted: pictures read when their turn comes.)"""
+    folder = lab.folder / "pictures"
+    folder.mkdir()
+    for name in ("a.npy", "b.npy"):
+        np.save(folder / name, np.full((N, N) if name == "a.npy" else (N - 1, N), 0.5))
+    with pytest.raises(MitsimError, match=r"b\.npy: has 15 pixels on its shorter side, and 16 are shown"):
+        lab.pairs(3, folder=folder)
+    assert not (lab.folder / "store").exists()
+    assert len(lab.pairs(1, folder=folder)) == 1, "which does not show the other"
+
+
 def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match=r"holds no pairs\.json"):
         PairStore.open(tmp_path)
@@ -302,6 +330,13 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
     (copy / "pairs_00000.h5").write_bytes(data)
     with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
         PairStore.open(copy).frames(3)
+    (copy / "pairs_00000.h5").write_bytes(bytes((drawn.folder / "pairs_00000.h5").read_bytes())[:-3000])
+    with pytest.raises(MitsimError, match="damaged, or no HDF5 file"):
+        PairStore.open(copy).frames(3)
+    more = {**json.loads((drawn.folder / "pairs.json").read_text()), "count": 5}
+    (copy / "pairs.json").write_text(json.dumps(more))
+    with pytest.raises(MitsimError, match=r"shards do not hold pairs 0 to 4, each once"):
+        PairStore.open(copy)
     (copy / "pairs.json").write_text("{}")
     with pytest.raises(MitsimError, match="is no manifest of pairs"):
         PairStore.open(copy)

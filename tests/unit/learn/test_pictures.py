@@ -70,6 +70,20 @@ def test_pictures_of_a_folder_are_middle_squares_then_crops(tmp_path: Path) -> N
     assert all(still == 0 and step > 0 for still, step in steps), "turned by quarters"
 
 
+def test_a_picture_of_sixteen_bits_or_without_transparency_is_read(tmp_path: Path) -> None:
+    save(tmp_path / "a.png", np.full((20, 20), 257 * 77, np.uint16))
+    opaque = np.full((20, 20, 4), 77, np.uint8)
+    opaque[..., 3] = 255
+    save(tmp_path / "b.png", opaque)
+    assert all((FolderPictures(tmp_path, 0).draw(number, 16) == 77).all() for number in (0, 1))
+
+
+def test_a_link_that_leads_nowhere_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.png").symlink_to(tmp_path / "gone.png")
+    with pytest.raises(MitsimError, match=r"picture .*a\.png: cannot be read"):
+        FolderPictures(tmp_path, 0).source  # noqa: B018 - found when it is asked for
+
+
 def test_a_jpeg_is_read(tmp_path: Path) -> None:
     """A grey one, but for what its packing changes."""
     Image.fromarray(np.full((40, 60), 77, np.uint8)).save(tmp_path / "photo.JPG")
@@ -82,6 +96,8 @@ def test_a_jpeg_is_read(tmp_path: Path) -> None:
         ("a.png", np.zeros((8, 9), np.uint8), "has 8 pixels on its shorter side, and 16 are shown"),
         ("a.npy", np.full((20, 20), 1.5), "its numbers reach from 1.5 to 1.5; give 0 to 1"),
         ("a.jpg", None, "cannot be read as a JPEG"),
+        ("a.png", np.full((20, 20, 4), 128, np.uint8), "has transparent pixels"),
+        ("a.png", np.full((20, 20, 2), 128, np.uint8), "is no grey PNG"),
     ],
 )
 def test_a_picture_that_cannot_be_shown_is_refused(

@@ -262,3 +262,23 @@ def test_a_truth_is_a_picture(tmp_path: Path) -> None:
         tmp_path / "known.json", [{"run": "run", "picture": "truth.exr"}], orientation="upright", scale=SCALES
     )
     assert error_of(one(listed), camera) < 1
+
+
+@pytest.mark.parametrize("method", ["tikhonov", "markov", "tv"])
+def test_an_image_has_no_more_directions_than_its_calibration_states(method: str, tmp_path: Path) -> None:
+    """One dim picture tells some directions of the codes alone; under nine patterns the same factors tell all.
+    (Planted: the rank of the factors' own numbers.)"""
+    camera = KnownCamera(4, light=300.0)
+    factors = one(camera.write_session(tmp_path / "cal", 1, orientation="upright", terms=1))
+    rows, columns = factors.manifest.result["rank"]
+    assert rows * columns < 400 and factors.stated_rank == (rows, columns)
+    lacking = "directions are not measured above the calibration's noise"
+    even, dots = (
+        str(reconstruct(load_run(run), factors, method=method).status)
+        for run in (
+            camera.write_run(tmp_path / "run", camera.picture()),
+            camera.write_run(tmp_path / "dots", camera.picture(), "dots:3"),
+        )
+    )
+    assert f"{400 - rows * columns} of 400 {lacking}" in even
+    assert 3 * rows >= 20 <= 3 * columns and lacking not in dots
