@@ -157,11 +157,11 @@ class Binning(Accumulator):
         """
         super().add(frame, row, column)
         values = np.asarray(frame)
-        pixels = np.outer(*(_binned(np.ones(size)) for size in values.shape))
-        self.frames[row, column] = _binned(_binned(values).T).T / pixels
+        pixels = np.outer(*(_bin(np.ones(size)) for size in values.shape))
+        self.frames[row, column] = _bin(_bin(values).T).T / pixels
 
 
-def _binned(values: FloatArray) -> FloatArray:
+def _bin(values: FloatArray) -> FloatArray:
     """(b, ...) sums of ``values`` (m, ...) over bins; the last may have fewer."""
     return np.asarray(np.add.reduceat(values, np.arange(0, len(values), BIN)))
 
@@ -170,5 +170,5 @@ def _slabs(side: Side) -> FloatArray:
     """(K, b, r) sums over bins of U of every pattern of a ``side``."""
     stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), side.accumulated_size))
     for whole, slab in zip(stack, side.slabs, strict=True):
-        whole[:, slab.columns] = _binned(slab.matrix)
+        whole[:, slab.columns] = _bin(slab.matrix)
     return stack

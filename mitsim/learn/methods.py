@@ -102,7 +102,13 @@ class Refined(Method):
         self.network = UNet(1, 1, self.WIDTH)
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """See :class:`Method`; of ``data`` and ``model``, looked at in a ``way``."""
+        """See :class:`Method`.
+
+        Parameters
+        ----------
+        data, model, way
+            as of :meth:`Method.forward`.
+        """
         start = self.start(data, model)
         return start + self.network(start, way) + _GREY
 
@@ -149,7 +155,13 @@ class Unrolled(Method):
         self.log_rho = nn.Parameter(torch.linspace(math.log(self.FIRST), math.log(self.LAST), self.STEPS))
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """See :class:`Method`; of ``data`` and ``model``, looked at in a ``way``."""
+        """See :class:`Method`.
+
+        Parameters
+        ----------
+        data, model, way
+            as of :meth:`Method.forward`.
+        """
         start = self.start(data, model)
         images = start
         for network, rho in zip(self.networks, torch.exp(self.log_rho), strict=True):
@@ -179,8 +191,15 @@ class PlugAndPlay(Method):
         self.network = UNet(2, 1, self.WIDTH)
 
     def denoise(self, images: Tensor, deviation: Tensor, way: int = 0) -> Tensor:
-        """``images`` (B, 1, n, n') less grey without white noise of a standard ``deviation`` (B, 1, 1, 1), looked at
-        in a ``way``."""
+        """Images without white noise.
+
+        Parameters
+        ----------
+        images, deviation
+            (B, 1, n, n') with it, less grey, and its (B, 1, 1, 1) standard deviation.
+        way
+            that the network looks at them in.
+        """
         return images + self.network(torch.cat([images, deviation.expand_as(images)], 1), way)
 
     @property
@@ -189,7 +208,13 @@ class PlugAndPlay(Method):
         return torch.logspace(math.log10(self.NOISIEST), math.log10(self.CLEANEST), self.STEPS)
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """See :class:`Method`; of ``data`` and ``model``, looked at in a ``way``."""
+        """See :class:`Method`.
+
+        Parameters
+        ----------
+        data, model, way
+            as of :meth:`Method.forward`.
+        """
         images = self.start(data, model)
         for deviation in self.deviations.to(images):
             images = self.denoise(images, deviation.reshape(1, 1, 1, 1), way)

@@ -63,9 +63,9 @@ class UNet(nn.Module):
         """
         half = self.training and has_half(images.device)
         with torch.autocast(images.device.type, torch.bfloat16, enabled=half):
-            return _turned_back(self._changed(_turned(images, way)), way).to(images.dtype)
+            return _turn_back(self._change(_turn(images, way)), way).to(images.dtype)
 
-    def _changed(self, images: Tensor) -> Tensor:
+    def _change(self, images: Tensor) -> Tensor:
         rows, columns = images.shape[-2:]
         levels = self.levels(images)
         values = levels.pop()
@@ -100,17 +100,17 @@ def has_half(device: torch.device) -> bool:
     """Whether a ``device`` computes with bfloat16, and does not only know it."""
     if device.type == "cpu":
         return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", bool)())
-    return device.type == "cuda" and bool(torch.cuda.is_bf16_supported())
+    return bool(getattr(torch.get_device_module(device), "is_bf16_supported", bool)())
 
 
-def _turned(images: Tensor, way: int) -> Tensor:
+def _turn(images: Tensor, way: int) -> Tensor:
     """``images`` (..., n, n') mirrored along both axes and across the diagonal, as the bits of a ``way`` say."""
     images = images.flip([axis for axis in (-2, -1) if way >> (axis + 2) & 1])
     return images.transpose(-2, -1) if way & 4 else images
 
 
-def _turned_back(images: Tensor, way: int) -> Tensor:
-    """What :func:`_turned` the same ``way`` gives ``images`` of."""
+def _turn_back(images: Tensor, way: int) -> Tensor:
+    """What :func:`_turn` the same ``way`` gives ``images`` of."""
     images = images.transpose(-2, -1) if way & 4 else images
     return images.flip([axis for axis in (-2, -1) if way >> (axis + 2) & 1])
 
