@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mitsim.devices.session import load_recipe as load_recipe
     from mitsim.learn.pair_store import PairStore as PairStore
     from mitsim.learn.verbs import load_network as load_network
+    from mitsim.learn.verbs import make_pairs as make_pairs
     from mitsim.learn.verbs import train as train
     from mitsim.light.plan import Plan as Plan
     from mitsim.metrics import psnr as psnr
@@ -68,7 +69,7 @@ _HOMES = {
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
         "learn.pair_store": "PairStore",
-        "learn.verbs": "load_network train",
+        "learn.verbs": "load_network make_pairs train",
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",

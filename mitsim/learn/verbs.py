@@ -1,5 +1,5 @@
-"""Training and trained networks for programs: folders and options in, a trained network out, or the line that says what
-is missing. torch, an extra, is imported when it is used.
+"""Pairs, training and trained networks for programs: folders and options in, pairs or a network out, or the line that
+says what is missing. torch, an extra, is imported when it is used.
 """
 
 from __future__ import annotations
@@ -8,14 +8,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mitsim.bench.request import Request, Task
 from mitsim.core.errors import MitsimError, check_arguments
-from mitsim.core.files import check_apart, check_plain, output_file
+from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
-from mitsim.learn.pair_request import CALIBRATION
+from mitsim.learn.pair_request import CALIBRATION, PairsRequest
 from mitsim.learn.training_request import Training
 
 if TYPE_CHECKING:
+    from mitsim.api.bench import Bench
     from mitsim.learn.learned_solver import Learned
+    from mitsim.learn.pair_store import PairStore
     from mitsim.learn.training import Trained
 
 
@@ -23,6 +26,58 @@ def check_torch() -> None:
     """MitsimError where torch is not installed."""
     if find_spec("torch") is None:
         raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
+
+
+@check_arguments
+def make_pairs(
+    bench: Bench,
+    output: Path | str,
+    count: int,
+    patterns: str = "dots:7",
+    idealised: bool = False,
+    pictures: Path | str | None = None,
+    resume: bool = False,
+    job: Job | None = None,
+    **request: Any,
+) -> PairStore:
+    """Pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
+
+    Parameters
+    ----------
+    bench
+        of the scene.
+    output
+        folder of the pairs.
+    count
+        of pairs.
+    patterns
+        name of their family.
+    idealised
+        whether frames are of the paper's separable model; their exact factors are then beside them.
+    pictures
+        folder of pictures; None: they are drawn by code.
+    resume
+        whether to go on where interrupted work of the same request stopped.
+    job
+        its limits, and who is told how far it is.
+    **request
+        other fields of :class:`mitsim.bench.request.Request`, but for ``seconds`` and ``noise_fraction``.
+
+    Raises
+    ------
+    MitsimError
+        for a request that cannot be served, a scene without a print, pictures that cannot be read, an output that
+        cannot be written or holds something else, and more memory, disk or time than is allowed.
+    """
+    output, folder = Path(output), None if pictures is None else Path(pictures)
+    asked = PairsRequest(Request.of(patterns=patterns, **request), count, idealised, folder)
+    asked.check()
+    check_output(output, overwrite=resume and (output / PAIRS).is_file())
+    task = Task.of(output, resume, job)
+    with task.importing():
+        from mitsim.learn import pairs
+
+    return pairs.make_pairs(lambda drawn: bench, asked, task)[0]
 
 
 @check_arguments

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
+import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.prints import show_picture
@@ -72,6 +74,20 @@ class Lab:
             Task(self.folder / name, resume),
         )  # fmt: skip
         return store
+
+
+def test_programs_make_the_same_pairs(lab: Lab) -> None:
+    """As the command line's; refused before any work where one cannot. (Planted: another seed.)"""
+    bench, folder = lab.bench(), lab.folder / "own"
+    own = ms.make_pairs(bench, folder, 2, "dots:2", accuracy=2e-3, seed=3)
+    other = lab.pairs()
+    for index in range(2):
+        assert_array_equal(own.frames(index), other.frames(index))
+    with pytest.raises(MitsimError, match="own"):
+        ms.make_pairs(bench, folder, 2, "dots:2")
+    with pytest.raises(MitsimError, match="share their light"):
+        ms.make_pairs(bench, lab.folder / "timed", 2, seconds=3.0)
+    assert not (lab.folder / "timed").exists()
 
 
 @pytest.fixture
