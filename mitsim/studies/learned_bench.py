@@ -199,7 +199,7 @@ class Shown:
             for name, values in self._expose(studio, condition, family).arrays().items()
         }
         with path.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **arrays)
 
     def _expose(self, studio: Studio, condition: str, name: str) -> Case:
         lit = studio.lit_scene(place_setup(studio, self.setup, self.place))
@@ -215,7 +215,7 @@ class Shown:
         model, exposer, frame = frames.prepare(), frames.exposer(seconds), None
         if len(family.shots) == 1:
             ((measured, _, _),) = exposer.measurements(family, expected)
-            frame, sums = (measured - taken_off(exposer, family, expected)).astype(np.float32), model.accumulator()
+            frame, sums = measured - taken_off(exposer, family, expected), model.accumulator()
             sums.add(frame, 0, 0)
         else:
             (sums,) = accumulate(exposer, family, expected, [model])

@@ -209,9 +209,9 @@ def _simulation(matrix: Matrix) -> list[Claim]:
     ideal, rendered = (_best(matrix, name, "uniform", name) for name in (IDEALISED, RENDERED))
     if not ideal or not rendered:
         return []
-    texts = [f"{kind.method} {gain:+} dB over the best classical image" for kind, gain in (ideal, rendered)]
+    one, other = (f"{kind.method} {gain:+} dB over the best classical image" for kind, gain in (ideal, rendered))
     claim = "On frames like those that they were trained on learned methods are best (uniform light)"
-    return [Claim(claim, "best", *texts, verdict(ideal[1].within(low=0)))]
+    return [Claim(claim, "best", one, other, verdict(ideal[1].within(low=0)))]
 
 
 def _flatnet(matrix: Matrix) -> list[Claim]:
@@ -256,10 +256,10 @@ def _coded_light(matrix: Matrix) -> list[Claim]:
     if not kinds:
         return []
     ideal, rendered = ({kind: matrix.gain(kind, name) for kind in kinds} for name in (IDEALISED, RENDERED))
-    texts = [", ".join(f"{kind.method} {gain:+} dB" for kind, gain in each.items()) for each in (ideal, rendered)]
+    one, other = (", ".join(f"{kind.method} {gain:+} dB" for kind, gain in each.items()) for each in (ideal, rendered))
     holds = every(*(gain.within(low=-_FAILS_DB) for gain in rendered.values()))
     claim = f"Trained on the idealised model, all do well under 49 dots (within {_FAILS_DB:g} dB of the best classical)"
-    return [Claim(claim, "similar to least squares", *texts, verdict(holds))]
+    return [Claim(claim, "similar to least squares", one, other, verdict(holds))]
 
 
 def _catastrophe(matrix: Matrix) -> list[Claim]:

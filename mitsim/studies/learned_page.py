@@ -7,11 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
+from mitsim.learn.training_request import FLATNET
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.report import RENDERED, in_text, label
+from mitsim.reconstruct.request import TIKHONOV
+from mitsim.report import IDEALISED, RENDERED, in_text, label
 from mitsim.report.pages import DASH, Mean
 from mitsim.report.plots import image_grid, pair_chart
 from mitsim.studies.framework.experiment import QUICK_IMAGES, PageTable, Results
+from mitsim.studies.learned_cells import ELSEWHERE, PICTURES
 from mitsim.studies.learned_claims import MISFIT, Gain, Kind, Matrix, count_failures, mean_mismatch
 from mitsim.studies.learned_scores import AUTOMATIC, BEST, WEIGHTS
 
@@ -189,7 +192,9 @@ def _images(results: Results, matrix: Matrix, patterns: str, condition: str) -> 
     for name in shown:
         add(TRUTH, best[name], f"{condition} {patterns} {TRUTH}")
         add("best classical", best[name], f"{condition} {patterns} {best[name]['method']} {BEST}")
-    for kind in (kind for kind in matrix.kinds if kind.patterns == patterns):
+        plain = _of_print(matrix.classical[patterns, condition, AUTOMATIC], name, TIKHONOV)
+        add("automatic Tikhonov", plain, f"{condition} {patterns} {TIKHONOV} {AUTOMATIC}")
+    for kind in (kind for kind in matrix.kinds if kind.patterns == patterns and _is_drawn(kind)):
         seed = min(row["seed"] for row in matrix.rows[kind, condition])  # type: ignore[type-var]
         by_print = {row["picture"]: row for row in matrix.rows[kind, condition] if row["seed"] == seed}
         for name in shown:
@@ -198,6 +203,17 @@ def _images(results: Results, matrix: Matrix, patterns: str, condition: str) -> 
     across = {print_: [cells[index] for cells in whole.values()] for index, print_ in enumerate(shown)}
     title = f"{label(patterns)}, tested on {condition}; networks by their training set"
     return {f"images_{condition}.png": image_grid(across, list(whole), title)} if whole else {}
+
+
+def _of_print(rows: Iterable[Mapping[str, object]], picture: str, method: str) -> Mapping[str, object]:
+    """The row of a method and a print."""
+    return next(row for row in rows if (row["picture"], row["method"]) == (picture, method))
+
+
+def _is_drawn(kind: Kind) -> bool:
+    """Whether it has a column among the images: the idealised FlatNet of the paper's claim, and all that was not
+    trained on idealised or varied benches, so that a page holds them."""
+    return kind.training in (RENDERED, ELSEWHERE, PICTURES) or (kind.training, kind.method) == (IDEALISED, FLATNET)
 
 
 def _short(kind: Kind) -> str:

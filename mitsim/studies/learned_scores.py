@@ -110,7 +110,13 @@ def classical_rows(case: Case, picture: str, methods: tuple[str, ...]) -> Iterat
         best = max(images, key=lambda each: psnr(each, case.truth))
         for weight, each in zip(WEIGHTS, (image, best), strict=True):
             _, beyond = beyond_noise(prepared, problem, each)
-            row = {"training": "none", "method": method, "weight": weight, "beyond": beyond, "seconds": seconds}
+            row: dict[str, Value] = {
+                "training": "none",
+                "method": method,
+                "weight": weight,
+                "beyond": beyond,
+                "seconds": seconds,
+            }
             row["unexplained"] = case.unexplained
             yield {**row, **scores(each, case, picture)}, each
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.learn.training_request import PREPROCESSED
 from mitsim.learn.verbs import check_torch
 from mitsim.report import IDEALISED, RENDERED
 from mitsim.report.pages import Value
@@ -23,7 +24,7 @@ from mitsim.studies.framework.claims import single_precision
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Experiment, Found, Point, Scope
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.learned_bench import DEPTH, PLACES, Shown
-from mitsim.studies.learned_cells import FULL, PICTURES, PREPROCESSED, QUICK, Budget, Cell, School, cells
+from mitsim.studies.learned_cells import FULL, PICTURES, QUICK, Budget, Cell, School, cells
 from mitsim.studies.learned_claims import find_claims
 from mitsim.studies.learned_page import TRUTH, figures, tables
 from mitsim.studies.learned_scores import CLASSICAL, classical_rows, network_row
@@ -47,7 +48,8 @@ def _points(scope: Scope) -> Sequence[Point]:
         raise MitsimError("study learned: has a bench of its own, the middle of the photograph; leave the scene out")
     families, budget = scope.choose(FAMILIES, FAMILIES[:1]), QUICK if scope.quick else FULL
     seed, places = scope.seeds[0], scope.choose(tuple(PLACES), (RENDERED, DEPTH))
-    prints = [(place, name) for place in places for name in _prints(scope, place)]
+    bars = scope.choose(BARS, BARS[1:2])
+    prints = [(place, name) for place in places for name in _prints(scope.pictures, bars, place)]
     shown = [
         Point.of(scope.setup.with_print(name), place=place, families=" ".join(families), seed=seed)
         for place, name in prints
@@ -56,16 +58,16 @@ def _points(scope: Scope) -> Sequence[Point]:
     networks = [
         Point.of(
             scope.setup, **vars(cell), families=" ".join(families), places=" ".join(places),
-            prints=",".join(str(name) for name in scope.pictures), noise=seed, **vars(budget),
+            prints=",".join(str(name) for name in scope.pictures), bars=",".join(bars), noise=seed, **vars(budget),
         )
         for cell in cells(seeds, families, scope.quick)
     ]  # fmt: skip
     return [*shown, *networks]
 
 
-def _prints(scope: Scope, place: str) -> tuple[str | None, ...]:
-    """Prints at a ``place``: bars stand where nothing is amiss."""
-    return (*scope.pictures, *(scope.choose(BARS, BARS[1:2]) if place == RENDERED else ()))
+def _prints(pictures: Sequence[str | None], bars: Sequence[str], place: str) -> tuple[str, ...]:
+    """Prints at a ``place``: ``bars`` stand where nothing is amiss, ``pictures`` everywhere."""
+    return (*map(str, pictures), *(bars if place == RENDERED else ()))
 
 
 @single_threaded_blas()
@@ -102,16 +104,16 @@ def _learned(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
     named = {**vars(cell), "train_s": seconds}
     rows: list[dict[str, Value]] = []
     arrays = {}
-    scope = Scope(point.setup, tuple(values["prints"].split(",")), quick=budget == QUICK)
+    pictures, bars = (tuple(values[name].split(",")) for name in ("prints", "bars"))
     for place in values["places"].split():
-        for name in _prints(scope, place):
+        for name in _prints(pictures, bars, place):
             shown = Shown(point.setup.with_print(name), place, families, noise)
             for (condition, family), case in shown.cases(studio).items():
                 if family != cell.patterns:
                     continue
                 factors = school.factors_for(case)
                 own = replace(model, sides=factors.sides) if cell.training == PICTURES else model
-                row, image = network_row(own, factors, case, str(name))
+                row, image = network_row(own, factors, case, name)
                 rows.append({**named, "picture": name, "condition": condition, **row})
                 if name in QUICK_IMAGES and cell.seed == noise:
                     arrays[f"{condition} {name}"] = image
