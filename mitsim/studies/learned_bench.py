@@ -64,7 +64,20 @@ _SCENES = {RENDERED: "photograph", DEPTH: "photograph", GLOSS: "photograph", AMB
 
 
 def place_setup(studio: Studio, setup: Setup, place: str) -> Setup:
-    """The ``setup`` of a ``place``, one of :data:`PLACES`, whose scene file stands in a folder of the ``studio``."""
+    """The setup of a place.
+
+    Parameters
+    ----------
+    studio, setup
+        in a folder of which the scene file stands, and what else the bench is of.
+    place
+        one of :data:`PLACES`.
+
+    Raises
+    ------
+    MitsimError
+        where the shipped scene is not as its middle is taken of.
+    """
     name = f"{_SCENES[place]}_{GLOSS}" if place == GLOSS else _SCENES[place]
     folder = studio.made_once("scenes", name, lambda part: _write_scene(part, _SCENES[place], place == GLOSS))
     own = replace(setup, scene=str(folder / "scene.xml"))
@@ -230,5 +243,13 @@ class Shown:
 
 
 def factors_of(studio: Studio, setup: Setup, seed: int) -> Factors:
-    """What a session at the calibrated distance estimates, whatever a ``setup`` shows; ``seed`` of its noise."""
+    """What a session at the calibrated distance estimates.
+
+    Parameters
+    ----------
+    studio, setup
+        where it is kept, and the bench, whatever it shows.
+    seed
+        of the session's noise.
+    """
     return studio.factors(place_setup(studio, setup.with_print(None), RENDERED), seed)

@@ -118,7 +118,15 @@ class Matrix:
         return best
 
     def level(self, kind: Kind, condition: str, column: str = "psnr_db") -> Gain:
-        """Mean of a ``column`` of a ``kind`` under a ``condition``."""
+        """Mean of a column.
+
+        Parameters
+        ----------
+        kind, condition
+            whose images, of what.
+        column
+            that is averaged.
+        """
         return _mean((row["picture"], row["seed"], row[column]) for row in self.scored(kind, condition, column))
 
     def gain(self, kind: Kind, condition: str, column: str = "psnr_db", weight: str = BEST) -> Gain:

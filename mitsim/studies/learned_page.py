@@ -23,7 +23,7 @@ TRUTH = "truth"
 
 
 def tables(results: Results) -> Sequence[PageTable]:
-    """PSNR and gain for each family of patterns; flags, detail, and costs."""
+    """PSNR and gain for each family of patterns; flags, detail, and costs; of all ``results``."""
     matrix = Matrix(results.table)
     found = [make(matrix, patterns) for patterns in matrix.patterns for make in (_psnr_table, _gain_table)]
     return [*found, _flag_table(matrix), _misfit_table(matrix), _detail_table(matrix), _cost_table(matrix)]
@@ -156,7 +156,7 @@ def _cost_table(matrix: Matrix) -> PageTable:
 
 
 def figures(results: Results) -> Mapping[str, Figure]:
-    """Losses by family; images where nothing is amiss, and of the worst mismatch."""
+    """Losses by family; images where nothing is amiss, and of the worst mismatch; of all ``results``."""
     matrix, drawn = Matrix(results.table), {}
     for patterns in matrix.patterns:
         kinds = [kind for kind in matrix.kinds if kind.patterns == patterns]
