@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock
 
-import mitsim
+from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray, read_npz
 from mitsim.core.files import PAIRS
@@ -203,9 +203,7 @@ class School:
 
         def opening(drawn: dict[str, str]) -> Any:
             parameters: dict[str, Any] = {**dict(setup.parameters), **drawn}
-            return mitsim.open_bench(
-                setup.scene, setup.variant, setup.camera, setup.projector, setup.outside, **parameters
-            )
+            return open_bench(setup.scene, setup.variant, setup.camera, setup.projector, setup.outside, **parameters)
 
         return opening
 
