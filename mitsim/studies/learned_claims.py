@@ -127,7 +127,7 @@ class Matrix:
         column
             that is averaged.
         """
-        return _mean((row["picture"], row["seed"], row[column]) for row in self.scored(kind, condition, column))
+        return _mean((row["picture"], row["seed"], row[column]) for row in self.rows_with(kind, condition, column))
 
     def gain(self, kind: Kind, condition: str, column: str = "psnr_db", weight: str = BEST) -> Gain:
         """Mean of what a kind has over the best classical image.
@@ -144,15 +144,15 @@ class Matrix:
         best = self.best_classical(kind.patterns, condition, weight)
         return _mean(
             (row["picture"], row["seed"], _number(row, column) - _number(best[row["picture"]], column))
-            for row in self.scored(kind, condition, column)
+            for row in self.rows_with(kind, condition, column)
         )
 
-    def lost(self, kind: Kind, condition: str) -> Gain:
+    def loss(self, kind: Kind, condition: str) -> Gain:
         """What a ``kind`` loses under a ``condition`` of its own PSNR without mismatch [dB]."""
-        home = {(row["picture"], row["seed"]): row["psnr_db"] for row in self.scored(kind, kind.home, "psnr_db")}
+        home = {(row["picture"], row["seed"]): row["psnr_db"] for row in self.rows_with(kind, kind.home, "psnr_db")}
         return _mean(
             (row["picture"], row["seed"], float(home[row["picture"], row["seed"]]) - _number(row, "psnr_db"))  # type: ignore[arg-type]
-            for row in self.scored(kind, condition, "psnr_db")
+            for row in self.rows_with(kind, condition, "psnr_db")
         )
 
     def mismatches(self, kind: Kind) -> list[str]:
@@ -163,7 +163,7 @@ class Matrix:
         """All kinds of a ``training`` under some ``patterns``."""
         return [kind for kind in self.kinds if (kind.training, kind.patterns) == (training, patterns)]
 
-    def scored(self, kind: Kind, condition: str, column: str = "psnr_db") -> list[Mapping[str, Value]]:
+    def rows_with(self, kind: Kind, condition: str, column: str = "psnr_db") -> list[Mapping[str, Value]]:
         """Rows of a kind that have a number in a column: PSNR is of pictures, and not of bars.
 
         Parameters
@@ -276,7 +276,7 @@ def _catastrophe(matrix: Matrix) -> list[Claim]:
         return []
     gain, kind, name = min(found, key=lambda item: item[0].prints.value)
     own = max(
-        ((matrix.lost(other, each), other, each) for other in matrix.kinds for each in matrix.mismatches(other)),
+        ((matrix.loss(other, each), other, each) for other in matrix.kinds for each in matrix.mismatches(other)),
         key=lambda item: item[0].prints.value,
     )
     plain = matrix.gain(kind, name, weight=AUTOMATIC)
@@ -320,7 +320,7 @@ def mean_mismatch(matrix: Matrix, kind: Kind) -> Gain:
     found = []
     for name in matrix.mismatches(kind):
         best = matrix.best_classical(kind.patterns, name)
-        rows = matrix.scored(kind, name)
+        rows = matrix.rows_with(kind, name)
         found += [(row["picture"], row["seed"], _level(row) - _level(best[row["picture"]])) for row in rows]
     return _mean(found)
 
@@ -335,8 +335,8 @@ def _variation(matrix: Matrix) -> list[Claim]:
             more = [
                 (row["picture"], row["seed"], _level(row) - _level(other))
                 for name in matrix.mismatches(varied)
-                for row in matrix.scored(varied, name)
-                for other in matrix.scored(plain, name)
+                for row in matrix.rows_with(varied, name)
+                for other in matrix.rows_with(plain, name)
                 if (row["picture"], row["seed"]) == (other["picture"], other["seed"])
             ]
             gains[varied.method] = _mean(more)
@@ -364,7 +364,7 @@ def count_failures(matrix: Matrix, kinds: Iterable[Kind]) -> tuple[int, int, int
     for kind in kinds:
         for condition in matrix.conditions:
             best = matrix.best_classical(kind.patterns, condition)
-            for row in matrix.scored(kind, condition):
+            for row in matrix.rows_with(kind, condition):
                 place = 0 if _level(row) < _level(best[row["picture"]]) - _FAILS_DB else 2
                 counts[place] += any(bool(row[flag]) for flag in MISFIT)
                 counts[place + 1] += 1

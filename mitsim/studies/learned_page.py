@@ -45,7 +45,7 @@ def _psnr_table(matrix: Matrix, patterns: str) -> PageTable:
 
 def _gain_table(matrix: Matrix, patterns: str) -> PageTable:
     rows = [
-        (str(kind), *(_signed(matrix.gain(kind, name)) for name in matrix.conditions))
+        (str(kind), *(_gain_text(matrix.gain(kind, name)) for name in matrix.conditions))
         for kind in matrix.kinds
         if kind.patterns == patterns
     ]
@@ -56,7 +56,7 @@ def _gain_table(matrix: Matrix, patterns: str) -> PageTable:
     return PageTable(title, ("network (training set)", *matrix.conditions), tuple(rows))
 
 
-def _signed(gain: Gain) -> str:
+def _gain_text(gain: Gain) -> str:
     """A gain with both standard errors, in few letters."""
     spread = "" if gain.trainings.of < 2 else f", {gain.trainings.error:.1f}"
     return f"{gain.prints:+}{spread}"
@@ -72,7 +72,7 @@ def _flag_table(matrix: Matrix) -> PageTable:
     for kind in matrix.kinds:
         shares = []
         for name in matrix.conditions:
-            own = matrix.scored(kind, name)
+            own = matrix.rows_with(kind, name)
             flags = [sum(any(bool(row[flag]) for flag in both) for row in own) / len(own) for both in _FLAGS]
             shares.append(" / ".join(f"{100 * share:.0f}" for share in flags))
         bad, of_bad, false, of_good = count_failures(matrix, [kind])
@@ -138,7 +138,7 @@ def _cost_table(matrix: Matrix) -> PageTable:
         gains = {name: matrix.gain(kind, name) for name in matrix.mismatches(kind)}
         worst = min(gains, key=lambda name: gains[name].prints.value)
         spent = _mean(own, "train_s", "{:.0f}"), _mean(own, "seconds", "{:.3f}")
-        losses = _signed(mean_mismatch(matrix, kind)), f"{_signed(gains[worst])} ({worst})"
+        losses = _gain_text(mean_mismatch(matrix, kind)), f"{_gain_text(gains[worst])} ({worst})"
         rows.append((f"{kind}, {in_text(kind.patterns)}", *losses, *spent))
     for method in dict.fromkeys(row["method"] for own in matrix.classical.values() for row in own):
         for patterns in matrix.patterns:

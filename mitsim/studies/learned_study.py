@@ -76,7 +76,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
     torch.set_num_threads(1)  # processes share the processors, and a training ends with the same bits at one number
     values = dict(point.values)
-    return _classical(studio, point, values) if "place" in values else _learned(studio, point, values)
+    return _classical(studio, point, values) if "place" in values else _networks(studio, point, values)
 
 
 def _classical(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
@@ -95,7 +95,7 @@ def _classical(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
     return Found(tuple(rows), single_precision(arrays))
 
 
-def _learned(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
+def _networks(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
     cell = Cell(*(values[name] for name in ("training", "patterns", "method", "seed")))
     families, noise = tuple(values["families"].split()), int(values["noise"])
     budget = Budget(*(int(values[name]) for name in ("pairs", "steps", "groups")))

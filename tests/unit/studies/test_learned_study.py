@@ -180,7 +180,7 @@ def test_the_home_of_a_network_is_no_mismatch() -> None:
     assert matrix.mismatches(FLAT) == [name for name in CONDITIONS if name != IDEALISED]
     assert matrix.mismatches(UNET) == [name for name in CONDITIONS if name not in (IDEALISED, RENDERED)]
     assert_allclose(mean_mismatch(matrix, UNET).prints.value, 4 / 5)
-    assert_allclose(matrix.lost(UNET, DRIFT).prints.value, 1.0)
+    assert_allclose(matrix.loss(UNET, DRIFT).prints.value, 1.0)
 
 
 def test_the_page_is_drawn_of_all_and_of_a_few() -> None:
