@@ -328,6 +328,7 @@ def test_a_network_taught_by_pictures_serves_all_patterns(tmp_path: Path, monkey
         own = school(studio, monkeypatch)
         for patterns in ("uniform", "dots:3"):
             model, _ = own.network(Cell(PICTURES, patterns, "plug-and-play", 0))
+            assert model.manifest.noise == (0.0, math.inf)
         row, image = network_row(model, own.factors_for(case), case, "page")
         assert len(list((tmp_path / "networks").glob("*.pt"))) == 1
     assert image.shape == case.truth.shape
