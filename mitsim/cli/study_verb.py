@@ -72,10 +72,10 @@ def study(
     common: Common,
 ) -> int:
     """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
-    of a ColorChecker; what `drift` between calibration and capture costs; `models` of a calibration; `sweep` of any
-    knob; what `accuracy` costs in time, on a scene and, of none, in the `solver`; what `diffraction` at the mask does;
-    how good a `calibration` session is, and why; `twin`: real captures beside their simulation; `merge` joins the parts
-    of --shard.
+    of a ColorChecker; what `drift` between calibration and capture costs; what `learned` methods gain and lose (needs
+    torch, takes hours, not in all); `models` of a calibration; `sweep` of any knob; what `accuracy` costs in time, on a
+    scene and, of none, in the `solver`; what `diffraction` at the mask does; how good a `calibration` session is, and
+    why; `twin`: real captures beside their simulation; `merge` joins the parts of --shard.
     """
     from mitsim.studies import EXPOSED, OF_NO_SCENE
     from mitsim.studies.framework.experiment import is_experiment

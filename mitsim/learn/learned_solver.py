@@ -25,6 +25,7 @@ from mitsim.learn.diagonal import Binning, Data, Diagonal
 from mitsim.learn.methods import CLASSES, Denoiser, Method, PlugAndPlay
 from mitsim.learn.training_request import PLUG_AND_PLAY, ModelManifest
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solution import Solution, Status, Verdict
@@ -38,9 +39,6 @@ _SAME_CAMERA = 0.02
 of 512 frames; a scene an eighth of a pixel aside has as much."""
 _OTHER_NOISE = 1.5
 """Factor by which noise may lie outside of what was trained with: that of half an exposure is 1.4."""
-_UNEXPLAINED = 3.5e-3
-"""Part of the frames, rms, that an image may leave beyond noise within the model's range: the limit of misfit outside
-of it (:mod:`mitsim.reconstruct.misfit`)."""
 _NO_NOISE = 1e-14
 """Part of the frames' energy that counts as noise where there is none: rounding of single precision."""
 
@@ -147,8 +145,7 @@ class Learned(Solver):
         image = found.cpu().numpy().astype(np.float64)
         if not np.isfinite(image).all():
             raise MitsimError(f"model {self.name}: its image of these frames is not finite; train it anew")
-        missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
-        beyond = float(np.sqrt(max(missed - variance * prepared.rank, 0.0) / problem.energy))
+        missed, beyond = beyond_noise(prepared, problem, image)
         outside = max(problem.energy - float(np.square(problem.projected).sum()), 0.0)
         flags = [*(prepared.doubts if isinstance(prepared, _Doubted) else ())]
         relative, (low, high) = relative_noise(problem), self.manifest.noise
@@ -157,7 +154,7 @@ class Learned(Solver):
                 f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, and here it is "
                 f"{relative:.1e}."
             )
-        if beyond > _UNEXPLAINED:
+        if beyond > UNEXPLAINED:  # within the model's range as outside of it
             flags.append(f"The image does not give the frames: {beyond:.1e} of them, beyond noise, are others.")
         return Solution(
             image=image,
@@ -257,6 +254,22 @@ def on_device(network: Method, device: str) -> Method:
 def datum_variance(problem: DiagonalProblem) -> float:
     """Noise variance of a datum of a ``problem`` [(electrons / s)^2], at least rounding's."""
     return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
+
+
+def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray) -> tuple[float, float]:
+    """Energy of the frames within the model's range that an image does not give, and the part of all energy that it
+    leaves beyond noise, rms.
+
+    Parameters
+    ----------
+    prepared, problem
+        the model, and the data of the frames.
+    image
+        (n, n').
+    """
+    missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
+    beyond = max(missed - datum_variance(problem) * prepared.rank, 0.0)
+    return missed, float(np.sqrt(beyond / problem.energy))
 
 
 def relative_noise(problem: DiagonalProblem) -> float:

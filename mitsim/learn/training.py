@@ -391,7 +391,7 @@ class Trained:
 @single_threaded_blas()
 def train_network(
     store: PairStore, factors: Factors, request: Training, output: Path | str, job: Job | None = None,
-    resume: bool = False,
+    resume: bool = False, sums: Sums | None = None,
 ) -> Trained:  # fmt: skip
     """Train a network and write its file.
 
@@ -407,6 +407,8 @@ def train_network(
         its limits, and who is told how far it is.
     resume
         whether to go on where an interrupted training of the same request stopped.
+    sums
+        what the frames of these pairs add up to with these factors, where they were read before.
 
     Raises
     ------
@@ -421,7 +423,7 @@ def train_network(
         prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
         network = first_network(request, (factors.left.shape[1], factors.right.shape[1]))
         _memory(store, network, request).check(f"{store.folder}: training {request.method}", job.limits)
-        sums = Sums.of(store, prepared, job, network.reads_frames)
+        sums = sums or Sums.of(store, prepared, job, network.reads_frames)
     trainer = Trainer(request, prepared, sums, network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), _digest(asdict(request), factors.fingerprint, about))

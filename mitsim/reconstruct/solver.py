@@ -396,6 +396,23 @@ class Accumulator:
         self._energy = 0.0
         self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
 
+    @classmethod
+    def of_sums(cls, prepared: Prepared, quarters: FloatArray, energy: float) -> Accumulator:
+        """That of all frames, whose sums were kept.
+
+        Parameters
+        ----------
+        prepared
+            the model that they were added up for, bit for bit: its singular vectors have signs of their own.
+        quarters, energy
+            as the accumulator of the frames had them.
+        """
+        found = cls(prepared)
+        found._quarters += quarters
+        found._energy = energy
+        found._seen[:] = True
+        return found
+
     @property
     def sum(self) -> FloatArray:
         """W (r_left, r_right), or for the Gram method the paper's Q (n, n); a copy."""

@@ -29,8 +29,9 @@ PAPER = (
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""
-EXPERIMENTS = (*PAPER, "colour", "drift", "models", "sweep")
-"""Studies of many points: their modules have an ``EXPERIMENT``."""
+EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "models", "sweep")
+"""Studies of many points: their modules have an ``EXPERIMENT``. ``learned`` is not on the page of all: it takes hours,
+and torch, which may be missing."""
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient"), "light_studies"),

@@ -30,7 +30,16 @@ from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
 from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, find_experiment
-from mitsim.studies.framework.run import POINTS, Shard, Store, batches, check_study_folder, study_folder, write_figures
+from mitsim.studies.framework.run import (
+    KEPT,
+    POINTS,
+    Shard,
+    Store,
+    batches,
+    check_study_folder,
+    study_folder,
+    write_figures,
+)
 
 if TYPE_CHECKING:
     from mitsim.studies.framework.page import Section
@@ -53,11 +62,19 @@ class Where:
         if self.jobs is not None and self.jobs < 1:
             raise MitsimError(f"--jobs {self.jobs}: give 1 or more processes")
 
-    def measure(self, name: str, points: Sequence[Point]) -> Iterable[tuple[Point, Found]]:
-        """What the experiment ``name`` finds at ``points``, in any order."""
+    def measure(self, name: str, points: Sequence[Point], kept: bool = False) -> Iterable[tuple[Point, Found]]:
+        """What an experiment finds, in any order.
+
+        Parameters
+        ----------
+        name, points
+            of the experiment, and where it is measured.
+        kept
+            as :attr:`mitsim.studies.framework.experiment.Experiment.kept`.
+        """
         if self.scheduler is not None:
-            return on_cluster(name, batches(points), self.scheduler)
-        return in_processes(name, batches(points), self.jobs or workers(), self.shared)
+            return on_cluster(name, batches(points, kept), self.scheduler)
+        return in_processes(name, batches(points, kept), self.jobs or workers(), self.shared)
 
 
 @dataclass(frozen=True)
@@ -131,12 +148,16 @@ def run_experiment(
             together = replace(where or Where(), shared=shared)
             return _all(scope, output, lambda name, folder: run_experiment(name, scope, folder, job, together))
     campaign, job, where = _Campaign.of(study, scope, output), job or Job(), where or Where()
-    own, started = where.shard.part(campaign.points), time.perf_counter()
+    kept = campaign.experiment.kept
+    own, started = where.shard.part(campaign.points, kept), time.perf_counter()
     for setup in dict.fromkeys(point.setup for point in own):
         check_scene(setup.scene, dict(setup.parameters), setup.outside)  # before there is a folder
     with campaign.folder(output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
-        for done, (point, found) in enumerate(where.measure(study, todo) if todo else (), start=1):
+        if kept:
+            (folder / KEPT).mkdir(exist_ok=True)
+            where = replace(where, shared=str(folder / KEPT))
+        for done, (point, found) in enumerate(where.measure(study, todo, kept) if todo else (), start=1):
             store.save(point, found)
             left = (time.perf_counter() - started) / done * (len(todo) - done)
             job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))

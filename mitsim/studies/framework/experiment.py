@@ -266,6 +266,9 @@ class Experiment:
         whether light is traced, to an accuracy that the page states.
     note
         what the reader of its figures has to know beside their titles and axes.
+    kept
+        whether what points share is kept in the study's folder: plans, calibrations, and what else a studio makes once.
+        A process may then measure any point, whatever its setup, and an interrupted study loses none of it.
     """
 
     name: str
@@ -280,6 +283,7 @@ class Experiment:
     heads: tuple[str, str, str] = HEADS
     note: str = ""
     traced: bool = True
+    kept: bool = False
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:

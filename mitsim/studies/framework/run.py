@@ -233,8 +233,18 @@ class Store:
         return self.folder / f"{point.key}.npz"
 
 
-def batches(points: Sequence[Point]) -> list[tuple[Point, ...]]:
-    """The ``points`` in their order, those of one setup together: they share its light."""
+def batches(points: Sequence[Point], kept: bool = False) -> list[tuple[Point, ...]]:
+    """The ``points`` in their order, those of one setup together: they share its light.
+
+    Parameters
+    ----------
+    points
+        of an experiment.
+    kept
+        whether what they share is kept in files: then each is a batch.
+    """
+    if kept:
+        return [(point,) for point in points]
     return [tuple(group) for _, group in groupby(points, key=lambda point: point.setup)]
 
 
@@ -253,16 +263,17 @@ class Shard:
             raise MitsimError(f"--shard {text!r}: give I/N with I from 1 to N, such as 1/4")
         return cls(int(number), int(count))
 
-    def part(self, points: Sequence[Point]) -> list[Point]:
-        """The ``points`` of this part: every ``count``-th batch, as a batch's light is traced once."""
-        own = batches(points)[self.number - 1 :: self.count]
+    def part(self, points: Sequence[Point], kept: bool = False) -> list[Point]:
+        """The ``points`` of this part: every ``count``-th of their :func:`batches`, as a batch's light is traced once;
+        ``kept`` as there."""
+        own = batches(points, kept)[self.number - 1 :: self.count]
         return [point for batch in own for point in batch]
 
 
 # -------- The folder of a study
 
-POINTS = "points"
-"""Folder of what the points of a study came to."""
+POINTS, KEPT = "points", "kept"
+"""Folders of what the points of a study came to, and of what they share."""
 DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 """What `mitsim demo` writes."""
 _PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -274,7 +285,7 @@ _PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """What a study writes beside NAME.json, with wildcards."""
-_OF_POINTS = ("*.png", "*.csv", "*.html", POINTS)
+_OF_POINTS = ("*.png", "*.csv", "*.html", POINTS, KEPT)
 """The same of all others, which are of many points."""
 
 

@@ -147,6 +147,24 @@ class Studio:
         place.mkdir(parents=True)
         return place
 
+    def made_once(self, kind: str, name: str, make: Callable[[Path], object]) -> Path:
+        """A file or folder that studios share: whole or not at all.
+
+        Parameters
+        ----------
+        kind, name
+            folder that it is in, and what it is called there.
+        make
+            makes it at a path that does not exist.
+        """
+        return _made_once(self.shared_folder(kind) / name, make)
+
+    def shared_folder(self, kind: str) -> Path:
+        """Folder of what studios share of a ``kind``; this studio's own where there are no others."""
+        place = (self._shared or Path(self._folder.name) / "shared") / kind
+        place.mkdir(parents=True, exist_ok=True)
+        return place
+
     def bench(self, setup: Setup) -> Bench:
         """The bench of a ``setup``.
 
