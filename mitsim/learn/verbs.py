@@ -34,11 +34,9 @@ def make_pairs(
     output: Path | str,
     count: int,
     patterns: str = "dots:7",
-    idealised: bool = False,
-    pictures: Path | str | None = None,
     resume: bool = False,
     job: Job | None = None,
-    **request: Any,
+    **options: Any,
 ) -> PairStore:
     """Pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
 
@@ -52,16 +50,14 @@ def make_pairs(
         of pairs.
     patterns
         name of their family.
-    idealised
-        whether frames are of the paper's separable model; their exact factors are then beside them.
-    pictures
-        folder of pictures; None: they are drawn by code.
     resume
         whether to go on where interrupted work of the same request stopped.
     job
         its limits, and who is told how far it is.
-    **request
-        other fields of :class:`mitsim.bench.request.Request`, but for ``seconds`` and ``noise_fraction``.
+    **options
+        ``idealised``: whether frames are of the paper's separable model, whose exact factors are then beside them;
+        ``pictures``: a folder of them, drawn by code where none is given; and other fields of
+        :class:`mitsim.bench.request.Request`, but for ``seconds`` and ``noise_fraction``.
 
     Raises
     ------
@@ -69,8 +65,9 @@ def make_pairs(
         for a request that cannot be served, a scene without a print, pictures that cannot be read, an output that
         cannot be written or holds something else, and more memory, disk or time than is allowed.
     """
-    output, folder = Path(output), None if pictures is None else Path(pictures)
-    asked = PairsRequest(Request.of(patterns=patterns, **request), count, idealised, folder)
+    output, folder = Path(output), options.pop("pictures", None)
+    idealised, request = bool(options.pop("idealised", False)), Request.of(patterns=patterns, **options)
+    asked = PairsRequest(request, count, idealised, None if folder is None else Path(folder))
     asked.check()
     check_output(output, overwrite=resume and (output / PAIRS).is_file())
     task = Task.of(output, resume, job)

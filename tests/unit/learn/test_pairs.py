@@ -87,6 +87,8 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
         ms.make_pairs(bench, folder, 2, "dots:2")
     with pytest.raises(MitsimError, match="share their light"):
         ms.make_pairs(bench, lab.folder / "timed", 2, seconds=3.0)
+    with pytest.raises(MitsimError, match="nowhere: is no folder"):
+        ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
     assert not (lab.folder / "timed").exists()
 
 
