@@ -74,7 +74,8 @@ def make_pairs(
     with task.importing():
         from mitsim.learn import pairs
 
-    return pairs.make_pairs(lambda drawn: bench, asked, task)[0]
+    # Loaded anew, as its prints are changed.
+    return pairs.make_pairs(lambda drawn: bench.in_variant(bench.variant), asked, task)[0]
 
 
 @check_arguments

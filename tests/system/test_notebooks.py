@@ -15,6 +15,8 @@ LARGEST = 400_000
 """Bytes of a notebook with its outputs."""
 FIT = {("stream", "stdout"), ("display_data", ""), ("execute_result", "")}
 """Outputs that may come: neither warnings on stderr nor errors."""
+NETWORK = "teach_a_network"
+"""The one that needs torch."""
 every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
@@ -46,8 +48,9 @@ def words(cell: dict[str, Any]) -> str:
     return re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", "\n".join("".join(text) for text in texts))
 
 
-def test_there_are_three() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["first_capture", "my_own_camera", "sweep_a_material"]
+def test_there_are_four() -> None:
+    names = ["first_capture", "my_own_camera", "sweep_a_material", NETWORK]
+    assert [path.stem for path in NOTEBOOKS] == names
 
 
 @every
@@ -77,6 +80,8 @@ def test_what_is_stored_is_fit_for_anybody(path: Path) -> None:
 )
 def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From top to bottom in an empty folder, by this Python, without the user's settings; the same kinds come out."""
+    if path.stem == NETWORK:
+        pytest.importorskip("torch", reason="torch is an extra: pip install 'mitsim[learn]'")
     import nbformat
     from jupyter_client.kernelspec import KernelSpecManager
     from jupyter_client.manager import AsyncKernelManager

@@ -77,12 +77,14 @@ class Lab:
 
 
 def test_programs_make_the_same_pairs(lab: Lab) -> None:
-    """As the command line's; refused before any work where one cannot. (Planted: another seed.)"""
+    """As the command line's, and the bench still shows what it showed; refused before any work where one cannot.
+    (Planted: another seed; the bench itself, whose print was then white.)"""
     bench, folder = lab.bench(), lab.folder / "own"
     own = ms.make_pairs(bench, folder, 2, "dots:2", accuracy=2e-3, seed=3)
     other = lab.pairs()
     for index in range(2):
         assert_array_equal(own.frames(index), other.frames(index))
+    assert float(np.max(bench.capture("dots:1", accuracy=1e-2).truth)) < 0.6
     with pytest.raises(MitsimError, match="own"):
         ms.make_pairs(bench, folder, 2, "dots:2")
     with pytest.raises(MitsimError, match="share their light"):
