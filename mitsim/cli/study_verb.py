@@ -75,7 +75,8 @@ def study(
     of a ColorChecker; what `drift` between calibration and capture costs; what `learned` methods gain and lose (needs
     torch, takes hours, not in all); `models` of a calibration; `sweep` of any knob; what `accuracy` costs in time, on a
     scene and, of none, in the `solver`; what `diffraction` at the mask does; how good a `calibration` session is, and
-    why; `twin`: real captures beside their simulation; `transfer`: networks of that simulation on them; `merge` joins the parts of --shard.
+    why; `twin`: real captures beside their simulation; `transfer`: networks of that simulation on them (needs torch);
+    `merge` joins the parts of --shard.
     """
     from mitsim.studies import EXPOSED, OF_CAPTURES, OF_NO_SCENE
     from mitsim.studies.framework.experiment import is_experiment

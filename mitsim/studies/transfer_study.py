@@ -80,8 +80,8 @@ class Camera:
     def of(cls, measured: Measured, learned: Learned) -> Camera:
         """Of a ``measured`` plane, and codes that were ``learned``."""
         sides = learned.codes.factors(measured.offset, measured.plane)
-        uniform = [np.ones((side.shape[1], 1)) for side in sides]
-        return cls(learned.see(measured), sides, prepare(*sides, *uniform, centre=True))
+        rows, columns = (np.ones((side.shape[1], 1)) for side in sides)
+        return cls(learned.see(measured), sides, prepare(*sides, rows, columns, centre=True))
 
     def twin_frame(self) -> FloatArray:
         """(m, m') frame of the twin, of the authors' image, with noise as the real one's [DN]."""
@@ -92,8 +92,8 @@ class Camera:
 def noise_range(planes: Sequence[Measured], learned: Learned) -> tuple[float, float]:
     """Least and largest standard deviation of white noise that pairs have [DN of the taught plane].
 
-    From the noise of the known ``planes`` alone to all that the codes leave of them, noise or not, each over its plane's
-    gain; and a factor :data:`_MARGIN` beyond either.
+    From the noise of the known ``planes`` alone to all that the codes leave of them, noise or not, each over its
+    plane's gain; and a factor :data:`_MARGIN` beyond either.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def measure(
     planes = read_captures(files.captures, request.seed)
     pictures, n = DrawnPictures(request.seed), len(planes[0].scene)
     truths = np.stack([pictures.draw(number, n) / np.float32(WHITE) for number in range(budget.pairs)])
-    held_out = []
+    held_out: list[HeldOut] = []
     for name in files.captures:
         job.progress("codes", len(held_out) / len(files.captures))
         known = [each for each in planes if each.capture != name]

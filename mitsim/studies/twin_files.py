@@ -1,5 +1,5 @@
-"""What `mitsim study twin` and `transfer` compare with: a folder of real captures in, their files out; or a line that says where to
-get them.
+"""What `mitsim study twin` and `transfer` compare with: a folder of real captures in, their files out; or a line that
+says where to get them.
 
 The folder has one of two others, or both, named and filled as the public repositories have them:
 
