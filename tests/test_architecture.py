@@ -390,6 +390,7 @@ WITHOUT_NUMPY = (
     "study accuracy photograph -o full",
     "study calibration photograph -o s --camera endless.toml",
     "study solver -o full",
+    "study transfer -o s",
     "study twin -o s",
     "study twin --data none -o s",
     "study merge bad -o s",

@@ -53,7 +53,7 @@ class Studied:
     patterns: Patterns = _MAIN_PATTERNS
     seed: Seed = 0
     recipe: Path | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
-    data: Path | None = option(None, "of twin: folder of real captures", metavar="DIR")
+    data: Path | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
 
 
@@ -75,9 +75,10 @@ def study(
     of a ColorChecker; what `drift` between calibration and capture costs; what `learned` methods gain and lose (needs
     torch, takes hours, not in all); `models` of a calibration; `sweep` of any knob; what `accuracy` costs in time, on a
     scene and, of none, in the `solver`; what `diffraction` at the mask does; how good a `calibration` session is, and
-    why; `twin`: real captures beside their simulation; `merge` joins the parts of --shard.
+    why; `twin`: real captures beside their simulation; `transfer`: networks of that simulation on them (needs torch);
+    `merge` joins the parts of --shard.
     """
-    from mitsim.studies import EXPOSED, OF_NO_SCENE
+    from mitsim.studies import EXPOSED, OF_CAPTURES, OF_NO_SCENE
     from mitsim.studies.framework.experiment import is_experiment
     from mitsim.studies.framework.run import check_study_folder, find_study
 
@@ -86,8 +87,8 @@ def study(
         refuse_unused(context, others, "on parts, which say themselves what they are of")
     else:
         refuse_unused(context, ["experiment"], "but with merge; give the module as the study's NAME")
-    if name != "twin":
-        refuse_unused(context, ["data"], "but on the study twin")
+    if name not in OF_CAPTURES:
+        refuse_unused(context, ["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
     session, request = recipe_for(name, studied.recipe), mitsim.Request.of(patterns=studied.patterns, seed=studied.seed)
     warnings: Sequence[str] = ()
     with common.job() as job:
@@ -111,10 +112,11 @@ def study(
             result = run_experiment(name, scope, studied.output, job, where)
         else:
             settings: dict[str, Any] = {"recipe": session} if session else {}
-            if name == "twin":
+            if name in OF_CAPTURES:
                 from mitsim.studies.twin_files import TwinFiles
 
-                settings = {"files": TwinFiles.find(studied.data), "variant": common.variant}
+                settings = {"files": TwinFiles.find(studied.data, name)}
+                settings |= {"variant": common.variant} if name == "twin" else {}
             run_study = find_study(name, **settings)
             if not points.are_main:
                 raise MitsimError(

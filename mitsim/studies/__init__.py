@@ -5,11 +5,13 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("accuracy", "calibration", "diffraction", "solver", "twin")
+STUDIES = ("accuracy", "calibration", "diffraction", "solver", "transfer", "twin")
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.run.Findings`."""
-OF_NO_SCENE = ("solver", "twin")
+OF_NO_SCENE = ("solver", "transfer", "twin")
 """Those whose bench is None."""
+OF_CAPTURES = ("transfer", "twin")
+"""Those of real captures (`--data`)."""
 EXPOSED = ("calibration", "diffraction")
 """Those whose frames fill a part of the camera's full well."""
 PAPER = (

@@ -1,5 +1,5 @@
-"""What `mitsim study twin` compares with: a folder of real captures in, their files out; or a line that says where to
-get them.
+"""What `mitsim study twin` and `transfer` compare with: a folder of real captures in, their files out; or a line that
+says where to get them.
 
 The folder has one of two others, or both, named and filled as the public repositories have them:
 
@@ -42,10 +42,10 @@ class TwinFiles:
     psf: Path | None
 
     @classmethod
-    def find(cls, folder: Path | None) -> TwinFiles:
-        """Those in a ``folder``; MitsimError where there are none, or too few."""
+    def find(cls, folder: Path | None, study: str = "twin") -> TwinFiles:
+        """Those in a ``folder``, for a ``study``; MitsimError where there are none, or too few."""
         if folder is None:
-            raise MitsimError(f"study twin: needs real captures; give --data FOLDER with {SOURCES}")
+            raise MitsimError(f"study {study}: needs real captures; give --data FOLDER with {SOURCES}")
         if not folder.is_dir():
             raise MitsimError(f"--data {folder}: there is no such folder; give one with {SOURCES}")
         frames = sorted((folder / FLATCAM).glob("fc_*.png"))
