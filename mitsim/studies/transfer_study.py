@@ -341,8 +341,8 @@ def _see(
             if frame is real:
                 found[method, plane] = seen
 
-    def coloured(method: str) -> FloatArray:
+    def in_colour(method: str) -> FloatArray:
         colours = [TURNS[back](np.mean([found[method, plane] for plane in each], axis=0)) for each in _COLOURS]
         return np.stack(colours, axis=-1)
 
-    return rows, {method: coloured(method) for method in (AUTHORS, *METHODS)}
+    return rows, {method: in_colour(method) for method in (AUTHORS, *METHODS)}

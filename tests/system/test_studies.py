@@ -46,7 +46,11 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("weather", (), "there is no such study; use accuracy, calibration, diffraction, solver, twin, patterns"),
+        (
+            "weather",
+            (),
+            "there is no such study; use accuracy, calibration, diffraction, solver, transfer, twin, patterns",
+        ),
         ("no_such.module", (), "cannot be used"),
         ("patterns", ("--shard", "3/2"), "--shard '3/2': give I/N"),
         ("patterns", ("--jobs", 0), "--jobs 0: give 1 or more"),
