@@ -1,1 +1,1 @@
-"""What networks learn from: pictures, and pairs of frames and truths that a camera would take of them."""
+"""What networks learn from: pictures, and pairs of frames and truths; their training; trained networks as solvers."""

@@ -56,7 +56,7 @@ class _Doubted(Prepared):
 
 
 @dataclass(frozen=True, eq=False)
-class Learned(Solver):
+class LearnedSolver(Solver):
     """A trained network as a method of solving; :func:`read_network` reads one.
 
     Attributes
@@ -195,7 +195,7 @@ _PATTERNS = ("P_L", "P_R")
 """Tensors of the patterns' factors."""
 
 
-def read_network(path: Path | str, device: str) -> Learned:
+def read_network(path: Path | str, device: str) -> LearnedSolver:
     """The network in a file of `mitsim train`.
 
     Parameters
@@ -229,7 +229,7 @@ def read_network(path: Path | str, device: str) -> Learned:
         ) from error
     if not finite:
         raise MitsimError(f"model {path}: has weights that are not finite; train it anew")
-    return Learned(manifest, on_device(network, device).eval(), (left, right), (patterns[0], patterns[1]))
+    return LearnedSolver(manifest, on_device(network, device).eval(), (left, right), (patterns[0], patterns[1]))
 
 
 def write_tensors(path: Path | str, held: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from torch.nn import functional
 LEVELS = (1, 2, 4, 6)
 """Channels of each level, over those of the first; a level has half the pixels a side of that before it. Chosen: all
 but the last take the same arithmetic, and a pixel of the image sees 50 others on either side. Squares of 2 x 2 pixels
-as channels of the first level learned as fast by processor time, and ended 0.07 dB lower; of 4 x 4, far slower."""
+as channels of the first level learn as fast by processor time; of 4 x 4, far slower."""
 WAYS = 8
 """To turn and mirror a square."""
 
@@ -51,8 +51,8 @@ class UNet(nn.Module):
     def forward(self, images: Tensor, way: int = 0) -> Tensor:
         """What is to be added to the images.
 
-        Half precision (bfloat16) is used in training where the processor computes with it: twice as fast, and the
-        image is no worse. Otherwise single precision.
+        Half precision (bfloat16) is used in training where the processor computes with it, twice as fast; otherwise
+        single precision.
 
         Parameters
         ----------

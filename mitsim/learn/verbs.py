@@ -17,7 +17,7 @@ from mitsim.learn.training_request import Training
 
 if TYPE_CHECKING:
     from mitsim.api.bench import Bench
-    from mitsim.learn.learned_solver import Learned
+    from mitsim.learn.learned_solver import LearnedSolver
     from mitsim.learn.pair_store import PairStore
     from mitsim.learn.training import Trained
 
@@ -79,7 +79,7 @@ def make_pairs(
 
 
 @check_arguments
-def load_network(path: Path | str, device: str = "cpu") -> Learned:
+def load_network(path: Path | str, device: str = "cpu") -> LearnedSolver:
     """A trained network, to give as ``method`` of :func:`mitsim.reconstruct`.
 
     Parameters

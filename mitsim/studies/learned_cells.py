@@ -39,7 +39,7 @@ from mitsim.studies.framework.studio import Studio
 from mitsim.studies.learned_bench import DEPTH_MM, DIM_FRACTION, DRIFT_UM, Case, factors_of, place_setup
 
 if TYPE_CHECKING:
-    from mitsim.learn.learned_solver import Learned
+    from mitsim.learn.learned_solver import LearnedSolver
     from mitsim.learn.pair_store import PairStore
     from mitsim.learn.training import Sums
 
@@ -123,7 +123,7 @@ class School:
     seed: int
     budget: Budget
 
-    def network(self, cell: Cell) -> tuple[Learned, float | None]:
+    def network(self, cell: Cell) -> tuple[LearnedSolver, float | None]:
         """The trained network of a ``cell``, and processor seconds of its training; None where it was trained before,
         or in parts.
 
@@ -248,7 +248,7 @@ def _is_complete(folder: Path) -> bool:
     return (folder / PAIRS).is_file() and read_pairs_manifest(folder).status == "complete"
 
 
-def _for_any_camera(model: Learned, factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> Learned:
+def _for_any_camera(model: LearnedSolver, factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> LearnedSolver:
     """A network that no frame taught, for other ``factors`` and ``patterns``, at any noise."""
     manifest = model.manifest.model_copy(update={"camera": factors.manifest.camera, "noise": (0.0, math.inf)})
     return replace(model, manifest=manifest, sides=factors.sides, patterns=patterns)

@@ -286,7 +286,7 @@ def _catastrophe(matrix: Matrix) -> list[Claim]:
         f"{kind}, {in_text(kind.patterns)}, {name}; "
         f"worst loss of its own {own[0]} dB: {own[1]}, {in_text(own[1].patterns)}, {own[2]}"
     )
-    claim = f"Any mismatch is catastrophic (loses {_CATASTROPHE_DB:g} dB against the best classical image)"
+    claim = f"The worst mismatch is catastrophic (loses {_CATASTROPHE_DB:g} dB against the best classical image)"
     return [Claim(claim, "catastrophic results in case of any mismatch", "", text,
                   verdict(gain.within(high=-_CATASTROPHE_DB)))]  # fmt: skip
 

@@ -26,13 +26,14 @@ from mitsim.studies.framework.experiment import PRINT_MM
 from mitsim.studies.learned_bench import SHEET_MM, SIDE, Case
 
 if TYPE_CHECKING:
-    from mitsim.learn.learned_solver import Learned
+    from mitsim.learn.learned_solver import LearnedSolver
 
 AUTOMATIC, BEST = WEIGHTS = ("automatic", "best")
 """Weight of a classical method: chosen by the frames, or that of the highest PSNR, which takes the truth to choose."""
 CLASSICAL = (TIKHONOV, MARKOV, TV, NONNEGATIVE)
-_AROUND = tuple(float(weight) for weight in np.logspace(-1.5, 1.5, 7))
-"""Weights about the automatic one of what is solved by iterations: half a decade apart, 0.3 dB at the best of them."""
+_AROUND = tuple(float(weight) for weight in np.logspace(-0.75, 2.0, 12))
+"""Weights of what is solved by iterations, over the automatic one: a quarter of a decade apart, and up to where the
+best lies under a mismatch."""
 _DETAIL_PIXELS = 1.5
 """Deviation of the blur that an image is less than its detail: what is left is above an eighth of a cycle a pixel."""
 _MARGIN = 4
@@ -85,22 +86,15 @@ def contrast(image: FloatArray, cycles: float) -> float:
     return float(np.mean([modulation(half, axis, cycles) for half, axis in halves]))
 
 
-def classical_rows(case: Case, picture: str, methods: tuple[str, ...]) -> Iterator[tuple[dict[str, Value], FloatArray]]:
-    """Scores and images of classical ``methods`` at their automatic and best weight.
-
-    Parameters
-    ----------
-    case, picture
-        what is imaged, and its print.
-    methods
-        some of :data:`CLASSICAL`.
-    """
+def classical_rows(case: Case, picture: str) -> Iterator[tuple[dict[str, Value], FloatArray]]:
+    """Scores and images of all classical methods at their automatic and best weight; ``case`` and ``picture`` are what
+    is imaged, and its print."""
     from mitsim.learn.learned_solver import beyond_noise
 
     prepared = case.prepare()
     sums = case.sums(prepared)
     problem = prepared.problem(sums)
-    for method in methods:
+    for method in CLASSICAL:
         started = time.process_time()
         solve = _solver(method, prepared, sums)
         lam, image = solve(None)
@@ -110,14 +104,8 @@ def classical_rows(case: Case, picture: str, methods: tuple[str, ...]) -> Iterat
         best = max(images, key=lambda each: psnr(each, case.truth))
         for weight, each in zip(WEIGHTS, (image, best), strict=True):
             _, beyond = beyond_noise(prepared, problem, each)
-            row: dict[str, Value] = {
-                "training": "none",
-                "method": method,
-                "weight": weight,
-                "beyond": beyond,
-                "seconds": seconds,
-            }
-            row["unexplained"] = case.unexplained
+            row: dict[str, Value] = {"training": "none", "method": method, "weight": weight}
+            row |= {"beyond": beyond, "seconds": seconds, "unexplained": case.unexplained}
             yield {**row, **scores(each, case, picture)}, each
 
 
@@ -152,7 +140,9 @@ def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, 
     return other, Accumulator.of_sums(other, turns[0].T @ sums.quarters @ turns[1], sums.energy)
 
 
-def network_row(model: Learned, factors: Factors, case: Case, picture: str) -> tuple[dict[str, Value], FloatArray]:
+def network_row(
+    model: LearnedSolver, factors: Factors, case: Case, picture: str
+) -> tuple[dict[str, Value], FloatArray]:
     """Scores and image of a network, and what it is flagged for: frames that the image does not give, frames that no
     image gives, another camera or calibration, noise that the network does not know.
 

@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.learn.training_request import PREPROCESSED
 from mitsim.learn.verbs import check_torch
-from mitsim.report import IDEALISED, RENDERED
+from mitsim.report import RENDERED
 from mitsim.report.pages import Value
 from mitsim.studies.framework.claims import single_precision
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Experiment, Found, Point, Scope
@@ -27,7 +27,7 @@ from mitsim.studies.learned_bench import DEPTH, PLACES, Shown
 from mitsim.studies.learned_cells import FULL, PICTURES, QUICK, Budget, Cell, School, cells
 from mitsim.studies.learned_claims import find_claims
 from mitsim.studies.learned_page import TRUTH, figures, tables
-from mitsim.studies.learned_scores import CLASSICAL, classical_rows, network_row
+from mitsim.studies.learned_scores import classical_rows, network_row
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
 BARS = ("bars 0.12", "bars 0.16", "bars 0.24")
@@ -35,10 +35,6 @@ BARS = ("bars 0.12", "bars 0.16", "bars 0.24")
 contrast that they have."""
 TRAININGS = 3
 """Trainings of a cell, from other first weights and orders of the pairs: their spread has a standard error."""
-_ITERATED = (IDEALISED, RENDERED)
-"""Conditions that all classical methods are tried on; on others the two of closed form, which are as good there and
-take milliseconds."""
-_CLOSED = CLASSICAL[:2]
 
 
 def _points(scope: Scope) -> Sequence[Point]:
@@ -86,7 +82,7 @@ def _classical(studio: Studio, point: Point, values: dict[str, Any]) -> Found:
     arrays = {}
     for (condition, family), case in shown.cases(studio).items():
         named = {"picture": picture, "condition": condition, "patterns": family, "seed": values["seed"]}
-        for row, image in classical_rows(case, picture, CLASSICAL if condition in _ITERATED else _CLOSED):
+        for row, image in classical_rows(case, picture):
             rows.append({**named, **row})
             if picture in QUICK_IMAGES:
                 arrays[f"{condition} {family} {row['method']} {row['weight']}"] = image

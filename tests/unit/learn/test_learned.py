@@ -22,10 +22,10 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.exchange import tensors
-from mitsim.learn import training, verbs
+from mitsim.learn import networks, training, verbs
 from mitsim.learn.critic import Critic
 from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
-from mitsim.learn.learned_solver import Learned, datum_variance, read_network
+from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import CLASSES
 from mitsim.learn.networks import LEVELS, WAYS, UNet
 from mitsim.learn.training import PairDataset, train_network
@@ -50,13 +50,13 @@ def _one_thread() -> Any:
     torch.set_num_threads(threads)
 
 
-def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **more: Any) -> Learned:
+def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **more: Any) -> LearnedSolver:
     request = Training(method, steps=more.pop("steps", STEPS), seed=3)
     return train_network(FakeStore(patterns=patterns), bench().calibrated(1), request, path, **more).model
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Learned:
+def model(tmp_path_factory: pytest.TempPathFactory) -> LearnedSolver:
     return trained(tmp_path_factory.mktemp("model") / "m.pt")
 
 
@@ -92,7 +92,30 @@ def test_a_network_looks_at_images_in_eight_ways() -> None:
             assert_allclose(network(square, way), network(square), atol=1e-5)
 
 
-def test_an_image_is_the_mean_over_all_ways(model: Learned) -> None:
+def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And of the step that a training's time is told from. (Planted: of images too; a step of images' precision.)"""
+    network, images = UNet(1, 1, 4), torch.randn((1, 1, 16, 16), generator=torch.Generator().manual_seed(1))
+    torch.nn.init.ones_(network.last.weight)
+    monkeypatch.setattr(networks, "has_half", lambda device: False)
+    single = network(images).detach()
+    monkeypatch.setattr(networks, "has_half", lambda device: True)
+    assert torch.equal(network.eval()(images), single)
+    rounded = network.train()(images).detach()
+    assert 1e-4 < float((rounded - single).abs().max() / single.abs().max()) < 0.1
+
+    store, factors = FakeStore(8), bench().calibrated(1)
+    prepared, request = SOLVERS["tikhonov"].init(factors, store.patterns), Training("refined", batch=4)
+    trainer = training.Trainer(
+        request, prepared, training.Sums.of(store, prepared, Job()), training.first_network(request, (16, 16))
+    )
+    trainer.judge()
+    precisions = list[bool]()
+    trainer.network.network.register_forward_hook(lambda module, *_: precisions.append(module.training))
+    trainer.seconds_a_step()
+    assert precisions == [True, True]
+
+
+def test_an_image_is_the_mean_over_all_ways(model: LearnedSolver) -> None:
     """And single precision makes it, whatever made the network. (Planted: seven of eight.)"""
     network = model.network
     data, diagonal = _problem(model)
@@ -103,7 +126,7 @@ def test_an_image_is_the_mean_over_all_ways(model: Learned) -> None:
     assert not network.training
 
 
-def _problem(model: Learned) -> tuple[Data, Diagonal]:
+def _problem(model: LearnedSolver) -> tuple[Data, Diagonal]:
     """Data of a picture, and its camera's model."""
     camera = bench()
     prepared = model.init(camera.calibrated(1), camera.run("uniform", picture(1), 1).patterns)
@@ -193,7 +216,7 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
             values.copy_(0.02 * torch.randn(values.shape, generator=random))
         start, expected = network.start(data, own) + 0.5, network(data, own)
     assert float((expected - start).abs().max()) > 1e-3
-    model = Learned(cast(Any, None), network, factors.sides, shots.patterns)
+    model = LearnedSolver(cast(Any, None), network, factors.sides, shots.patterns)
     names = dict(physics=physics, y=y, model=model, start=start, variance=variance, deepinv=deepinv)
     (lines,) = re.findall(r"^```text\n(# The loop of deepinv.*?)^```", LEARNED.read_text("utf-8"), flags=re.M | re.S)
     with torch.no_grad():
@@ -346,12 +369,12 @@ class HotStore(FakeStore):
 # -------- Images by a network
 
 
-def image_of(model: Learned, patterns: str = "uniform", seed: int = 5, **changes: Any) -> Reconstruction:
+def image_of(model: LearnedSolver, patterns: str = "uniform", seed: int = 5, **changes: Any) -> Reconstruction:
     camera = bench(**changes)
     return reconstruct(camera.run(patterns, picture(seed), seed), camera.calibrated(1), method=model)
 
 
-def test_an_image_says_by_what_it_was_found(model: Learned, tmp_path: Path) -> None:
+def test_an_image_says_by_what_it_was_found(model: LearnedSolver, tmp_path: Path) -> None:
     """Better than least squares at the best lambda, of a picture that never taught; without an uncertainty."""
     camera = bench()
     shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
@@ -369,14 +392,14 @@ def test_an_image_says_by_what_it_was_found(model: Learned, tmp_path: Path) -> N
         reconstruct(shots, factors, 1.0, method=model)
 
 
-def test_a_file_gives_the_same_image(model: Learned, tmp_path: Path) -> None:
+def test_a_file_gives_the_same_image(model: LearnedSolver, tmp_path: Path) -> None:
     model.save(tmp_path / "m.pt")
     again = verbs.load_network(tmp_path / "m.pt")
     assert again.name == model.name and again.manifest == model.manifest
     assert_array_equal(image_of(again).image, image_of(model).image)
 
 
-def test_a_device_that_there_is_not_is_refused(model: Learned, tmp_path: Path) -> None:
+def test_a_device_that_there_is_not_is_refused(model: LearnedSolver, tmp_path: Path) -> None:
     """(Planted: the network moved without a look.)"""
     model.save(tmp_path / "m.pt")
     for device in ("abacus", "meta", ""):
@@ -385,7 +408,7 @@ def test_a_device_that_there_is_not_is_refused(model: Learned, tmp_path: Path) -
         assert "\n" not in str(refused.value)
 
 
-def test_a_full_disk_is_told_in_a_line(model: Learned, tmp_path: Path) -> None:
+def test_a_full_disk_is_told_in_a_line(model: LearnedSolver, tmp_path: Path) -> None:
     """A file may have a megabyte, and the network has four. (Planted: torch writes the file itself.)"""
     resource = pytest.importorskip("resource")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -398,7 +421,7 @@ def test_a_full_disk_is_told_in_a_line(model: Learned, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_what_a_network_does_not_know_is_refused(model: Learned) -> None:
+def test_what_a_network_does_not_know_is_refused(model: LearnedSolver) -> None:
     camera = bench()
     with pytest.raises(MitsimError, match="trained under the patterns uniform, and these are others"):
         reconstruct(camera.run("dots:2", picture(5), 5), camera.calibrated(1), method=model)
@@ -407,7 +430,7 @@ def test_what_a_network_does_not_know_is_refused(model: Learned) -> None:
         reconstruct(small.run("uniform", picture(5, 8), 5), small.calibrated(1), method=model)
 
 
-def test_another_bench_is_flagged(model: Learned) -> None:
+def test_another_bench_is_flagged(model: LearnedSolver) -> None:
     """(Planted: each of the four doubts left out.)"""
     camera = bench()
     shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
@@ -423,7 +446,7 @@ def test_another_bench_is_flagged(model: Learned) -> None:
     assert "The image does not give the frames" in str(image_of(blind).status)
 
 
-def read_of_nothing(model: Learned) -> Learned:
+def read_of_nothing(model: LearnedSolver) -> LearnedSolver:
     """A network whose frames count for nothing at the end."""
     network = CLASSES["unrolled"]((16, 16))
     network.load_state_dict(model.network.state_dict())
@@ -433,7 +456,7 @@ def read_of_nothing(model: Learned) -> Learned:
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "pickle", "tensors", "nan", "method", "newer", "folder", "none"])
-def test_a_file_that_is_none_is_refused(damage: str, model: Learned, tmp_path: Path) -> None:
+def test_a_file_that_is_none_is_refused(damage: str, model: LearnedSolver, tmp_path: Path) -> None:
     path = tmp_path / "m.pt"
     model.save(path)
     held = torch.load(path, weights_only=True)
