@@ -23,7 +23,7 @@ from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
 from mitsim.learn.diagonal import Binning, Data, Diagonal
 from mitsim.learn.methods import CLASSES, Denoiser, Method, PlugAndPlay
-from mitsim.learn.training_request import PLUG_AND_PLAY, ModelManifest
+from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED, ModelManifest
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
@@ -87,7 +87,7 @@ class LearnedSolver(Solver):
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised, with doubts where it is not what the network knows.
 
-        MitsimError for images of another size and other patterns.
+        MitsimError for images of another size, other patterns, and another camera where the weights stand for one.
         """
         shape = camera.left.shape[1], camera.right.shape[1]
         if shape != self.network.shape:
@@ -100,18 +100,28 @@ class LearnedSolver(Solver):
                 f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
                 "others; capture those, or train one for these"
             )
+        other = self._other_camera(camera)
+        if other and self.network.holds_camera:
+            raise MitsimError(
+                f"model {self.name}: was trained for another camera ({other}), and its weights stand for that one; "
+                f"train one for calibration {camera.name}, or {UNROLLED} or {REFINED}, which serve others, flagged"
+            )
         return _Doubted(
             **vars(SOLVERS[TIKHONOV].init(camera, patterns)),
-            doubts=self._doubts(camera),
+            doubts=self._doubts(camera, other),
             reads_frames=self.network.reads_frames,
         )
 
-    def _doubts(self, camera: Factors) -> tuple[str, ...]:
-        """Sentences on what a ``camera`` differs in from that of the pairs."""
+    def _other_camera(self, camera: Factors) -> str:
+        """By which names a ``camera`` is another than that of the pairs; empty where it is the same."""
         ours, theirs = self.manifest.camera, camera.manifest.camera
         others = [name for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]
-        if others:
-            return (f"The network was trained for another camera: {', '.join(map(cut, others))} differ.",)
+        return f"{', '.join(map(cut, others))} differ" if others else ""
+
+    def _doubts(self, camera: Factors, other: str) -> tuple[str, ...]:
+        """Sentences on what a ``camera`` differs in from that of the pairs, the names of an ``other`` one first."""
+        if other:
+            return (f"The network was trained for another camera: {other}.",)
         difference = _difference(self.sides, camera.sides)
         if difference > _SAME_CAMERA:
             return (f"The network was trained with a calibration that differs by {difference:.1%}.",)

@@ -37,8 +37,9 @@ class Method(nn.Module):
     PASSES, WIDTH = 1, 24
     """Times that an image goes through a network in training, and channels of its first level: 0.97 million weights,
     three times those that gained 0.2 dB over least squares at its best weight."""
-    reads_frames = False
-    """Whether it reads frames, and not only what they add up to."""
+    reads_frames, holds_camera = False, False
+    """Whether it reads frames, and not only what they add up to; and whether its weights stand for one camera, not only
+    for pictures."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__()
@@ -122,6 +123,8 @@ class FlatNet(Refined):
     shape
         (n, n') of the images.
     """
+
+    holds_camera = True
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__(shape)
@@ -262,7 +265,7 @@ class Preprocessed(Refined):
         (n, n') of the images.
     """
 
-    reads_frames = True
+    reads_frames, holds_camera = True, True
     FRAME_WIDTH, FRAME_STACKED = 16, 4
     """On squares of 4 x 4 bins, as there are many frames; chosen so."""
 

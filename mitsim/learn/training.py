@@ -339,7 +339,8 @@ class Unfinished:
             raise MitsimError(f"{self.path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
         if own != self.digest:
             raise MitsimError(
-                f"{self.path}: is of a training of other pairs, factors or options; give those, or remove it"
+                f"{self.path}: is of a training of other pairs, factors or options, or of numbers of other precision "
+                "on another processor; give those, or remove it"
             )
         return state
 
@@ -427,7 +428,9 @@ def train_network(
         sums = sums or Sums.of(store, prepared, job, network.reads_frames)
     trainer = Trainer(request, prepared, sums, network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
-    unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), _digest(asdict(request), factors.fingerprint, about))
+    half = has_half(trainer.model.sigma.device)
+    digest = _digest(asdict(request), factors.fingerprint, about, half)
+    unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), digest)
     state = unfinished.read() if resume and unfinished.path.is_file() else State.first(trainer)
     state.restore(trainer)
     with job.clock.stage("train"):
@@ -438,7 +441,7 @@ def train_network(
             state.go_on(trainer, job)
             unfinished.write(state)
     network.load_state_dict(state.best)
-    how = {**asdict(request), "half_precision": has_half(trainer.model.sigma.device), "curve": state.curve}
+    how = {**asdict(request), "half_precision": half, "curve": state.curve}
     manifest = ModelManifest(
         method=request.method, camera=factors.manifest.camera, factors=factors.fingerprint,
         patterns=store.manifest.patterns, exposure_s=store.manifest.exposure_s, noise=sums.noise, pairs=about,

@@ -27,7 +27,7 @@ from mitsim.learn.critic import Critic
 from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import CLASSES
-from mitsim.learn.networks import LEVELS, WAYS, UNet
+from mitsim.learn.networks import LEVELS, WAYS, UNet, has_half
 from mitsim.learn.training import PairDataset, train_network
 from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
@@ -240,9 +240,12 @@ def test_every_method_learns(method: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["unrolled", "plug-and-play", "preprocessed", "flatnet"])
-def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) -> None:
+def test_an_interrupted_training_goes_on_bit_equal(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And one that was not interrupted twice the same; FlatNet with its adversary. (Planted: weights without what the
-    optimiser knows; without the adversary; progress by the steps squared.)"""
+    optimiser knows; without the adversary; progress by the steps squared;
+    any precision taken for the same.)"""
     store, factors = FakeStore(12), bench().calibrated(1)
     other = 0.1 if method == "flatnet" else 0.0
     request = Training(method, steps=6, batch=4, seed=1, feature_weight=other, adversary_weight=other)
@@ -268,6 +271,9 @@ def test_an_interrupted_training_goes_on_bit_equal(method: str, tmp_path: Path) 
     assert not (tmp_path / "c.pt").exists() and parts == [step / 6 for step in (1, 2, 3, 4)]
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
         train_network(store, factors, replace(request, seed=2), tmp_path / "c.pt", resume=True)
+    with monkeypatch.context() as patch, pytest.raises(MitsimError, match="numbers of other precision"):
+        patch.setattr(training, "has_half", lambda device: not has_half(device))
+        train_network(store, factors, request, tmp_path / "c.pt", resume=True)
     unfinished = tmp_path / "d.pt.unfinished"
     unfinished.write_bytes((tmp_path / "c.pt.unfinished").read_bytes()[:-2000])
     with pytest.raises(MitsimError, match=r"d\.pt\.unfinished: cannot be read .*; remove it"):
@@ -431,13 +437,17 @@ def test_what_a_network_does_not_know_is_refused(model: LearnedSolver) -> None:
 
 
 def test_another_bench_is_flagged(model: LearnedSolver) -> None:
-    """(Planted: each of the four doubts left out.)"""
+    """(Planted: each of the four doubts left out; no refusal of another camera.)"""
     camera = bench()
     shots, factors = camera.run("uniform", picture(5), 5), camera.calibrated(1)
     named = {"camera": {"mask": "other"}}
     others = Capture(shots.manifest.model_copy(update=named), memory=shots._memory)
     elsewhere = replace(factors, manifest=factors.manifest.model_copy(update=named))
     assert "trained for another camera: mask differ" in str(reconstruct(others, elsewhere, method=model).status)
+    for method in ("flatnet", "preprocessed"):
+        network = CLASSES[method]((16, 16))
+        with pytest.raises(MitsimError, match=r"trained for another camera .mask differ., and its weights stand for"):
+            reconstruct(others, elsewhere, method=replace(model, network=network))
     moved = image_of(model, shift=0.2)
     assert not moved.ok and "trained with a calibration that differs by" in str(moved.status)
     dim = image_of(model, peak=500.0)
