@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import refusal, validate
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
+from mitsim.core.mistakes import refusal
 from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name

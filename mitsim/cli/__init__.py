@@ -101,7 +101,7 @@ def run() -> None:
             sys.exit(128 + signal.SIGPIPE)
         raise
     except MitsimError as error:
-        _fail(message_of(error))
+        _fail(*message_of(error).split("\n"))
     except (typer.Abort, KeyboardInterrupt) as error:
         if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
             end_uncaught(error.__cause__)
@@ -135,10 +135,10 @@ def _usage(error: Any) -> str:
     return message
 
 
-def _fail(message: str) -> None:
+def _fail(*lines: str) -> None:
     if is_stopped():
         end_stopped()  # what an interrupt became on its way, as of a module that was being imported
-    print(f"mitsim: {' '.join(printable(message).split())}", file=sys.stderr)
+    print("mitsim:", "\n  ".join(" ".join(printable(line).split()) for line in lines), file=sys.stderr)
     sys.exit(2)
 
 
