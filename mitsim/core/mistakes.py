@@ -58,7 +58,8 @@ class Table(dict[str, Any]):
         """The line on which each name, and each table, of the file begins."""
         found: dict[Place, int] = {}
         entries: dict[Place, int] = {}  # of arrays of tables
-        table, statement, first = (), "", 1
+        table: Place = ()
+        statement, first = "", 1
         for number, line in enumerate(self.text.split("\n"), 1):
             statement += line + "\n"
             try:
