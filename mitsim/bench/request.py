@@ -120,8 +120,7 @@ class Exposure:
         if sensor.mosaic is not None:
             raise MitsimError(
                 f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
-                "capture and calibrate it with --colour mosaic, in Python capture_mosaic and calibrate_mosaic; "
-                "pairs are made by monochrome cameras alone"
+                "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic), make pairs by another"
             )
         if self.seconds is None and not math.isfinite(sensor.full_well_e):
             raise MitsimError(

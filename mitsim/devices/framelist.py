@@ -233,10 +233,9 @@ def load_frames(folder: Path | str) -> SessionFrames:
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
             raise MitsimError(
-                f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
-                f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
-                f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
-                f"frame in {place.name}{_not_counted(folder, names)}"
+                f"frames {folder}: holds {len(names)} frames, and n {listed.n}, signed_capture "
+                f"{listed.signed_capture!r}{_times(listed)} are {len(wanted)}, from {wanted[0][0]} to {wanted[-1][0]}; "
+                f"take the others, or name each in {place.name}{_not_counted(folder, names)}"
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
@@ -314,7 +313,7 @@ def _check_files(session: SessionFrames) -> None:
             raise MitsimError(
                 f"frames {folder}: {shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one "
                 f"pattern, exposed for {session.exposure_s(shot):g} and {session.exposure_s(other):g} s; expose them "
-                "alike, so that their dark signal is the same"
+                "alike"
             )
     if session.pairs:
         return

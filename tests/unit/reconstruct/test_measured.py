@@ -154,7 +154,7 @@ def entries(**changes: Any) -> list[dict[str, Any]]:
         ({"frames": entries(side="diagonal")}, "frames.3.side: got 'diagonal'"),
         ({"repeats": 2}, "signed_capture 'pair', repeats 2, are 32"),
         ({"repeats": 2, "frames": entries(repeat=1)}, "first horizontal stripes 0 of sign +1, repeat 1"),
-        ({"n": 5}, "holds 16 frames, but 5 projector pixels, signed_capture 'pair', are 32"),
+        ({"n": 5}, "holds 16 frames, and n 5, signed_capture 'pair' are 32"),
         ({"signed_capture": "uniform"}, "are 10 (horizontal, then vertical)"),
         ({"digital": {**DIGITAL, "gain_dn_per_e": 0}}, "digital.gain_dn_per_e: got 0"),
         ({"cammera": "mine"}, "cammera: got 'mine', no such field; did you mean camera?"),
