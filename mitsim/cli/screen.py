@@ -333,7 +333,9 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
             print(json.dumps(plain(payload), allow_nan=False))
         else:
             for line in lines:
-                print(*(each for part in line.split("\n") for each in wrapped(part)), sep="\n")
+                for part in line.split("\n"):
+                    # Columns of a table stay one below the other.
+                    print(*([printable(part)] if "  " in part.strip() else wrapped(part)), sep="\n")
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0

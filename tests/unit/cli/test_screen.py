@@ -283,10 +283,10 @@ def test_lines_are_as_wide_as_the_terminal(monkeypatch: pytest.MonkeyPatch, caps
     """80 characters where there is none; a path is not broken. (Planted: printed as they are.)"""
     monkeypatch.delenv("COLUMNS", raising=False)
     path = "/a-folder/" * 9
-    screen.finish(False, {}, ["word " * 40, f"Image: {path}", ""], ())
+    screen.finish(False, {}, ["word " * 40, f"Image: {path}", "", "a  " * 40], ())
     lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines[:3])) <= 80 and len(lines) == 6
-    assert f"  {path}" in lines and lines[-1] == ""
+    assert max(map(len, lines[:3])) <= 80 and len(lines) == 7
+    assert f"  {path}" in lines and lines[-2:] == ["", "a  " * 40]
 
 
 def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:

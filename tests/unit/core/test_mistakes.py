@@ -84,8 +84,8 @@ def test_a_line_is_that_of_the_name_itself(tmp_path: Path) -> None:
 
 
 def test_a_value_over_very_many_lines_ends_the_search(tmp_path: Path) -> None:
-    """Its lines are read again with each further one: 4000 took 9 s of a processor. (Planted: no limit.)"""
-    (tmp_path / "a.toml").write_text("a = [\n" + "1,\n" * 20_000 + "]\nb = 1\n")
+    """Its lines are read again with each further one: 800 took 0.7 s, 400 took 0.2 s. (Planted: no limit.)"""
+    (tmp_path / "a.toml").write_text("a = [\n" + "1,\n" * 500 + "]\nb = 1\n")
     assert ("b",) not in read_toml(tmp_path / "a.toml").lines()
 
 
