@@ -308,9 +308,7 @@ def wrapped(text: str, indent: str = "") -> list[str]:
     paths stay whole."""
     width = shutil.get_terminal_size((_COLUMNS, _SCREEN_LINES)).columns
     indent = indent or text[: len(text) - len(text.lstrip())] or "  "
-    lines = textwrap.wrap(
-        printable(text), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-    )
+    lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return lines or [""]
 
 
@@ -333,9 +331,9 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
             print(json.dumps(plain(payload), allow_nan=False))
         else:
             for line in lines:
-                for part in line.split("\n"):
+                for part in printable(line).split("\n"):
                     # Columns of a table stay one below the other.
-                    print(*([printable(part)] if "  " in part.strip() else wrapped(part)), sep="\n")
+                    print(*([part] if "  " in part.strip() else wrapped(part)), sep="\n")
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0
