@@ -289,6 +289,9 @@ def _reconstruct_colours(
     return finish(common.as_json, payload, _colours_lines(found, common), found.warnings)
 
 
+# ---- what is said of images, and words of options --------------------------------------------------------------------
+
+
 def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
     """What is said of an image in colour, as ``common`` options have it."""
     verdict = "Solved" if found.ok else "Flagged"

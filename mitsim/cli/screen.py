@@ -264,9 +264,9 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         after.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
     if everything:
-        rows = [line for row in plan.effects for line in (_row_text(row, row.state), f"    {row.reason}")]
-        return [gist, _HEAD.format("effect", "error if off", "seconds", "state"), *rows, *after]
-    room = _SCREEN_LINES - sum(len(wrapped(line)) for line in (gist, *after)) - 2  # what has no room
+        texts = [line for row in plan.effects for line in (_row_text(row, row.state), f"    {row.reason}")]
+        return [gist, _HEAD.format("effect", "error if off", "seconds", "state"), *texts, *after]
+    room = _SCREEN_LINES - sum(len(wrap_text(line)) for line in (gist, *after)) - 2  # what has no room
     rows = sorted(plan.effects, key=lambda row: -(row.error_if_off or 0.0))
     small = plan.accuracy * _WORTH_NAMING
     left_out = [row for row in rows if row.state == "off" and (row.error_if_off is None or row.error_if_off >= small)]
@@ -296,14 +296,14 @@ def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tupl
     """Lines of the ``rows`` that have ``room`` under a ``heading`` and that of their ``words``, and the other rows."""
     indent, lines = " " * len(_HEAD.format("", "", "", "")), [_HEAD.format(heading, "error if off", "seconds", words)]
     for number, row in enumerate(rows):
-        text = wrapped(_row_text(row, row.gist), indent)
+        text = wrap_text(_row_text(row, row.gist), indent)
         if len(lines) + len(text) > room:
             return lines, [*rows[number:]]
         lines += text
     return (lines if rows else []), []
 
 
-def wrapped(text: str, indent: str = "") -> list[str]:
+def wrap_text(text: str, indent: str = "") -> list[str]:
     """A ``text`` in lines as wide as the terminal, or of 80 characters, after the first behind an ``indent``; names and
     paths stay whole."""
     width = shutil.get_terminal_size((_COLUMNS, _SCREEN_LINES)).columns
@@ -333,7 +333,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
             for line in lines:
                 for part in printable(line).split("\n"):
                     # Columns of a table stay one below the other.
-                    print(*([part] if "  " in part.strip() else wrapped(part)), sep="\n")
+                    print(*([part] if "  " in part.strip() else wrap_text(part)), sep="\n")
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0

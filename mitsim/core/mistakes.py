@@ -115,7 +115,7 @@ def refusal(
     data
         that was read.
     """
-    found = _listed(model, error, data)
+    found = _mistakes_in(model, error, data)
     if isinstance(data, Table):
         return told_together(where, found)
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
@@ -143,11 +143,11 @@ def mistakes(model: type[pydantic.BaseModel], data: Table) -> list[Mistake]:
     try:
         model.model_validate(data)
     except pydantic.ValidationError as error:
-        return _listed(model, error, data)
+        return _mistakes_in(model, error, data)
     return []
 
 
-def _listed(model: type[pydantic.BaseModel], error: pydantic.ValidationError, data: object) -> list[Mistake]:
+def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationError, data: object) -> list[Mistake]:
     """What pydantic found wrong, unknown names first and missing ones last."""
     lines = data.lines() if isinstance(data, Table) else {}
     above = data.place if isinstance(data, Table) else ()

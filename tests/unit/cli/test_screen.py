@@ -237,7 +237,7 @@ def test_a_plan_says_first_what_it_comes_to_and_fits_a_screen(monkeypatch: pytes
     monkeypatch.setenv("COLUMNS", "80")
     lines = screen.plan_lines(plan_of())
     assert lines[0] == "Plan at accuracy 0.001: 7.6 s, error up to 7.1e-04"
-    printed = [part for line in lines for part in screen.wrapped(line)]
+    printed = [part for line in lines for part in screen.wrap_text(line)]
     assert len(printed) <= 24 and max(map(len, printed)) <= 80
     text = " ".join(" ".join(printed).split())
     assert not any(line.startswith(("mirrors", "blur")) for line in lines)
@@ -260,7 +260,7 @@ def test_rows_beyond_a_screen_are_named(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("COLUMNS", "80")
     more = [(f"effect-{k}", "exact", "for a reason of its own", 10.0**-k) for k in range(1, 9)]
     lines = screen.plan_lines(plan_of(*more))
-    assert sum(len(screen.wrapped(line)) for line in lines) <= 24
+    assert sum(len(screen.wrap_text(line)) for line in lines) <= 24
     (unshown,) = (line for line in lines if line.startswith("No room for"))
     assert "effect-8" in unshown and "effect-1," not in unshown
 
