@@ -17,7 +17,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,14 +169,15 @@ def closed() -> dict[str, float]:
 
 # ---- README's tour of the command line -------------------------------------------------------------------------------
 
-VERBS = ("capture", "calibrate", "reconstruct")
-"""Of photograph: from a scene to an image, with every figure at its default."""
+VERBS = ("plan", "capture", "calibrate", "reconstruct")
+"""A plan of cookie_bag; of photograph, from a scene to an image with every figure at its default."""
 _BLOCK = r"^    \$ mitsim ({verb} .*)\n((?:    (?!\$ ).*\n)*)"
-_MACHINE = re.compile(r"\bin [\d.]+ s\b(?: \(transport [^)]*\))?|\bmemory [\d.]+ GiB of at most [\d.]+ predicted")
+_MACHINE = re.compile(
+    r"\b(?:in |0\.001: )[\d.]+ s\b|(?<=e[+-]\d\d) +\d+\.\d\d(?= )|(?<= [-0]) +\d+\.\d\d(?= )|"
+    r"\bSeconds:(?: \w+ [\d.e-]+,?)+|\bAt most [\d.]+ GiB"
+)
 """What an output says of the machine, not of the scene."""
 _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[+-]?\d+)?")
-_WIDTH = 116
-"""Columns of README's outputs, without their indent."""
 
 
 def printed(verb: str) -> tuple[str, str]:
@@ -213,34 +213,6 @@ def last_digit(number: str) -> float:
     return math.pow(10, int(exponent or 0) - len(mantissa.partition(".")[2]))
 
 
-def planned(folder: Path) -> dict[str, tuple[str, str, str]]:
-    """State, reason and error of every row of README's plan, as its command gives them now."""
-    command, _ = printed("plan")
-    program = [sys.executable, "-m", "mitsim", *shlex.split(command), "--json", "--quiet"]
-    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=True)
-    rows = json.loads(done.stdout)["effects"]
-    return {row["name"]: (row["state"], row["reason"], f"{row['error_if_off'] or 0:.1e}") for row in rows}
-
-
-def plan_lines(now: dict[str, tuple[str, str, str]]) -> dict[str, str]:
-    """README's lines of the plan that are not what the plan is ``now``, and what they should be.
-
-    A line has the first words of a reason. Its seconds are the machine's.
-    """
-    found = {}
-    for line in printed("plan")[1].splitlines():
-        cells = re.split(r"\s{2,}", line.strip())
-        name, *cells = re.split(r"\s+", cells[0], maxsplit=1) + cells[1:]
-        if name not in now:
-            continue
-        state, reason, error = cells[:3]
-        words = re.match(_NUMBER.sub("#", reason).replace("#", _NUMBER.pattern), now[name][1])
-        new = line.replace(f" {state} ", f" {now[name][0]} ").replace(f" {error} ", f" {now[name][2]} ")
-        new = new.replace(reason, words[0] if words else now[name][1])
-        found |= {} if new == line else {line: new}
-    return found
-
-
 def statuses(folder: Path) -> dict[str, str]:
     """Sentences in README's table of exit statuses whose figures differ, and what their commands say now."""
     found = {}
@@ -262,15 +234,15 @@ def tour_figures() -> dict[str, float]:
         "ssim": r"SSIM ([\d.]+),",
         "truth_db": r"truth good to ([\d.]+) dB",
         "mc_error": r"Monte Carlo error ([\d.e+-]+),",
-        "factor_error": r"factor error ([\d.e+-]+),",
-        "uncertainty": r"standard uncertainty ([\d.e+-]+) rms",
+        "factor_error": r"Factor error ([\d.e+-]+),",
+        "uncertainty": r"Standard uncertainty ([\d.e+-]+) rms",
     }
     return {name: float(re.findall(pattern, text)[0]) for name, pattern in patterns.items()}
 
 
 def tour(work: Path) -> dict[str, float]:
     """The tour's commands run in ``work``; their outputs stand in README then."""
-    for line, now in (plan_lines(planned(work)) | statuses(work)).items():
+    for line, now in statuses(work).items():
         sys.stdout.write(f"{line} -> {now}\n")
         README.write_text(README.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
     for verb, now in outputs(work):
@@ -281,14 +253,10 @@ def tour(work: Path) -> dict[str, float]:
 
 
 def updated(page: str, verb: str, now: str) -> str:
-    """The ``page`` with the output ``now`` of a ``verb``."""
+    """The ``page`` with the output ``now`` of a ``verb``, the machine's figures too."""
     command, old = printed(verb)
-    kept = iter(_MACHINE.findall(" ".join(old.split())))
-    text = "\n".join(_MACHINE.sub(lambda found: next(kept, found[0]), line) for line in now.splitlines())
-    lines = [wrapped for line in text.splitlines() for wrapped in textwrap.wrap(line, _WIDTH)]
-    return page.replace(
-        f"    $ mitsim {command}\n{old}", f"    $ mitsim {command}\n" + "".join(f"    {line}\n" for line in lines)
-    )
+    lines = "".join(f"    {line}\n" for line in now.splitlines())
+    return page.replace(f"    $ mitsim {command}\n{old}", f"    $ mitsim {command}\n{lines}")
 
 
 def plan(work: Path) -> dict[str, float]:

@@ -8,9 +8,6 @@ the file differs from the models.
 
 from __future__ import annotations
 
-import ast
-import inspect
-import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -28,6 +25,7 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
+from mitsim.core.mistakes import meanings
 from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.chart import ChartPlace
@@ -68,23 +66,6 @@ def table(model: type[BaseModel]) -> str:
         default = "required" if name in schema.get("required", ()) else _default(model.model_fields[name].default)
         lines.append(f"| `{name}` | {_allowed(rules)} | {default} | {known[name]} |")
     return "\n".join(lines)
-
-
-def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """What each field of a ``model`` is: the first paragraph of the docstring below it, as a table has it."""
-    found: dict[str, str] = {}
-    for base in reversed([one for one in model.__mro__ if issubclass(one, BaseModel) and one is not BaseModel]):
-        body = ast.parse(inspect.getsource(base)).body[0].body  # type: ignore[attr-defined]
-        for field, below in itertools.pairwise(body):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(below, ast.Expr)
-                and isinstance(below.value, ast.Constant)
-            ):
-                text = " ".join(str(below.value.value).split("\n\n")[0].split()).removesuffix(".")
-                plain = len(text) > 1 and (text[1].islower() or text[1] == " ")
-                found[ast.unparse(field.target)] = text[0].lower() + text[1:] if plain else text
-    return found
 
 
 def _default(value: Any) -> str:

@@ -11,10 +11,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate
+from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate, read_toml
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain
+from mitsim.core.mistakes import mistakes, told_together
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import read_name
 from mitsim.scene.outline import Outline, SceneFiles, lit_side
@@ -408,7 +409,25 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
     there is not."""
     found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
     first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
+    if camera is not None:
+        _check_camera(first)
     return first, second
+
+
+def _check_camera(path: Path) -> None:
+    """MitsimError for a camera file whose sensor breaks a rule, with the mistakes of its mask beside them."""
+    from mitsim.devices.sensor import SensorModel
+
+    table = read_toml(path)
+    mask = table.part("mask") if isinstance(table.get("mask"), dict) else None
+    table.pop("mask", None)
+    found = mistakes(SensorModel, table)
+    if found and mask is not None:
+        from mitsim.devices.mask_profile import MaskProfile  # only now: it imports numpy
+
+        found += mistakes(MaskProfile, mask)
+    if found:
+        raise told_together(f"file {path}", found)
 
 
 def open_apparatus(

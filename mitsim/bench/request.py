@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import refusal, validate
+from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
+from mitsim.core.mistakes import refusal
 from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
@@ -119,8 +120,7 @@ class Exposure:
         if sensor.mosaic is not None:
             raise MitsimError(
                 f"camera {camera_file}: has a mosaic {sensor.mosaic}, whose frames show all lines at once; "
-                "capture and calibrate it with --colour mosaic, in Python capture_mosaic and calibrate_mosaic; "
-                "pairs are made by monochrome cameras alone"
+                "capture and calibrate by --colour mosaic (capture_mosaic, calibrate_mosaic), make pairs by another"
             )
         if self.seconds is None and not math.isfinite(sensor.full_well_e):
             raise MitsimError(

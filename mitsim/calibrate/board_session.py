@@ -156,9 +156,8 @@ class Session:
             found = self._inseparable
         if found is not None and too_many(found.patterns, count):
             raise MitsimError(
-                f"{found.words}, and {found.patterns} of {2 * count} patterns of a session would show no shape that "
-                f"the others do, too many for factors; {found.remedy}: without factors it can be planned and captured, "
-                "and no image is solved"
+                f"{found.words}: {found.patterns} of {2 * count} patterns would show another shape than the rest, too "
+                f"many for factors; {found.remedy}; it can be planned and captured all the same"
             )
 
     @property

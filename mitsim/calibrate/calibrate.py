@@ -168,8 +168,8 @@ def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[
             plane, line = dark[0]
             raise MitsimError(
                 f"camera {bench.whole.devices.camera_file}: its {str(filters.mosaic)[plane]} filters "
-                f"pass nothing of {names[line]}, so a calibration in this line alone does not see all "
-                "pixels; use a projector whose lines all filters pass"
+                f"pass nothing of {names[line]}, so its calibration lacks pixels; use a projector whose lines all "
+                "filters pass"
             )
         passed = list(behind(weights, bench.whole.geometry.frame_shape))
     whole = Session(bench.whole, (request.recipe or load_recipe()).of_one_depth(), request.seed)

@@ -136,9 +136,8 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
     geometry = bench.geometry
     if geometry.is_drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
         raise MitsimError(
-            f"calibrate: a {model} model has a mask of one or two separable terms, mounted straight, and "
-            f"{geometry.mask_words} is not; describe it so in the camera's [mask] (a fit finds its rotation), or "
-            "calibrate without a model"
+            f"calibrate: a {model} model needs a mask of one or two separable terms, mounted straight, not "
+            f"{geometry.mask_words}; change the camera's [mask] (a fit finds its rotation), or leave out --model"
         )
     return ModelledCamera(bench.geometry, bench.windows, bench.n, bench.spectrum if model == "wave" else None)
 

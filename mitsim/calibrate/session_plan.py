@@ -216,8 +216,8 @@ def plan_calibration(
     recipe, job = (recipe or load_recipe()).of_one_depth(), job or Job()
     if len(recipe.exposure_ladder) > 1 or recipe.dark_frames:
         raise MitsimError(
-            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; a "
-            "plan knows sessions of one exposure without dark frames, so leave exposure_ladder and dark_frames out"
+            f"recipe: has {len(recipe.exposure_ladder)} exposures of a frame and {recipe.dark_frames} dark frames; for "
+            "--plan leave exposure_ladder and dark_frames out"
         )
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
     session = Session(bench, recipe, seed)

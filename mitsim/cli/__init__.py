@@ -56,7 +56,7 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
-from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
+from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
@@ -101,7 +101,7 @@ def run() -> None:
             sys.exit(128 + signal.SIGPIPE)
         raise
     except MitsimError as error:
-        _fail(message_of(error))
+        _fail(*message_of(error).split("\n"))
     except (typer.Abort, KeyboardInterrupt) as error:
         if isinstance(error.__cause__, EOFError):  # which click takes for Control-D
             end_uncaught(error.__cause__)
@@ -135,10 +135,10 @@ def _usage(error: Any) -> str:
     return message
 
 
-def _fail(message: str) -> None:
+def _fail(*lines: str) -> None:
     if is_stopped():
         end_stopped()  # what an interrupt became on its way, as of a module that was being imported
-    print(f"mitsim: {' '.join(printable(message).split())}", file=sys.stderr)
+    print("mitsim:", "\n  ".join(" ".join(printable(line).split()) for line in lines), file=sys.stderr)
     sys.exit(2)
 
 
@@ -196,6 +196,7 @@ def plan(
         Path | None, typer.Option("-o", "--output", help="file to make, for capture --plan", metavar="FILE.json")
     ] = None,
     overwrite: Overwrite = False,
+    everything: Annotated[bool, typer.Option("--all", help="all effects, and all of their reasons")] = False,
     *,
     common: Common,
 ) -> int:
@@ -218,11 +219,10 @@ def plan(
             found = _plan_of(bench, devices.colour, request).taking(start=starting)
         if place is not None:
             found.save(place)
-    if not common.as_json:
-        print_plan(found)
     written = {} if output is None else {"output": str(output)}
     kernels = asdict(compiled_kernels())
-    lines = [*(f"Plan: {text}" for text in written.values()), *kernel_lines(kernels)]
+    lines = [] if common.as_json else plan_lines(found, everything or common.verbose)
+    lines += [*(f"Plan: {text}" for text in written.values()), *kernel_lines(kernels)]
     return finish(common.as_json, {**found.payload(), **written, "kernels": kernels}, lines, found.warnings)
 
 
@@ -314,7 +314,7 @@ def capture(
         else:
             payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, made.resume, job))
     payload["memory_bytes"] = memory_since(held)
-    return finish(limited.as_json, payload, _capture_lines(payload), payload["warnings"])
+    return finish(limited.as_json, payload, _capture_lines(payload, limited), payload["warnings"])
 
 
 def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any], task: Task) -> dict[str, Any]:
@@ -377,9 +377,9 @@ def _chosen_colour(known: Plan) -> str:
     return NO if known.colour.chosen == MONO else known.colour.chosen
 
 
-def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
-    """What is said of a capture by its ``payload``: of one that tells no lines apart, a coloured one, or of frames
-    behind colour filters."""
+def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
+    """What is said of a capture by its ``payload``, as ``common`` options have it: of one that tells no lines apart, a
+    coloured one, or of frames behind colour filters."""
     taken = payload["seconds"]
     if payload.get("kind") == RUN:
         each = [
@@ -388,7 +388,7 @@ def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
             f"{part['exposure_s']:.3g} s a frame"
             for part in payload["channels"]
         ]
-        return [*each, total_of_lines(payload), *kernel_lines(payload["kernels"]), *_colour_lines(payload)]
+        return [total_of_lines(payload), *each, *kernel_lines(payload["kernels"]), *_colour_lines(payload)]
     frames = f"{payload['frames']} frames of {payload['shape'][0]}x{payload['shape'][1]}"
     if "mosaic" in payload:
         return [
@@ -399,11 +399,14 @@ def _capture_lines(payload: Mapping[str, Any]) -> list[str]:
             *_ambient_lines(payload),
         ]
     lines = [
-        f"{frames} in {taken['total']:.1f} s (transport {taken['transport']:.2f}, optics {taken['optics']:.2f}, "
-        f"sensor {taken['sensor']:.2f}, write {taken['write']:.2f}): {payload['output']}",
+        f"{frames} in {taken['total']:.1f} s: {payload['output']}",
         f"Monte Carlo error {payload['mc_error']:.1e}, {payload['mc_to_sensor_noise']:.0%} of the sensor's noise; "
-        f"exposure {payload['exposure_s']:.3g} s a frame; memory {payload['memory_bytes'] / 2**30:.2g} GiB "
-        f"of at most {payload['predicted_memory_bytes'] / 2**30:.2g} predicted",
+        f"exposure {payload['exposure_s']:.3g} s a frame",
+        *common.details(
+            f"Total error up to {payload['total_error_bound']:.1e}, accuracy {payload['accuracy']:g}",
+            f"Seconds: {', '.join(f'{name} {seconds:.2f}' for name, seconds in taken.items() if name != 'total')}",
+            memory_line(payload),
+        ),
         *kernel_lines(payload["kernels"]),
         *_colour_lines(payload),
     ]
@@ -501,12 +504,15 @@ def doctor(
     checks = run_doctor()
     if warm and all(check.ok for check in checks):
         checks.append(warm_up(common.variant))
-    lines = [
+    lines = [f"{sum(check.ok for check in checks)} of {len(checks)} checks pass"]
+    lines += [
         f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.detail}"
         + (f"\n     mend with: {check.remedy}" if check.remedy and not check.ok else "")
         for check in checks
     ]
     bad = tuple(f"{check.name}: {check.detail}" for check in checks if not check.ok)
+    if not (bad or common.verbose):
+        lines = [f"All {len(checks)} checks pass (--verbose lists them)"]
     return finish(common.as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
 
 

@@ -20,6 +20,7 @@ from mitsim.cli.options import (
     NO,
     Accuracy,
     Coloured,
+    Common,
     Limited,
     Resume,
     Seed,
@@ -31,7 +32,7 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
-from mitsim.cli.screen import finish, payload_of_lines, total_of_lines
+from mitsim.cli.screen import finish, memory_line, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
@@ -40,9 +41,9 @@ if TYPE_CHECKING:
     from mitsim.devices.session import Modelling
     from mitsim.reconstruct.factors import Factors
 
-_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet"}
+_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet", "verbose"}
 """Options of `mitsim calibrate` that go with --frames."""
-_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet"}
+_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose"}
 """Those that go with --known."""
 
 
@@ -207,7 +208,7 @@ def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured
         {**factors.manifest.result, "memory_bytes": taken, "output": place}
         for factors, place in zip(found, places, strict=True)
     ]
-    lines = [line for payload in payloads for line in _session_lines(payload)]
+    lines = [line for payload in payloads for line in _session_lines(payload, limited)]
     warnings = [text for factors in found for text in factors.warnings]
     if not recipe.depths:
         return finish(limited.as_json, payloads[0], lines, warnings)
@@ -215,19 +216,20 @@ def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured
     return finish(limited.as_json, whole, lines, warnings)
 
 
-def _session_lines(payload: dict[str, Any]) -> list[str]:
-    """What is said of a simulated session, by its ``payload``."""
+def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
+    """What is said of a simulated session, by its ``payload``, as ``common`` options have it."""
     names = "separability_residual", "noise_free_residual", "phi_error", "condition"
     residual, clean, error, condition = _finite(payload, *names)
     shadow = payload["shadow_residual"]
     return [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: "
         f"{payload['output']}",
-        f"separability residual {residual:.2%} ({clean:.1e} without noise), factor error {error:.1e}, condition "
-        f"{condition:.2e}",
-        *([] if shadow is None else [f"of single pixels' shadows the factors lack {shadow:.1e}"]),
-        f"memory {payload['memory_bytes'] / 2**30:.2g} GiB of at most {payload['predicted_memory_bytes'] / 2**30:.2g} "
-        "predicted",
+        f"Factor error {error:.1e}, separability residual {residual:.2%} ({clean:.1e} without noise)",
+        *common.details(
+            f"Condition {condition:.2e}",
+            *([] if shadow is None else [f"Of single pixels' shadows the factors lack {shadow:.1e}"]),
+            memory_line(payload),
+        ),
     ]
 
 
@@ -244,7 +246,7 @@ def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, A
         f"{part['predicted_phi_error'] if part['phi_error'] is None else part['phi_error']:.1e}"
         for part in payload["channels"]
     ]
-    return payload, [*lines, total_of_lines(payload)]
+    return payload, [total_of_lines(payload), *lines]
 
 
 def _percent(part: float | None) -> str:
@@ -277,9 +279,10 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
     residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
-        f"separability residual {residual:.2%}, factor error {error:.1e} by its noise, condition {condition:.2e}",
-        *([] if payload["divided_by"] == 1 else [f"numbers are divided by {payload['divided_by']}, which all have"]),
-        *(f"not known: {text}" for text in payload["not_known"]),
+        f"Factor error {error:.1e} by its noise, separability residual {residual:.2%}",
+        *limited.details(f"Condition {condition:.2e}", memory_line(payload)),
+        *([] if payload["divided_by"] == 1 else [f"Numbers are divided by {payload['divided_by']}, which all have"]),
+        *(f"Not known: {text}" for text in payload["not_known"]),
     ]
     return finish(limited.as_json, payload, lines, factors.warnings)
 
@@ -312,12 +315,12 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
     pictures = f"{first['pictures']} picture" + "s" * (first["pictures"] > 1)
     said = f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"
     if aged is not None:
-        left = f"left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
-        return finish(limited.as_json, payload, [said, f"moved: {moved_in_words(first['moved'])}", left], warnings)
+        left = f"Left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
+        return finish(limited.as_json, payload, [said, f"Moved: {moved_in_words(first['moved'])}", left], warnings)
     rows, columns = first["scale"]
     lines = [
         said,
-        f"pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
+        f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
         "columns of pixels",
         *(
             f"{name and name + ': '}{each['terms']} code{'s' if each['terms'] > 1 else ''} a side explain "
@@ -419,6 +422,6 @@ def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
     return [
         f"{result['model']} model fitted to {result['frames']} frames in {result['seconds']['total']:.1f} s: {output}",
         *numbers,
-        f"unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
+        f"Unexplained {result['unexplained_residual']:.2%}, chi-square {result['chi_square']:.3g} a datum, condition "
         f"{result['condition']:.2e}",
     ]

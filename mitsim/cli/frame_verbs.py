@@ -35,6 +35,7 @@ from mitsim.core.spectral_manifests import (
 from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
 
 if TYPE_CHECKING:
+    from mitsim.report.colour_image import JudgedColours
     from mitsim.report.quality import Judged
 
 # ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
@@ -189,14 +190,21 @@ def reconstruct(
 
 def _finish_image(result: Judged, payload: dict[str, Any], common: Common) -> int:
     """Print a ``result``, whose JSON is the ``payload``; the exit status."""
-    rank = "" if payload["rank"] is None else f"rank {payload['rank']}, condition {payload['condition_whole']:.3g}, "
+    image, rank = result.reconstruction, payload["rank"]
+    verdict = image.status.verdict.value.capitalize()
+    rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
+    trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit) if known)
     lines = [
-        payload["status"],
-        *([] if result.quality is None else [str(result.quality)]),
-        f"lambda {payload['lambda']:.3g}, {rank}residual {payload['residual']:.1e}: {payload['output']}",
+        f"{image.status.sentence}." if result.quality is None else f"{verdict}: {result.quality}",
+        f"Image: {payload['output']}",
         *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
-        *([] if result.reconstruction.focus is None else [str(result.reconstruction.focus)]),
-        *result.reconstruction.trust,
+        *([] if image.focus is None else [str(image.focus)]),
+        *([trust.capitalize()] if trust else []),
+        *common.details(
+            *([str(image.status)] if image.ok else []),  # a warning has it otherwise
+            f"lambda {payload['lambda']:.3g}, residual {payload['residual']:.1e}{rank_words}",
+            *image.trust,
+        ),
     ]
     return finish(common.as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
 
@@ -278,7 +286,22 @@ def _reconstruct_colours(
     with common.job() as job:
         found = reconstruct_colours(run, calibration, output, place, job=job, **options)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    return finish(common.as_json, payload, [*found.sentences, found.output], found.warnings)
+    return finish(common.as_json, payload, _colours_lines(found, common), found.warnings)
+
+
+# ---- what is said of images, and words of options --------------------------------------------------------------------
+
+
+def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
+    """What is said of an image in colour, as ``common`` options have it."""
+    verdict = "Solved" if found.ok else "Flagged"
+    quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
+    return [
+        f"{verdict}: {quality}",
+        f"Image: {found.output}",
+        *(f"{text[0].upper()}{text[1:]}" for text in found.colours.sentences),
+        *common.details(*found.described),
+    ]
 
 
 def _two_bounds(text: str) -> tuple[float, float]:

@@ -37,6 +37,7 @@ _SPELLED = {
     "outside": "--allow-outside-files",
     "planning": "--plan",
     "as_json": "--json",
+    "everything": "--all",
     "aged": "--from",
     "lam": "--lambda",
 }
@@ -133,6 +134,11 @@ class Common:
     )
     as_json: bool = option(False, "one JSON object on stdout, nothing else there", "--json")
     quiet: bool = option(False, "no progress", "--quiet")
+    verbose: bool = option(False, "say all that was found, not the result alone", "--verbose")
+
+    def details(self, *lines: str) -> Sequence[str]:
+        """Those ``lines`` that are printed with --verbose alone."""
+        return lines if self.verbose else ()
 
     @contextmanager
     def job(self) -> Iterator[Job]:

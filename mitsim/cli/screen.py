@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import shutil
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions
     from rich.table import Table
 
-    from mitsim.light.plan import Plan
+    from mitsim.light.plan import Plan, PlanRow
 
 SECONDS_A_LINE = 60.0
 """Least time between two lines of progress in a log [s]: a run of an hour leaves a page of them, a short one none."""
@@ -30,6 +33,8 @@ _SHORTEST_S = 0.05
 """Stages below this get no row: they would say 0.0 s."""
 _REFRESHES = 5
 """Times a second that rows are written: 2.7 ms of a processor each, eight of them, 1.3 % of one."""
+_COLUMNS = 80
+"""Of the usual terminal, and of what is no terminal."""
 _BAR = 24
 """Characters of a bar: with a stage's name and two times it fits into a terminal of 80."""
 
@@ -241,37 +246,70 @@ def _text(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def print_plan(plan: Plan) -> None:
-    """Print the ``plan``'s effects, with reasons, and what it takes."""
-    with write_at_end():
-        _print_plan(plan)
+def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
+    """What people read of a ``plan``: first what it comes to, then what it is made of.
 
-
-def _print_plan(plan: Plan) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=f"Effect plan at accuracy {plan.accuracy:g}")
-    for heading in ("effect", "state", "reason", "error if off", "seconds"):
-        table.add_column(heading, justify="right" if heading in ("error if off", "seconds") else "left")
-    for row in plan.effects:
-        error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}"
-        table.add_row(row.name, row.state, printable(row.reason), error, f"{row.seconds:.2f}")
-    console = Console(markup=False)  # names of a scene stand in the reasons
-    console.print(table)
-    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in plan.predicted.items())
-    console.print(f"Predicted time from start to finish: {plan.predicted_seconds:.2f} s ({stages})")
-    if plan.range_words:
-        console.print(plan.range_words)
-    for note in plan.notes:
-        console.print(note)
-    if plan.colour is not None:
-        console.print(plan.colour.words)
+    What is left out is named where its error is within two decades of the accuracy, or not known; ``everything`` tells
+    all rows and their whole reasons. Rows that a screen has no room for are named at its end.
+    """
+    most = math.hypot(plan.systematic_bound, plan.sampling_target)
+    gist = f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}"
+    stages = ", ".join(f"{name} {seconds:.3g}" for name, seconds in plan.predicted.items())
+    after = [f"Seconds: {stages}", *filter(None, [plan.range_words]), *plan.notes]
+    if plan.colour is not None and (everything or len(plan.colour.candidates) > 1):
+        after.append(plan.colour.words)
     if plan.asked_seconds is not None:
-        console.print(f"Accuracy {plan.accuracy:g} is the finest that {plan.asked_seconds:g} s buy")
+        after.append(f"Accuracy {plan.accuracy:g} is the finest that {plan.asked_seconds:g} s buy")
     if plan.cost:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
-        console.print(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
+        after.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
+    if everything:
+        texts = [line for row in plan.effects for line in (_row_text(row, row.state), f"    {row.reason}")]
+        return [gist, _HEAD.format("effect", "error if off", "seconds", "state"), *texts, *after]
+    room = _SCREEN_LINES - sum(len(wrap_text(line)) for line in (gist, *after)) - 2  # what has no room
+    rows = sorted(plan.effects, key=lambda row: -(row.error_if_off or 0.0))
+    small = plan.accuracy * _WORTH_NAMING
+    left_out = [row for row in rows if row.state == "off" and (row.error_if_off is None or row.error_if_off >= small)]
+    off, no_room = _table("left out", "why", left_out, room // 2)
+    on, more = _table("on", "how", [row for row in rows if row.state != "off"], room - len(off))
+    silent = sum(row.state == "off" for row in rows) - len(left_out)
+    unshown = ", ".join(row.name for row in (*more, *no_room))
+    rest = f"No room for {unshown}, and for " if unshown else ""
+    rest += f"{silent} {'' if unshown else 'more '}that nothing calls for (--all)"
+    return [gist, *on, *off, rest, *after]
+
+
+_HEAD = "{:16} {:>12} {:>7}  {}"
+"""Columns of a plan: a name, two numbers and words."""
+_SCREEN_LINES = 24
+"""Of the usual terminal."""
+_WORTH_NAMING = 1e-2
+"""Part of the accuracy from which on what is left out is named: two decades, so a hundred may add up to it."""
+
+
+def _row_text(row: PlanRow, words: str) -> str:
+    error = "-" if row.error_if_off is None else f"{row.error_if_off:.1e}" if row.error_if_off else "0"
+    return _HEAD.format(row.name, error, f"{row.seconds:.2f}", words)
+
+
+def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tuple[list[str], list[PlanRow]]:
+    """Lines of the ``rows`` that have ``room`` under a ``heading`` and that of their ``words``, and the other rows."""
+    indent, lines = " " * len(_HEAD.format("", "", "", "")), [_HEAD.format(heading, "error if off", "seconds", words)]
+    for number, row in enumerate(rows):
+        text = wrap_text(_row_text(row, row.gist), indent)
+        if len(lines) + len(text) > room:
+            return lines, [*rows[number:]]
+        lines += text
+    return (lines if rows else []), []
+
+
+def wrap_text(text: str, indent: str = "") -> list[str]:
+    """A ``text`` in lines as wide as the terminal, or of 80 characters, after the first behind an ``indent``; names and
+    paths stay whole."""
+    width = shutil.get_terminal_size((_COLUMNS, _SCREEN_LINES)).columns
+    indent = indent or text[: len(text) - len(text.lstrip())] or "  "
+    lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return lines or [""]
 
 
 def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
@@ -282,7 +320,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
     as_json
         one JSON object instead of text.
     payload, lines
-        the result as that object, and as lines of text.
+        the result as that object, and as lines of text: first what it comes to, then where it is.
     warnings
         on stderr, in either case.
     """
@@ -293,7 +331,9 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
             print(json.dumps(plain(payload), allow_nan=False))
         else:
             for line in lines:
-                print(printable(line))
+                for part in printable(line).split("\n"):
+                    # Columns of a table stay one below the other.
+                    print(*([part] if "  " in part.strip() else wrap_text(part)), sep="\n")
     for warning in warnings:
         print(f"mitsim: warning: {printable(warning)}", file=sys.stderr)
     return 1 if warnings else 0
@@ -326,14 +366,17 @@ def kernel_lines(kernels: Mapping[str, float]) -> list[str]:
     """The line that is said of compiled ``kernels``: their number and seconds; none where there are none."""
     if not kernels["number"]:
         return []
-    return [
-        f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache holds them for "
-        "later runs"
-    ]
+    return [f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache keeps them"]
+
+
+def memory_line(payload: Mapping[str, Any]) -> str:
+    """The line that is said of the memory that a capture or calibration took, by its ``payload``."""
+    taken, most = payload["memory_bytes"] / 2**30, payload["predicted_memory_bytes"] / 2**30
+    return f"Memory {taken:.2g} GiB of at most {most:.2g} predicted"
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:
-    """The last line of text of a ``payload`` as of :func:`payload_of_lines`."""
+    """The first line of text of a ``payload`` as of :func:`payload_of_lines`."""
     return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _MAIN_PATTERNS, _MAIN_MEASURE = "dots:7", "psnr"
 """What is studied where nothing is said."""
-_OF_MERGE = ("name", "scenes", "output", "experiment", "variant", "as_json", "quiet")
+_OF_MERGE = ("name", "scenes", "output", "experiment", "variant", "as_json", "quiet", "verbose")
 """Parameters that `mitsim study merge` has."""
 _OF_SCENES = ("patterns", "camera", "projector", "define", "outside")
 """Those of studies of a scene."""

@@ -1,15 +1,15 @@
 """Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
 
 import os
-import reprlib
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
 import pydantic
 
-from mitsim.core.errors import MitsimError, cut, near_name
-from mitsim.core.files import BYTE_ORDER_MARK, read_text
+from mitsim.core.errors import MitsimError, near_name
+from mitsim.core.files import BYTE_ORDER_MARK, read_json, read_text
+from mitsim.core.mistakes import Table, refusal
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -20,8 +20,6 @@ _MOST_BYTES = 1 << 16
 """Ten times the longest file that is shipped."""
 _MOST_DOTS = 200
 """The parser takes a tenth of a second for a name of that many parts."""
-_SHORT = reprlib.Repr()  # values as a message shows them
-_SHORT.maxstring = _SHORT.maxother = 100  # characters: a line of 120 with what stands around them
 DEFAULT_CAMERA = "imx249"
 """Of a bench where none is named: the paper's."""
 Model = TypeVar("Model", bound=pydantic.BaseModel)
@@ -50,18 +48,29 @@ def shipped_path(*parts: str) -> Path:
     return path
 
 
-def read_toml(path: Path | str) -> dict[str, Any]:
+def read_toml(path: Path | str) -> Table:
     """The table in the TOML file ``path`` of at most 64 KiB. MitsimError when it cannot be read or is not TOML."""
     try:
         text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
         if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
             raise ValueError(f"a line with over {_MOST_DOTS} dots")
-        return tomllib.loads(text)
+        return Table(tomllib.loads(text), text)
     except RecursionError as error:
         raise MitsimError(f"file {path}: not valid TOML (it is nested too deep); flatten it") from error
     except ValueError as error:
         raise MitsimError(f"file {path}: not valid TOML ({error}); correct that line") from error
+
+
+def read_table(path: Path, what: str) -> Table:
+    """The table in the TOML or JSON file ``path`` of a person's; MitsimError, which calls it ``what``, for a file that
+    cannot be read or holds something else."""
+    if path.suffix.lower() != ".json":
+        return read_toml(path)
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise MitsimError(f"{what} {path}: holds a {type(data).__name__}; give a table of names and values")
+    return Table(data)
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
@@ -86,87 +95,13 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
     Raises
     ------
     MitsimError
-        in one line, for the first field that breaks a rule: its value, the rule, and what to do.
+        for fields that break a rule: value, rule, and what to do. Of a :class:`Table` all of them, each on a line; of
+        other data, which programs write, the first.
     """
     try:
         return model.model_validate(data, context=context)
     except pydantic.ValidationError as error:
-        raise refusal(model, error, where) from error
-
-
-def refusal(model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str) -> MitsimError:
-    """What pydantic found wrong, as :func:`validate` raises it.
-
-    Parameters
-    ----------
-    model
-        that was to be made.
-    error
-        that pydantic raised.
-    where
-        what the message begins with.
-    """
-    problems = error.errors(include_url=False)
-    # A mistyped name is both an unknown field and a missing one; the first tells more.
-    first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return MitsimError(f"{where}: {_complaint(model, first)}{more}")
-
-
-def _complaint(model: type[pydantic.BaseModel], problem: Any) -> str:
-    """Field, value and rule of one problem that pydantic found."""
-    field = ".".join(cut(str(part)) for part in problem["loc"])
-    if problem["type"] == "value_error":  # a validator of ours, whose text says all
-        return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
-    rule = problem["msg"][0].lower() + problem["msg"][1:]
-    if problem["type"] == "string_pattern_mismatch" and "/" in problem["ctx"]["pattern"]:
-        rule = "a name without folders is needed"
-    hint = _range(model, problem["loc"])
-    if problem["type"] in ("extra_forbidden", "missing") and (holder := _holder(model, problem["loc"][:-1])):
-        known = [*holder.model_fields]
-        meant = near_name(str(problem["loc"][-1]), known) if problem["type"] == "extra_forbidden" else ""
-        rule = "no such field" if problem["type"] == "extra_forbidden" else rule
-        hint = f"; {meant}known fields: {', '.join(known)}"
-    value = "nothing" if problem["type"] == "missing" else _short_text(problem["input"])
-    return f"{field or 'contents'}: got {value}, {rule}{hint}; correct this field"
-
-
-def _holder(model: type[pydantic.BaseModel], place: tuple[str | int, ...]) -> type[pydantic.BaseModel] | None:
-    """The model of the part at ``place`` inside a ``model``; None for another kind of part."""
-    for name in place:
-        if isinstance(name, str) and name in model.model_fields:
-            kinds = [model.model_fields[name].annotation]
-            for kind in kinds:  # grows: a part may stand in a tuple, or be optional
-                kinds += get_args(kind)
-            models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)]
-            if not models:
-                return None
-            model = models[0]
-    return model
-
-
-def _range(model: Any, location: tuple[int | str, ...]) -> str:
-    """What a number at ``location`` of a model may be, where it has two ends."""
-    marks: list[Any] = []
-    for part in location:
-        holders = (getattr(kind, "model_fields", {}) for kind in (model, *get_args(model)))  # a part may be optional
-        field = next((fields[part] for fields in holders if part in fields), None)
-        if field is None:
-            return ""
-        model, marks = field.annotation, field.metadata
-    ends = {name: getattr(mark, name) for mark in marks for name in ("ge", "gt", "le", "lt") if hasattr(mark, name)}
-    if len(ends) != 2:
-        return ""
-    low, high = (f"{end:g}" for end in ends.values())
-    return f" (range: {'above ' if 'gt' in ends else ''}{low} to {'below ' if 'lt' in ends else ''}{high})"
-
-
-def _short_text(value: object) -> str:
-    """A value on one short line, however large it is."""
-    try:
-        return cut(_SHORT.repr(value), 120)
-    except (ValueError, RecursionError):  # a number of thousands of digits
-        return f"a {type(value).__name__} too large to show"
+        raise refusal(model, error, where, data) from error
 
 
 def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: str) -> Path:

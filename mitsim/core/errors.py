@@ -19,12 +19,13 @@ _LONGEST = 1500
 class MitsimError(Exception):
     """A request that cannot be served; the command line prints it on one line and exits with status 2.
 
-    The ``message`` is one line: what is wrong, where, the value received, what is allowed, and what to do. Whatever a
-    hostile file brought into it, it is printable and not long.
+    The ``message`` is one line: what is wrong, where, the value received, what is allowed, and what to do. Of several
+    ``mistakes`` in one file each has a line of its own under it. Whatever a hostile file brought into them, they are
+    printable and not long.
     """
 
-    def __init__(self, message: str) -> None:
-        super().__init__(cut(message, _LONGEST))
+    def __init__(self, message: str, *mistakes: str) -> None:
+        super().__init__("\n  ".join(cut(line, _LONGEST) for line in (message, *mistakes)))
 
 
 class ArgumentError(MitsimError):

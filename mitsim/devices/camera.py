@@ -152,9 +152,8 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
             )
         if self.pitches[0] != self.pitches[1] and self.is_drawn(waves=True):
             raise ValueError(
-                f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; the shadow of "
-                f"{self.mask_words} is drawn on a raster of square cells, so give square pixels, or a mask of one or "
-                "two separable terms that is not turned"
+                f"row_pitch: got {self.pitches[0]:g} beside pixel_pitch {self.pitches[1]:g}; behind {self.mask_words} "
+                "pixels must be square; give equal ones, or a mask of one or two separable terms that is not turned"
             )
         return self
 

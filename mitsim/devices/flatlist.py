@@ -91,8 +91,6 @@ def load_flats(folder: Path | str) -> FlatFrames:
     """
     folder = Path(folder)
     place, data = read_list(folder, "name, pixel_pitch_um, bits, and sets lit and dark of files and exposure_s")
-    if not isinstance(data, dict):
-        raise MitsimError(f"frames {place}: holds no table; give name, pixel_pitch_um, bits, lit and dark")
     flats = FlatFrames(folder, validate(FlatList, data, f"frames {place}"))
     _check_sets(flats)
     return flats

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, read_toml, validate
+from mitsim.core.configuration import Configuration, Positive, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
-from mitsim.core.files import read_json
 from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
+from mitsim.core.mistakes import Table
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
 
@@ -206,14 +206,14 @@ class SessionFrames:
         return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]
 
 
-def read_list(folder: Path, fields: str) -> tuple[Path, Any]:
+def read_list(folder: Path, fields: str) -> tuple[Path, Table]:
     """The list in a ``folder``, and what it says; MitsimError, which names its ``fields``, unless there is one."""
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
     if len(lists) != 1:
         found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
         names = (" and " if lists else " nor ").join(LISTS)
         raise MitsimError(f"frames {folder}: {found} {names}; give one, with {fields}")
-    return lists[0], read_toml(lists[0]) if lists[0].suffix == ".toml" else read_json(lists[0])
+    return lists[0], read_table(lists[0], "frames")
 
 
 def load_frames(folder: Path | str) -> SessionFrames:
@@ -233,10 +233,9 @@ def load_frames(folder: Path | str) -> SessionFrames:
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
             raise MitsimError(
-                f"frames {folder}: holds {len(names)} frames, but {listed.n} projector pixels, "
-                f"signed_capture {listed.signed_capture!r}{_times(listed)}, are {len(wanted)} "
-                f"({wanted[0][0]}, then {wanted[-1][0]}); take those that are missing, or name each "
-                f"frame in {place.name}{_not_counted(folder, names)}"
+                f"frames {folder}: holds {len(names)} frames, and n {listed.n}, signed_capture "
+                f"{listed.signed_capture!r}{_times(listed)} are {len(wanted)}, from {wanted[0][0]} to {wanted[-1][0]}; "
+                f"take the others, or name each in {place.name}{_not_counted(folder, names)}"
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
@@ -314,7 +313,7 @@ def _check_files(session: SessionFrames) -> None:
             raise MitsimError(
                 f"frames {folder}: {shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one "
                 f"pattern, exposed for {session.exposure_s(shot):g} and {session.exposure_s(other):g} s; expose them "
-                "alike, so that their dark signal is the same"
+                "alike"
             )
     if session.pairs:
         return

@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 
 from pydantic import FailFast, Field, model_validator
 
-from mitsim.core.configuration import Configuration, read_toml, validate
+from mitsim.core.configuration import Configuration, read_table, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_plain, read_json
+from mitsim.core.files import check_plain
 from mitsim.core.imagelist import Preparation
 from mitsim.core.manifests import RunManifest, read_manifest
 from mitsim.core.spectral_manifests import RUN, ColourManifest, is_coloured, is_mosaic, read_colours
@@ -107,9 +107,7 @@ def load_known(path: Path | str) -> KnownCaptures:
     path = Path(path)
     if path.is_dir():
         raise MitsimError(f"list {path}: is a folder; give the TOML or JSON file in it that names runs and pictures")
-    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
-    if not isinstance(data, dict):
-        raise MitsimError(f"list {path}: holds a {type(data).__name__}; give a table of names and values")
+    data = read_table(path, "list")
     listed = validate(KnownList, data, f"list {path}")
     found = KnownCaptures(path, listed, None, {})
     for number, capture in enumerate(listed.known):

@@ -53,7 +53,7 @@ class MaskProfile(Configuration):
     """What a mask is made of; the scene states where it stands."""
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
-    """See below."""
+    """Which kind of mask it is."""
     feature_mm: float = Field(ge=1e-6, le=1e3)
     """Side of a feature, or of a picture's pixel [mm].
 
@@ -236,12 +236,12 @@ def mura(features: int) -> FloatArray:
 
 def load_mask(path: Path | str) -> MaskProfile | None:
     """The table ``[mask]`` of the camera file ``path``, None without one. MitsimError naming field, value and rule."""
-    table = read_toml(path).get("mask")
-    if table is None:
+    table = read_toml(path)
+    if "mask" not in table:
         return None
-    if not isinstance(table, dict):
-        raise MitsimError(f"file {path}: mask: got {table!r}; give a table [mask]")
-    return validate(MaskProfile, table, f"file {path}: [mask]")
+    if not isinstance(table["mask"], dict):
+        raise MitsimError(f"file {path}: mask: got {table['mask']!r}; give a table [mask]")
+    return validate(MaskProfile, table.part("mask"), f"file {path}")
 
 
 def _is_odd_prime(number: int) -> bool:

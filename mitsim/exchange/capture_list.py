@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import Configuration, locate, read_toml, validate
+from mitsim.core.configuration import Configuration, locate, read_table, validate
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import check_plain, read_json
+from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, CORRECTIONS, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
 from mitsim.core.seeds import check_root
@@ -75,9 +75,7 @@ def load_capture_list(name: Path | str) -> CaptureList:
     MitsimError when there is none, or it breaks a rule.
     """
     path = locate(name, "calibration", ".toml")
-    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
-    if not isinstance(data, dict):
-        raise MitsimError(f"list {path}: holds a {type(data).__name__}; give a table of names and values")
+    data = read_table(path, "list")
     for name_of_field, kind in _OTHERS.items():
         if name_of_field in data:
             raise MitsimError(f"list {path}: is {kind}")

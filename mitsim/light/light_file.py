@@ -258,8 +258,8 @@ def _specular(path: Path, light: SampledLight) -> sparse.csr_array | None:
     shining = len(np.unique(light.bench.specular.beams.pixel))
     if shining * rows * columns * 8 > _SPECULAR_BYTES:
         raise MitsimError(
-            f"file {path}: {shining} projector pixels shine over mirrors, and their frames of {rows}x{columns} take "
-            f"more than {_SPECULAR_BYTES >> 30} GiB at once; leave the mirror out, or take a sensor of fewer pixels"
+            f"file {path}: {shining} projector pixels shine over mirrors, in frames of over {_SPECULAR_BYTES >> 30} "
+            f"GiB at {rows}x{columns}; leave the mirror out, or take a sensor of fewer pixels"
         )
     found = light.simulation.specular_frames(light.labels)
     if found is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -14,16 +15,20 @@ import pydantic
 
 from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import Request
-from mitsim.core.configuration import Configuration, refusal
+from mitsim.core.configuration import Configuration
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import table
 from mitsim.core.job import Cost
+from mitsim.core.mistakes import refusal
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 from mitsim.version import __version__
 
 State = Literal["exact", "approximate", "off"]
+LEFT_OUT, WITHOUT, NO_TIME, ONE = "left out, the frames change by", "without it the error", "it takes no time", ", one"
+"""How what a row's reason says of its error begins."""
+_REPEATED = re.compile(f"(^|; )({LEFT_OUT}|{WITHOUT}|{NO_TIME})[^;]*|{ONE} (less than )?[0-9.e+-]+$")
 _REPORTED = (
     "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
     "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour", "notes",
@@ -52,6 +57,11 @@ class PlanRow:
     reason: str
     error_if_off: float | None
     seconds: float
+
+    @property
+    def gist(self) -> str:
+        """The reason without what :attr:`error_if_off` says, or the state where nothing else is said."""
+        return _REPEATED.sub("", self.reason).removeprefix("; ") or self.state
 
 
 @dataclass(frozen=True)

@@ -99,9 +99,8 @@ class EdgeWaves:
         size = count + 2 * reach
         if size > _LARGEST_GRID:
             raise MitsimError(
-                f"diffraction over {product**0.5 * 1e3:.3g} um (sqrt of wavelength x distance) needs a grid of "
-                f"{size:.3g} points, more than {_LARGEST_GRID}; move the mask off the sensor and the scene, or take "
-                "fewer or smaller pixels"
+                f"mask: its diffraction, {product**0.5 * 1e3:.3g} um wide, needs {size:.3g} points, more than "
+                f"{_LARGEST_GRID}; move the mask off the sensor and the scene, or take fewer or smaller pixels"
             )
         x = (np.arange(reach) + 0.5) * step_mm
         wave = edge_wave(x * (2 / product) ** 0.5)
@@ -248,10 +247,9 @@ def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
     """MitsimError for a ``mask`` whose openings are too narrow for scalar waves of ``wavelength_nm``."""
     if mask.opening_mm < narrowest_mm(wavelength_nm):
         raise MitsimError(
-            f"mask of features of {mask.feature_mm:g} mm: its openings are {mask.opening_mm:.3g} mm wide, and "
-            f"diffraction of light of {wavelength_nm:.0f} nm is worked out from {narrowest_mm(wavelength_nm):.3g} mm, "
-            "half a wavelength; give more as feature_mm in the camera file's [mask] or mask_feature in the scene, or "
-            "use --effects=-diffraction"
+            f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {wavelength_nm:.0f} nm needs "
+            f"{narrowest_mm(wavelength_nm):.3g}, half a wavelength; give a larger feature_mm (camera file) or "
+            "mask_feature (scene), or --effects=-diffraction"
         )
 
 

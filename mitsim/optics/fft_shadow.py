@@ -179,9 +179,8 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
     terms = mask.amplitude.most_terms
     if terms * float(points) ** 2 * mask.amplitude.uneven_part > _MOST_WAVE_TERMS:
         raise MitsimError(
-            f"{mask.words}: {len(mask.values)} features a side are in sight, of {terms} terms, and their waves are "
-            f"added up at {points} points a side: minutes for each line of light, before anything is known; use "
-            "--effects=-diffraction for its geometric shadow, or give larger features or fewer pixels"
+            f"{mask.words}: waves of {len(mask.values)} features a side, in {terms} terms, take minutes a line of "
+            "light; use --effects=-diffraction, for its geometric shadow, or give larger features or fewer pixels"
         )
 
 
@@ -287,9 +286,8 @@ def _fields(
     points = points_per_cell(wavelength_nm, distance, step)
     if count * points > _MOST_WAVE_POINTS:
         raise MitsimError(
-            f"mask of {len(shadow.mask.terms)} terms, {shadow.distance_mm:g} mm from the sensor: its waves are squared "
-            f"at {count * points} points a side there, more than {_MOST_WAVE_POINTS}; move it off the sensor, or take "
-            "fewer pixels"
+            f"mask {shadow.distance_mm:g} mm from the sensor: its waves need {count * points} points a side, more than "
+            f"{_MOST_WAVE_POINTS}; move it off the sensor, or take fewer pixels"
         )
     between = max(int(np.ceil(step / points / grid_step(shadow, wavelength_nm))), _GRID_CELLS)
     half = count * step / 2

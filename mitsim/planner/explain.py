@@ -28,7 +28,7 @@ from mitsim.light.cost_model import (
     unit_costs_of,
 )
 from mitsim.light.passes import FOLLOWED
-from mitsim.light.plan import Plan, PlanRow, State
+from mitsim.light.plan import LEFT_OUT, NO_TIME, ONE, WITHOUT, Plan, PlanRow, State
 from mitsim.light.settings import Estimate, PilotResult, Settings
 from mitsim.planner.choose import Candidate, cheapest, predicted_candidate
 from mitsim.transport.missed import polished_shapes
@@ -278,7 +278,7 @@ class _Words:
         """What the total error would be with other ``settings``."""
         other = predicted_candidate(self.accuracy, self.pilot_result, settings, {})
         total = math.hypot(other.systematic.bound, self.chosen.noise)
-        return f"without it the error would be up to {total:.1e}, and {self.accuracy:g} is allowed"
+        return f"{WITHOUT} would be up to {total:.1e}, and {self.accuracy:g} is allowed"
 
     def _anchors(self) -> PlanRow:
         side = self.chosen.settings.anchors
@@ -294,7 +294,7 @@ class _Words:
         left = _error_words(self._number("layers", len(depths)))
         reason = f"the light is seen from {depths[-1]:.0f} to {depths[0]:.0f} mm; {len(depths)} layers leave {left}"
         return PlanRow(
-            "layers", "approximate", f"{reason}, one {_error_words(one)}", one.value, self._seconds(layers=())
+            "layers", "approximate", f"{reason}{ONE} {_error_words(one)}", one.value, self._seconds(layers=())
         )
 
     def _cells(self) -> PlanRow:
@@ -327,7 +327,7 @@ class _Words:
         name, one = count.replace("_", "-"), self._number(count, 1)
         if (chosen := getattr(self.chosen.settings, count)) == 1:
             return PlanRow(name, "off", f"{alone} leaves {_error_words(one)}", one.value, 0.0)
-        reason = f"{several} leave {_error_words(self._number(count, chosen))}, one {_error_words(one)}"
+        reason = f"{several} leave {_error_words(self._number(count, chosen))}{ONE} {_error_words(one)}"
         return PlanRow(name, "approximate", reason, one.value, seconds)
 
     @property
@@ -376,11 +376,11 @@ class _Words:
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
         sentences = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
-        sentences.append(f"left out, the frames change by {_error_words(error)}")
+        sentences.append(f"{LEFT_OUT} {_error_words(error)}")
         takes_time = name in costly_effects()
         if on and name not in self.switches:
             less = replace(settings, effects=settings.effects - {name})
-            sentences.append(self._without(less) if takes_time else "it takes no time")
+            sentences.append(self._without(less) if takes_time else NO_TIME)
         seconds = self._seconds(effects=settings.effects - {name}) if on and takes_time else 0.0
         return PlanRow(name, state, "; ".join(filter(None, sentences)), error.value, seconds)
 
@@ -416,7 +416,7 @@ def _fixed_rows(facts: SceneFacts) -> tuple[PlanRow, ...]:
     )
     noise = "Poisson, full well, read noise and quantisation of each frame"
     return (
-        PlanRow("keystone", "exact" if facts.keystone else "off", keystone, None, 0.0),
+        PlanRow("keystone", "exact" if facts.keystone else "off", keystone, None if facts.keystone else 0.0, 0.0),
         facts.spectrum,
         PlanRow("sensor-noise", "exact", noise, None, 0.0),
     )

@@ -355,9 +355,8 @@ def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
     if times > 1 and hits * more.direct < _FEWEST_IN_RUN:
         n, side = bench.n, math.sqrt(hits)
         raise MitsimError(
-            f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of a "
-            f"projector pixel ({side:.1e} of one a side), of {n} x {n}, and would be met by too few rays; give the "
-            "projector a narrower fov, or a larger target"
+            f"what the camera sees is too small for the projector's light: all that it lights fills {hits:.1e} of one "
+            f"of {n} x {n} projector pixels ({side:.1e} a side); give the projector a narrower fov, or a larger target"
         )
     return more
 

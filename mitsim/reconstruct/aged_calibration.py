@@ -298,9 +298,8 @@ class _AgedCamera:
         best = max(likeness, key=lambda turn: likeness[turn][0])
         if 1 - likeness["upright"][0] ** 2 > _CLEARER * (1 - likeness[best][0] ** 2):
             raise MitsimError(
-                f"list {name}: pictures lie {best} of how images by the calibration lie: frames correlate by "
-                f"{likeness[best][0]:.3f} with those of pictures that lie so, and by {likeness['upright'][0]:.3f} with "
-                "those of these; save the pictures so"
+                f"list {name}: the calibration's images lie {best} beside these pictures: frames correlate by "
+                f"{likeness[best][0]:.3f} so, as they are by {likeness['upright'][0]:.3f}; save the pictures {best}"
             )
         move = np.array([*likeness["upright"][1], 0.0])
         guess = _Moved(move, dict.fromkeys(self.factors, 1.0), np.zeros((3 + len(self.factors),) * 2))

@@ -284,9 +284,9 @@ def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
     values, digital = session.read(first.file), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
         raise MitsimError(
-            f"frames {session.folder}: no number of {first.file}, a uniform frame, is above {values.max():g}, and its "
-            f"list states digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
-            f"{digital.dark_current_e_per_s:g}, which leave no light; state levels in the numbers of the files"
+            f"frames {session.folder}: {first.file}, a uniform frame, reaches {values.max():g}, and the list's "
+            f"digital.black_level_dn {digital.black_level_dn:g} and dark_current_e_per_s "
+            f"{digital.dark_current_e_per_s:g} leave no light of it; state them in the files' numbers"
         )
 
 

@@ -110,15 +110,17 @@ class Misfit:
     defects: Defects | None = None
     detail: float = 0.0
 
+    @property
+    def gist(self) -> str:
+        """The misfit in a few words."""
+        return f"chi-square {chi_square_text(self.chi_square)} a datum"
+
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
         cause = f"; likely cause: {self.reason}" if self.cause else ""
         defects = f"; {self.defects}" if self.defects else ""
         detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
-        return (
-            f"misfit: chi-square {chi_square_text(self.chi_square)} a datum{noise}, "
-            f"{self.unexplained:.1e} unexplained{detail}{cause}{defects}"
-        )
+        return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{detail}{cause}{defects}"
 
     @property
     def reason(self) -> str:

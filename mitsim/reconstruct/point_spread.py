@@ -101,9 +101,8 @@ class ShiftedLight:
         for size, most in zip(self.sensor, self._whole, strict=True):
             if size > most:
                 raise MitsimError(
-                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light of {self.scene[0]} x {self.scene[1]} "
-                    f"scene pixels reaches {self._whole[0]} x {self._whole[1]} of them; give a point spread function "
-                    "of the frames' pixels, or patterns of more"
+                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self._whole[0]} x "
+                    f"{self._whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
                 )
 
     @property

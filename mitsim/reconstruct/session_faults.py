@@ -597,9 +597,8 @@ def check_session(
     if too_many(len(patterns), count):
         first = faults[0]
         raise MitsimError(
-            f"{len(patterns)} of {2 * count} patterns of the session are not what they should be, first {first.side} "
-            f"stripes {first.index}: {first.detail}; too many to leave out: check the order of the frames, and take "
-            "the session again"
+            f"{len(patterns)} of {2 * count} patterns are not what they should be, too many to leave out; the first, "
+            f"{first.side} stripes {first.index}: {first.detail}; check the frames' order, and take them again"
         )
     return CheckedSession(
         (work[0].result(), work[1].result()),

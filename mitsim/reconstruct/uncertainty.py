@@ -358,11 +358,16 @@ class Uncertainty:
             "smaller lambda."
         )
 
+    @property
+    def gist(self) -> str:
+        """The uncertainty of the whole image in a few words."""
+        return f"standard uncertainty {_rms(self.total):.1e} rms"
+
     def __str__(self) -> str:
         parts = sorted(((value, name) for name, value in self.budget.items() if value), reverse=True)
         by_source = ", ".join(f"{name.replace('_', ' ')} {value:.1e}" for value, name in parts)
         known = f"; extrapolated: it is known to a factor of {self.bias_factor:.1f}" if self.extrapolated else ""
-        return f"standard uncertainty {_rms(self.total):.1e} rms: {by_source or 'no noise is stated'}{known}"
+        return f"{self.gist}: {by_source or 'no noise is stated'}{known}"
 
     def channels(self) -> dict[str, Channel]:
         """(n, n') channels of uncertainty.exr."""

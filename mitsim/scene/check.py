@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 import pydantic
 
+from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene import limits
 from mitsim.scene.headers import MOST_TEXELS, check_image, check_obj, check_ply
@@ -251,11 +252,16 @@ class _Tree:
         try:
             CameraGeometry(**values)
         except pydantic.ValidationError as error:
-            problem = error.errors(include_url=False)[0]
-            name = str((*problem["loc"], "mask_distance")[0])
-            got = values.get(name, "its default")
-            shown = repr(got) if isinstance(got, str) else f"{got:g}"
-            raise self.outline.tag(node, name).refusal(name, shown, problem["msg"]) from None
+            found = []
+            for problem in error.errors(include_url=False):
+                name = str((*problem["loc"], "mask_distance")[0])
+                got = values.get(name, "its default")
+                shown = repr(got) if isinstance(got, str) else f"{got:g}"
+                found.append(self.outline.tag(node, name).refusal(name, shown, problem["msg"]))
+            if len(found) == 1:
+                raise found[0] from None
+            head = f"{self.outline.path}: the camera has {len(found)} mistakes:"
+            raise MitsimError(head, *map(str, found)) from None
 
     def _check_sizes(self) -> None:
         """What references unfold to is neither deep nor large."""

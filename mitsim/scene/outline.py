@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.parsers import expat
 
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import MitsimError, cut, near_name
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -111,11 +111,17 @@ class Outline:
                     f"parameter {cut(name)}={cut(value)!r}: give a plain value without $, backslash or line breaks"
                 )
         self._read(files.scene(path), path.parent, ())
-        for name in defines:
-            if name not in self._defaults or name in ("config", "filename"):  # Mitsuba's own arguments
-                known = ", ".join(sorted(self._defaults)) or "none"
-                place = f"{path} has no <default name={cut(name)!r}>"
-                raise MitsimError(f"parameter {cut(name)}={cut(defines[name])}: {place}; it knows {known}")
+        known = ", ".join(sorted(self._defaults)) or "none"
+        unknown = [
+            f"parameter {cut(name)}={cut(value)}: {path} has no <default name={cut(name)!r}>; "
+            f"{near_name(name, self._defaults)}"
+            for name, value in defines.items()
+            if name not in self._defaults or name in ("config", "filename")  # Mitsuba's own arguments
+        ]
+        if len(unknown) == 1:
+            raise MitsimError(f"{unknown[0]}it knows {known}")
+        if unknown:
+            raise MitsimError(f"{path}: {len(unknown)} parameters are unknown; it knows {known}:", *unknown)
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
         """The tag of the object ``node``, or that of its property ``name``."""

@@ -123,8 +123,8 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
     maps = _Maps.of(taken, images)
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
-            f"light differs by {100 * maps.uneven:.0f} % over the frame, so its pixels saturate at other exposures; at "
-            f"most {100 * _MOST_UNEVEN:.0f} % is possible; move the lamp away, or cut frames to what it lights evenly"
+            f"light differs by {100 * maps.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
+            "possible; move the lamp away, or cut frames to what it lights evenly"
         )
     wide = math.sqrt(max(*maps.responses().values, 0.0))
     if wide > _MOST_RESPONSE:

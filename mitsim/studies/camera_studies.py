@@ -201,8 +201,8 @@ def _resolution_measure(studio: Studio, point: Point) -> Found:
     own = float(frequency) * pixel_mm
     if own < _SHOWN_CYCLES and (there := _contrast(lit.truth, own)) < _SHOWS:
         raise MitsimError(
-            f"scene {point.setup.scene}: bars of {frequency} line pairs a mm show a contrast of {there:.2f} in its "
-            f"truth; the study needs a print {PRINT_MM:g} mm wide, flat and facing the camera, that fills the image"
+            f"scene {point.setup.scene}: bars of {frequency} line pairs a mm have a contrast of {there:.2f} in its "
+            f"truth; give a print {PRINT_MM:g} mm wide, flat and facing the camera, that fills the image"
         )
     extremes = float(np.mean([contrast(*half) for half in _halves(image.image)]))
     row |= {"pairs_a_mm": float(frequency), "contrast": _contrast(image.image, own), "contrast_of_extremes": extremes}

@@ -76,7 +76,7 @@ class DemoResult:
             for name, value in self.psnr.items()
         ]
         truth = f"The truth is good to {-20 * math.log10(self.truth_error):.1f} dB."
-        return [*table, f"{self.verdict}.", *([truth] if self.truth_error else ()), f"Report: {self.report}"]
+        return [f"{self.verdict}.", f"Report: {self.report}", *table, *([truth] if self.truth_error else ())]
 
 
 def demo(bench: Bench, output: Path | str, request: Request | None = None, job: Job | None = None) -> DemoResult:

@@ -126,7 +126,7 @@ class DiffractionFindings(Findings):
             f"{row.psnr_db:5.1f} dB, {row.psnr_best_db:5.1f} dB with the best lambda; residual {row.residual:.1e}"
             for row in self.quality
         ]
-        return [*shadows, *quality, f"{self.verdict}."]
+        return [f"{self.verdict}.", *shadows, *quality]
 
     @property
     def verdict(self) -> str:

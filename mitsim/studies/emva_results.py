@@ -218,6 +218,8 @@ class Characterisation:
         counts = self.frames.shape, len(self.session.lit), len(self.session.unlit)
         (m, n), lit, unlit = counts
         lines = [f"{self.camera}: {m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"]
+        if self.output:
+            lines.append(f"JSON, plots and the camera found, camera.toml: {self.output}")
         lines += text_table(head, rows)
         if any(row.expected is not None for row in self.rows):
             figure = "the camera has" if self.real else "the one set"
@@ -232,10 +234,7 @@ class Characterisation:
         ]  # fmt: skip
         beside = ("set",) if not self.real else ()
         head = ("camera found", "unit", *beside, "found", "std. error", *(("off by",) if beside else ()))
-        lines += ["", *text_table(head, fields), *self.found.notes]
-        if self.output:
-            lines.append(f"JSON, plots and the camera found, camera.toml: {self.output}")
-        return lines
+        return [*lines, "", *text_table(head, fields), *self.found.notes]
 
 
 def _set(frames: Frames, name: str) -> float:

@@ -225,9 +225,8 @@ def _check_noise(where: str, sets: Sequence[FlatSet]) -> None:
     part = (means[saturation_of([each.taken for each in sets])[0]] - min(means)) / (max(means) - min(means))
     if part < _PEAK:
         raise MitsimError(
-            f"{where}: variances do not rise with means as those of counted electrons, the largest is at "
-            f"{100 * part:.0f} % of the brightest signal; a gamma curve, compression or codes coarser than the noise "
-            "do that; give raw frames of more bits, or of a higher gain"
+            f"{where}: the variance is largest at {100 * part:.0f} % of the brightest signal, not near it, as after "
+            "a gamma curve, compression or too coarse codes; give raw frames of more bits, or of a higher gain"
         )
 
 

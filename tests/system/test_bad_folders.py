@@ -149,9 +149,9 @@ NAN = float("nan")
     ("change", "fragments"),
     [
         (put("status", value="incomplete"), ["incomplete", "resume"]),
-        (drop("patterns"), ["patterns: got nothing"]),
-        (drop("digital"), ["digital: got nothing"]),
-        (drop("camera"), ["camera: got nothing"]),
+        (drop("patterns"), ["patterns: is missing"]),
+        (drop("digital"), ["digital: is missing"]),
+        (drop("camera"), ["camera: is missing"]),
         (put("camera", value="mine"), ["camera: got 'mine'"]),
         (drop("patterns", "P_L"), ["P_L"]),
         (put("patterns", "P_R", value=[[1, 0], [1]]), ["P_R"]),
@@ -196,7 +196,7 @@ def test_a_run_manifest_with_a_mistake(
     ("change", "fragments"),
     [
         (put("status", value="incomplete"), ["incomplete"]),
-        (drop("camera"), ["camera: got nothing"]),
+        (drop("camera"), ["camera: is missing"]),
         (drop("camera", "sensor"), ["sensor", "None"]),
         (put("centre", value="no"), ["centre", "'no'"]),
         (put("checksums", "left.exr", value="0" * 64), ["left.exr", "checksum"]),

@@ -183,7 +183,7 @@ def test_what_the_command_says_of_measured_frames(call: Callable[..., Any], tmp_
     frames = session.write(tmp_path / "frames")
     done = call("calibrate", "--frames", "frames", "-o", "cal", cwd=tmp_path)
     assert done.code == 0 and done.err == "", done.err
-    assert done.out.startswith("16 frames of 4 stripes in ") and "\nnot known: parallax: " in done.out
+    assert done.out.startswith("16 frames of 4 stripes in ") and "\nNot known: parallax: " in done.out
     full = session.frame(np.ones((4, 4)))
     full[0, 0] = 4095
     write_image(frames / "f_0.png", full)

@@ -117,7 +117,7 @@ class CampaignResult:
         heads = self.section.experiment.heads if self.section else HEADS
         lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
         lines += self.section.warnings if self.section else ()
-        return [*lines, f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}"]
+        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
 
 def run_experiment(

@@ -90,7 +90,7 @@ class StudyResult:
 
     def lines(self) -> list[str]:
         """For people."""
-        return [*self.findings.lines(), f"JSON and plots: {self.output}"]
+        return [f"JSON and plots: {self.output}", *self.findings.lines()]
 
     @property
     def warnings(self) -> Sequence[str]:

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from mitsim.cli import screen
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Clock, Job
+from mitsim.core.job import Clock, Cost, Job
+from mitsim.light.plan import Plan, PlanRow, State
 
 
 @pytest.fixture
@@ -190,21 +191,102 @@ def test_no_control_character_of_a_file_reaches_the_terminal(capsys: pytest.Capt
     assert "\x1b" not in capsys.readouterr().err
 
 
-def test_names_in_a_plan_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    """A surface that a scene calls "[/]" was an error of rich. (Planted: markup read.)"""
+ROWS = [
+    ("anchors", "approximate", "falloff, gloss and parallax: 3x3 anchors leave 2.8e-06, one 1.3e-03", 1.3e-3),
+    ("layers", "approximate", "the light is seen from 364 to 450 mm; 3 layers leave 2.0e-05, one 6.6e-03", 6.6e-3),
+    ("cells", "approximate", "4x4 cells of even light a projector pixel leave 1.6e-04", 2.2e-3),
+    (
+        "followed-anchors", "approximate",
+        "light over several surfaces, in mirrors and of lamps: 3x3 in cells of 4x4 pixels leave 1.9e-04, one 4.3e-04",
+        4.3e-4,
+    ),
+    (
+        "occluded-anchors", "approximate",
+        "101 projector pixels are hidden from part of the sensor: 8x8 anchors leave 2.3e-04, one 6.7e-03", 6.7e-3,
+    ),
+    (
+        "interreflection", "exact",
+        "left out, the frames change by 5.6e-02; without it the error would be up to 6.2e-02, and 0.001 is allowed",
+        5.6e-2,
+    ),
+    ("mirrors", "off", "no surface reflects or transmits light in single directions", 0.0),
+    (
+        "diffraction", "exact",
+        "a mask feature's Fresnel number is 3.2 at 562 nm, 3 lines; left out, the frames change by 7.9e-02; without it "
+        "the error would be up to 7.9e-02, and 0.001 is allowed", 7.9e-2,
+    ),
+    ("blur", "off", "the projector's pixels are sharp", 0.0),
+    ("black-level", "exact", "left out, the frames change by 6.0e-04; it takes no time", 6e-4),
+    ("spectrum", "off", "one panchromatic reflectance; what that leaves out: --colour auto", None),
+    ("sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None),
+]  # fmt: skip
+"""Of cookie_bag, as `mitsim plan` has them."""
 
-    class Row:
-        name, state, reason, error_if_off, seconds = "gloss", "exact", f"of {HOSTILE}", 0.1, 1.0
 
-    class Plan:
-        accuracy, effects, predicted, predicted_seconds = 1e-3, (Row,), {"plan": 1.0}, 1.0
-        range_words = "nine of ten such runs take 1 to 5 s."
-        colour = asked_seconds = cost = None
-        notes = ("cells are chosen safely",)
+def plan_of(*more: tuple[str, str, str, float | None], **fields: Any) -> Plan:
+    """A plan at 1e-3 of these rows, and ``more``."""
+    rows = tuple(PlanRow(name, cast(State, state), reason, error, 0.5) for name, state, reason, error in (*ROWS, *more))
+    seconds = {"transport": 3.76, "truth": 0.41, "optics": 1.2, "plan": 1.4, "start": 1.1}
+    return Plan(
+        1e-3, rows, 7.6, cast(Any, None), 5e-4, 4e-4, 5e-4, (), seconds, cost=Cost(7.6, 2.5 * 2**30, 1e8), **fields
+    )
 
-    screen.print_plan(cast(Any, Plan))
+
+def test_a_plan_says_first_what_it_comes_to_and_fits_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """24 lines of 80; no reason is cut. (Planted: no room kept for the end; what is off and leaves nothing shown.)"""
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = screen.plan_lines(plan_of())
+    assert lines[0] == "Plan at accuracy 0.001: 7.6 s, error up to 7.1e-04"
+    printed = [part for line in lines for part in screen.wrap_text(line)]
+    assert len(printed) <= 24 and max(map(len, printed)) <= 80
+    text = " ".join(" ".join(printed).split())
+    assert not any(line.startswith(("mirrors", "blur")) for line in lines)
+    assert [line.split()[0] for line in lines if " exact" in line] == ["interreflection", "black-level"]
+    assert "diffraction 7.9e-02 0.50 a mask feature's Fresnel number is 3.2 at 562 nm, 3 lines interref" in text
+    assert "3x3 in cells of 4x4 pixels leave 1.9e-04 left out" in text
+    assert text.endswith("start 1.1 At most 2.5 GiB of memory, 95.4 MiB of disk")
+    assert "left out error if off seconds why spectrum - 0.50 one panchromatic" in text
+    assert "No room for sensor-noise, and for 2 that nothing calls for (--all)" in text
+
+
+def test_what_is_left_out_is_named_within_two_decades_of_the_accuracy() -> None:
+    """(Planted: one decade, and three.)"""
+    text = "\n".join(screen.plan_lines(plan_of(("glare", "off", "small", 1.1e-5), ("speckle", "off", "less", 0.9e-5))))
+    assert "\nglare " in text and "speckle" not in text and "3 that nothing calls for" in text
+
+
+def test_rows_beyond_a_screen_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The least ones. (Planted: all shown, 31 lines.)"""
+    monkeypatch.setenv("COLUMNS", "80")
+    more = [(f"effect-{k}", "exact", "for a reason of its own", 10.0**-k) for k in range(1, 9)]
+    lines = screen.plan_lines(plan_of(*more))
+    assert sum(len(screen.wrap_text(line)) for line in lines) <= 24
+    (unshown,) = (line for line in lines if line.startswith("No room for"))
+    assert "effect-8" in unshown and "effect-1," not in unshown
+
+
+def test_all_of_a_plan_has_every_row_with_its_whole_reason() -> None:
+    lines = screen.plan_lines(plan_of(), everything=True)
+    assert all(f"    {reason}" in lines for _, _, reason, _ in ROWS)
+    assert [line.split()[0] for line in lines[2::2]][: len(ROWS)] == [name for name, *_ in ROWS]
+
+
+def test_names_in_a_plan_are_printable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A surface that a scene calls "[/]" was an error of rich. (Planted: printed as it is.)"""
+    made = plan_of(("gloss", "exact", f"of {HOSTILE}", 0.5), notes=("cells are chosen safely",))
+    screen.finish(False, {}, screen.plan_lines(made), ())
     out = capsys.readouterr().out
-    assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and Plan.range_words in out and Plan.notes[0] in out
+    assert "\x1b]" not in out and "[/]" in out.replace("\n", "") and made.notes[0] in out
+
+
+def test_lines_are_as_wide_as_the_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """80 characters where there is none; a path is not broken. (Planted: printed as they are.)"""
+    monkeypatch.delenv("COLUMNS", raising=False)
+    path = "/a-folder/" * 9
+    screen.finish(False, {}, ["word " * 40, f"Image: {path}", "", "a  " * 40], ())
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines[:3])) <= 80 and len(lines) == 7
+    assert f"  {path}" in lines and lines[-2:] == ["", "a  " * 40]
 
 
 def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.MonkeyPatch) -> None:

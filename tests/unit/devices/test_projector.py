@@ -27,7 +27,7 @@ def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path)
     """`blur_pixel = 3` was ignored, and the projector was sharp."""
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\neffective_wavelength_nm = 550\nblur_pixel = 3\n')
-    with pytest.raises(MitsimError, match=r"mine\.toml: blur_pixel: got 3, no such field; did you mean blur_pixels\?"):
+    with pytest.raises(MitsimError, match=r"mine\.toml:3: blur_pixel: got 3, no such .* mean blur_pixels\?"):
         load_model(path, ProjectorModel)
     path.write_text('name = "mine"\neffective_wavelenght_nm = 550\n')
     with pytest.raises(MitsimError, match=r"effective_wavelenght_nm: [^;]*; did you mean effective_wavelength_nm\?"):
@@ -37,18 +37,18 @@ def test_a_mistyped_field_is_refused_with_the_field_it_resembles(tmp_path: Path)
 @pytest.mark.parametrize(
     ("field", "value", "rule"),
     [
-        ("blur_pixels", 300.0, "range: 0 to 16"),
-        ("blur_pixels", True, "range: 0 to 16"),
-        ("aperture_radius_mm", 1e4, "range: 0 to 1000"),
-        ("focus_mm", 0.0, r"range: 1 to 1e\+07"),
-        ("focus_mm", math.inf, "finite"),
-        ("speckle_contrast", 1.5, "range: 0 to 1"),
-        ("effective_wavelength_nm", 0.0, r"range: 1 to 1e\+06"),
+        ("blur_pixels", 300.0, "give 0 to 16"),
+        ("blur_pixels", True, "give a number, 0 to 16"),
+        ("aperture_radius_mm", 1e4, "give 0 to 1000"),
+        ("focus_mm", 0.0, r"give 1 to 1e\+07"),
+        ("focus_mm", math.inf, r"give 1 to 1e\+07"),
+        ("speckle_contrast", 1.5, "give 0 to 1"),
+        ("effective_wavelength_nm", 0.0, r"give 1 to 1e\+06"),
         ("contrast_ratio", 1.0, "greater than 1"),
         ("ansi_contrast", 1.0, "greater than 1"),
-        ("glare_spread", 0.0, "range: 0.1 to 2"),
-        ("luminous_efficacy_lm_per_w", 900.0, "range: 0 to 684"),
-        ("columns", 1920.0, "integer"),
+        ("glare_spread", 0.0, "give 0.1 to 2"),
+        ("luminous_efficacy_lm_per_w", 900.0, "give 0 to 684"),
+        ("columns", 1920.0, "give a whole number"),
         ("laser_class", "5", "'3R'"),
         ("derived", ["blur"], "'blur' is none"),
         ("wavelengths_nm", [550.0], "one share a line"),

@@ -247,8 +247,8 @@ def listing(**more: object) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (turned, "pictures lie turned of how images by the calibration lie"),
-        (transposed, "pictures lie transposed of how images by the calibration lie"),
+        (turned, "the calibration's images lie turned beside these pictures"),
+        (transposed, "the calibration's images lie transposed beside these pictures"),
         (with_camera, "name is .*another.*calibrate this camera"),
         (listing(orientation="upright"), "orientation is of codes.*leave orientation out"),
         (listing(centre=True), "centre is True, but False in calibration"),

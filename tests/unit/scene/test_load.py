@@ -165,7 +165,28 @@ def test_a_dtd_is_refused(tmp_path: Path, dtd: str) -> None:
 
 def test_an_unknown_define_lists_the_known(small_scene: Write) -> None:
     message = refusal(small_scene(), {"albdo": "1"})
-    assert "albdo=1" in message and "it knows albedo" in message
+    assert "albdo=1" in message and "did you mean albedo? it knows albedo" in message
+
+
+def told(path: Path, defines: dict[str, str] | None = None) -> list[str]:
+    with pytest.raises(MitsimError) as caught:
+        load_scene(path, defines or {})
+    return str(caught.value).split("\n")
+
+
+def test_all_unknown_defines_are_told_at_once(small_scene: Write) -> None:
+    """(Planted: the first alone.)"""
+    head, *lines = told(small_scene(), {"albdo": "1", "albedo": "1", "nothing": "2"})
+    assert "2 parameters are unknown; it knows albedo" in head
+    assert [line.split(":")[0].strip() for line in lines] == ["parameter albdo=1", "parameter nothing=2"]
+
+
+def test_all_mistakes_of_a_camera_are_told_at_once(small_scene: Write) -> None:
+    """(Planted: the first alone.)"""
+    path = replaced(small_scene(), '"mask_distance" value="2"', '"mask_distance" value="-2"')
+    head, *lines = told(replaced(path, 'value="separable"', 'value="seperable"'))
+    assert head.endswith("the camera has 2 mistakes:")
+    assert sorted(line.split(": ")[1] for line in lines) == ["mask", "mask_distance"]
 
 
 def replaced(path: Path, old: str, new: str) -> Path:

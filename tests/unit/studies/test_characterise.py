@@ -158,7 +158,7 @@ def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "found" / "characterise.json").read_text())
     assert written["kind"] == "characterise" and written["pixels"] == 32
     assert [figure["name"] for figure in written["figures"]] == [row.name for row in done.rows]
-    assert done.lines()[-1] == f"JSON, plots and the camera found, camera.toml: {tmp_path / 'found'}"
+    assert done.lines()[1] == f"JSON, plots and the camera found, camera.toml: {tmp_path / 'found'}"
     assert load_sensor(tmp_path / "found" / "camera.toml") == done.found.sensor
 
 

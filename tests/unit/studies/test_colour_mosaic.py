@@ -115,7 +115,9 @@ def test_the_command_line_tells_of_every_line(
     reported = json.loads(capsys.readouterr().out)
     assert [line["name"] for line in reported["channels"]] == ["638nm", "520nm", "445nm"]
     assert reported["mosaic"] == "joint" and reported["steps"] > 0 and reported["lambda"] > 0
-    assert main([*command, "--mosaic", "half", "--overwrite"]) == 1, "planes that see several lines have no camera"
+    assert main([*command, "--mosaic", "half", "--overwrite", "--verbose"]) == 1, (
+        "planes that see several lines have no camera"
+    )
     half = capsys.readouterr()
     assert "half: lambda" in half.out and "Misfit" in half.err
 

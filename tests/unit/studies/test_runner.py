@@ -49,7 +49,7 @@ def test_a_study_is_its_measure_and_the_runner_does_the_rest(tmp_path: Path) -> 
     payload = {"rows": [1.0], "scene": "scene.xml", "patterns": "dots:7", "output": str(tmp_path / "out")}
     assert result.payload() == payload and payload.items() <= written.items()
     assert written["kind"] == "toy" and written["seed"] == 4 and "mitsim" in written["versions"]
-    assert result.lines()[0] == "It is 1." and str(tmp_path / "out") in result.lines()[1]
+    assert result.lines()[1] == "It is 1." and str(tmp_path / "out") in result.lines()[0]
 
 
 class Doubtful(Toy):
