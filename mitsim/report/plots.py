@@ -55,8 +55,10 @@ _HANDLE = 0.6
 """Inches of a line in a legend, and of the room beside its name."""
 ROW = 0.27
 """Inches of a row of bars: a line of text, and a third of one between two."""
-_UPRIGHT_LETTERS = 26
-"""Of a line along a panel of curves."""
+_NAME_LETTERS = 34
+"""Of a line of the name of a bar: half of the figure is left for bars."""
+_UPRIGHT_LETTERS, _TITLE_LETTERS = 26, 46
+"""Of a line along a panel of curves, and above it."""
 LOGARITHMIC = 30.0
 """Largest over least value from which an axis is logarithmic: on a linear one the smaller half of its decades lies
 within a dot of nothing."""
@@ -126,7 +128,7 @@ def curves(
     if labels:
         legend_below(figure, [shown_by_name[name] for name in labels], labels)
     if title:
-        figure.suptitle(fill(title, int(COLUMN / _LETTER)), fontsize=FONT + 1)
+        figure.suptitle(fill(title, _TITLE_LETTERS), fontsize=FONT + 1)
     return figure
 
 
@@ -213,7 +215,7 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
         name of the axis, with its unit.
     """
     ordered = sorted(values.items(), key=lambda item: item[1][0].value)
-    figure, axes = figure_of(0.9 + ROW * len(ordered), _BARS)
+    figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
     rows = np.arange(len(ordered))
     first, second = (
         np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
@@ -238,7 +240,7 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
     """
     values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
     ordered = sorted(values, key=lambda value: value[0].value)
-    figure, axes = figure_of(1.2 + ROW * len(ordered), _BARS)
+    figure, axes = figure_of(1.2 + _rows_height(name for _, name, _ in ordered), _BARS)
     for colour, kind in zip((BLUE, PALE), kinds, strict=False):
         own = [(row, mean) for row, (mean, _, of) in enumerate(ordered) if of == kind]
         if own:
@@ -450,7 +452,7 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
         axes.set(xscale="log", yscale="log", xmargin=0.2)
         axes.set_title(title, fontsize=FONT)
         log_ticks(axes)
-        label_axes(axes, "wall time [s]", fill(error, _UPRIGHT_LETTERS))
+        label_axes(axes, "wall time [s]" if axes is places[-1, 0] else "", fill(error, _UPRIGHT_LETTERS))
     for text, level in (levels or {}).items():
         where: Any = places[0, 0].get_yaxis_transform()
         places[0, 0].axhline(level, color=GREY, lw=1.5, ls="--")
@@ -474,11 +476,17 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:
     """Names of bars, from below, and a legend above the axes, where no bar is, of two or more kinds."""
-    axes.set_yticks(range(len(names)), [typeset(name) for name in names])
+    axes.set_yticks(range(len(names)), [fill(typeset(name), _NAME_LETTERS) for name in names])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(names) - 0.4)
     if len(axes.get_legend_handles_labels()[0]) > 1:
         axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+
+
+def _rows_height(names: Iterable[str]) -> float:
+    """Inches of rows of bars with these ``names``, all as high as the one of the most lines."""
+    lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
+    return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
@@ -521,7 +529,7 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    """A legend below a figure, in as many columns as its width has room for.
+    """A legend below a figure, in as many columns as its width has room for; none without names.
 
     Parameters
     ----------
@@ -531,6 +539,8 @@ def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
         matplotlib's.
     """
     names = list(labels)
+    if not names:
+        return
     room = figure.get_figwidth() / (_HANDLE + _LETTER * max(map(len, names)))
     columns = max(min(int(room), len(names)), 1)
     figure.legend(handles, names, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)

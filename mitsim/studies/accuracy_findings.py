@@ -166,6 +166,9 @@ class JudgeFacts:
         return float((self.mc_error**2 + self.systematic_error**2) ** 0.5)
 
 
+# -------- All rows in, text, figures and page out
+
+
 @dataclass(frozen=True)
 class AccuracyFindings(Findings):
     """All that was measured, and what did not fit in the time.
@@ -249,7 +252,7 @@ class AccuracyFindings(Findings):
         own = [row for row in self.rows if self.quoted in row.accuracies]
         run = f"At {self.quoted:g} a run takes {own[0].spread.median:.1f} s" if own else ""
         speedup = self.speedup_at_equal_error
-        more = f"the reference would take {speedup:.0f} times as long as its light for that error" if speedup else ""
+        more = f"the reference would take {float(f'{speedup:.2g}'):g} times as long as its light" if speedup else ""
         return "; ".join(part for part in (run, more) if part)
 
     def parts(self) -> Sequence[Part]:

@@ -134,7 +134,7 @@ class DiffractionFindings(Findings):
         """Of the page: images, and shadows."""
         images = [
             (row.frames, row.mask, row.light, label(row.patterns), row.factors, f"{row.psnr_db:.1f}",
-             f"{row.psnr_best_db:.1f}", f"{self.loss_db(row):.1f}", f"{row.residual:.1e}")
+             f"{row.psnr_best_db:.1f}", f"{round(self.loss_db(row), 1) + 0.0:.1f}", f"{row.residual:.1e}")
             for row in self.quality
         ]  # fmt: skip
         shadows = [
@@ -296,8 +296,8 @@ class _Trials:
 
 # -------- Figures
 
-_TITLE_LETTERS = 100
-"""Of a line above a figure of the page's width."""
+_TITLE_LETTERS = 66
+"""Of a line above a figure of bars."""
 
 
 def quality_by_factors(rows: Sequence[QualityRow], message: str) -> Figure:

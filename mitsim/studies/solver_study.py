@@ -66,10 +66,10 @@ class SolverFindings(Findings):
             f"lambda {row.lambda_rel:.0e} {row.method:>4} {row.layout:<5} {row.precision:<16} {row.seconds:7.3f} s "
             f"({row.seconds:.3f} to {row.most_s:.3f}, {row.repeats} runs)  error {row.error:.1e}"
             f"{'  *' if row in best else ''}"
-            for row in self._ordered()
+            for row in self._by_time()
         ] + ["* nothing measured is as good in less time"]
 
-    def _ordered(self) -> list[SolverRow]:
+    def _by_time(self) -> list[SolverRow]:
         return sorted(self.rows, key=lambda row: (-row.lambda_rel, row.seconds))
 
     def _best(self) -> list[SolverRow]:
@@ -86,7 +86,7 @@ class SolverFindings(Findings):
         rows = [
             (f"{row.lambda_rel:.0e}", row.method, row.layout, row.precision, f"{row.seconds:.3f}",
              f"{row.error:.1e}", "best for its time" if row in best else "")
-            for row in self._ordered()
+            for row in self._by_time()
         ]  # fmt: skip
         return [
             Part(

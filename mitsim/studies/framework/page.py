@@ -73,7 +73,7 @@ class Section:
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
             message=experiment.message(results) or tally(claims),
             claims=tuple(claims),
-            pictures={name: page_figure(figure) for name, figure in figures.items()},
+            pictures={name: page_figure(figures[name]) for name in sorted(figures, key=_images_first)},
             count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
             tables=tuple(experiment.tables(results)),
@@ -131,6 +131,10 @@ def tally(claims: Sequence[Claim]) -> str:
     )
     kinds = [f"{counts[kind]} {kind}" for kind in (CONFIRMED, _IN_PART, NOT_CONFIRMED, _NOT_DECIDED) if counts[kind]]
     return f"{len(claims)} claim{'s' * (len(claims) > 1)}: {', '.join(kinds)}" if claims else ""
+
+
+def _images_first(file: str) -> bool:
+    return not file.startswith("images")
 
 
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
