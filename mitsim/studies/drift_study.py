@@ -632,7 +632,7 @@ def _images(results: Results) -> dict[str, Figure]:
     for name, rows in dearest[:_SHOWN]:
         row = rows.rows[0]
         truth = results.array(row, TRUTH)
-        kept = ((results.array(row, array), row[column]) for array, column in _ARRAYS.items())
+        kept = ((results.array(row, array), row.get(column)) for array, column in _ARRAYS.items())
         cells = [(image, truth, f"{level:.1f} dB") for image, level in kept if image is not None]
         if len(cells) == len(_ARRAYS):
             grid[name] = cells

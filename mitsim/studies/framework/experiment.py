@@ -220,7 +220,7 @@ class Results:
 
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
         """The array ``name`` that was kept with a ``row``."""
-        return self.arrays.get((str(row["point"]), name))
+        return self.arrays.get((str(row.get("point")), name))
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ STUDIES = (
     "convolutional", "depth", "drift", "models", "waterfall", "sweep",
 )  # fmt: skip
 KNOBS = ("sheet_z", ("390", "400", "410")), ("patterns", ("dots:4", "dots:7"))
+OTHERS = "spectrum", "without the drift"
+"""Arrays of the studies of patterns and of drift."""
 SCOPE = Scope(Setup(), QUICK_IMAGES, quick=True, measures=("psnr", "lambda"))
 
 
@@ -85,7 +87,7 @@ def invented(name: str) -> Results:
     rows = [row for point in points for row in rows_of(point, rng)]
     if name == "waterfall":
         rows = [{**row, "model": model} for row in rows for model in ("assumed", "calibrated")]
-    arrays = {(point.key, array): rng.random((4, 4)) for point in points for array in (IMAGE, TRUTH, "spectrum")}
+    arrays = {(point.key, array): rng.random((4, 4)) for point in points for array in (IMAGE, TRUTH, *OTHERS)}
     return Results(Table(tuple(rows)), arrays, scope)
 
 
@@ -185,3 +187,12 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
     page = build_page([section], tmp_path / "page.html", section.title).read_text()
     order = [page.index(each) for each in (said, section.experiment.question, "claim 4", "<img", "Zheng")]
     assert order == sorted(order)
+
+
+def test_images_of_a_drift_stand_beside_the_truth() -> None:
+    """Of the kinds that cost the most. (Planted: in the table's order.)"""
+    results = invented("drift")
+    cells = find("drift").figures(results)["images.png"].axes
+    assert [axes.get_title() for axes in cells[:3]] == ["truth", "without the drift", "with it"] and len(cells) == 12
+    most = max(results.table.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
+    assert str(most["amount"]) and cells[2].get_xlabel() == f"{most['after_db']:.1f} dB"
