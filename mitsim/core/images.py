@@ -578,9 +578,10 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     return buffer.getvalue()
 
 
-def data_uri(picture: bytes) -> str:
-    """A PNG ``picture`` as the address that holds it, for a page that refers to nothing outside itself."""
-    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    """A ``picture``, a PNG or of another ``kind``, as the address that holds it, for a page that refers to nothing
+    outside itself."""
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def span(values: npt.ArrayLike, unit: str) -> str:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 # -------- Pages
 
-_DPI, _SHOWN_DPI = 220, 110
-"""Figures are 8.6 inches wide at most: 946 pixels of the page, in two dots each."""
+_SHOWN_DPI = 110
+"""Figures are 8.6 inches wide at most: 946 pixels of the page."""
 
 
 def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
@@ -79,7 +79,7 @@ def write_html(path: Path, text: str) -> Path:
 
 
 def page_figure(figure: Figure) -> tuple[str, int]:
-    """A figure for a page.
+    """A figure for a page: an SVG, sharp at any size, of a third of a PNG's bytes; the same of the same figure.
 
     Parameters
     ----------
@@ -91,7 +91,11 @@ def page_figure(figure: Figure) -> tuple[str, int]:
     tuple of str and int
         its data URI, and how wide it is shown [pixels].
     """
-    return figure_uri(figure, _DPI), round(float(figure.get_figwidth()) * _SHOWN_DPI)
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": "mitsim"}):  # names inside the file; without it they are random
+        figure.savefig(buffer := BytesIO(), format="svg", metadata={"Date": None})
+    return data_uri(buffer.getvalue(), "svg+xml"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
 def figure_uri(figure: Figure, dots_per_inch: int) -> str:

@@ -6,7 +6,7 @@ draws stands with that study.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 from typing import Any, Literal
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
@@ -35,6 +36,13 @@ FONT = 11.0
 """Points: as large as the text of a page of 8.6 inches."""
 WIDTH = 8.6
 """Inches: a page of text."""
+COLUMN = 4.65
+"""Inches of a figure of curves: two stand beside each other on a page, and one fits a telephone without shrinking its
+letters below 12 pixels."""
+_BARS = 6.2
+"""Inches of a figure of bars with their names: one fits a telephone with letters of 10 pixels."""
+_PANEL = 2.3
+"""Inches of a panel of curves: half as high as it is wide."""
 _CELL = 1.5
 """Inches of an image in a grid, at most: six stand on a page."""
 _LABEL = 1.1
@@ -43,10 +51,17 @@ _CAPTION = 0.32
 """Inches of a row for the captions below its images."""
 _LETTER = 0.085
 """Inches of a letter of such a name, on the average."""
+_HANDLE = 0.6
+"""Inches of a line in a legend, and of the room beside its name."""
 ROW = 0.27
 """Inches of a row of bars: a line of text, and a third of one between two."""
-_UPRIGHT_LETTERS = 36
-"""Of a line along a figure of curves."""
+_NAME_LETTERS = 34
+"""Of a line of the name of a bar: half of the figure is left for bars."""
+_UPRIGHT_LETTERS, _TITLE_LETTERS = 26, 46
+"""Of a line along a panel of curves, and above it."""
+LOGARITHMIC = 30.0
+"""Largest over least value from which an axis is logarithmic: on a linear one the smaller half of its decades lies
+within a dot of nothing."""
 Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
@@ -66,7 +81,7 @@ def curves(
     ticks: bool = True,
     title: str = "",
 ) -> Figure:
-    """Curves with bars of one standard error, in panels side by side on one scale.
+    """Curves with bars of one standard error, in panels below each other on one scale.
 
     Parameters
     ----------
@@ -75,44 +90,81 @@ def curves(
     x, y
         names of the axes, with units.
     log
-        whether x is logarithmic.
+        whether x is logarithmic even where its numbers span little (:func:`spans_decades`).
     ticks
-        whether every x that was measured has a tick.
+        whether every x that was measured has a tick, as far as there is room.
     title
         of all panels.
 
     Notes
     -----
-    A curve alone needs no name: an empty one has no line in the legend.
+    A curve alone needs no name: an empty one has no line in the legend. A panel without two places along x tells
+    nothing and is left out; a figure without panels is empty (:func:`tells`).
     """
-    figure, places = panels_of(1, len(panels), 0.46 * WIDTH, sharex=True, sharey=True)
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
-    for axes, (panel, shown) in zip(places[0], panels.items(), strict=True):
-        for name, curve in ((name, curve) for name, curve in shown.items() if curve):
-            points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
-            numbers, means, errors = np.array(points).reshape(-1, 3).T
+    found = {panel: {name: _points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
+    told = {panel: shown for panel, shown in found.items() if len(_column(shown, 0)) > 1}
+    if not told:
+        return Figure()
+    figure, places = panels_of(len(told), 1, _PANEL * len(told) + 0.9, COLUMN, sharex=True, sharey=True)
+    measured = sorted({number for shown in told.values() for number in _column(shown, 0)})
+    levels = [level for shown in told.values() for level in _column(shown, 1)]
+    for axes, (panel, shown) in zip(places[:, 0], told.items(), strict=True):
+        for name, points in ((name, points) for name, points in shown.items() if len(points)):
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
-            axes.errorbar(numbers, means, _bar_errors(errors), label=name, **style)
+            axes.errorbar(points[:, 0], points[:, 1], _bar_errors(points[:, 2]), label=name, **style)
         axes.set_title(panel, fontsize=FONT)
-        label_axes(axes, x, fill(y, _UPRIGHT_LETTERS) if axes is places[0][0] else "")
-        if log:
+        label_axes(axes, x if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
+        if log or spans_decades(measured):
             axes.set_xscale("log")
-        if ticks:
-            measured = sorted(
-                {float(number) for each in panels.values() for curve in each.values() for number in curve}
-            )
-            axes.xaxis.set_major_locator(FixedLocator(measured))
-            axes.xaxis.set_minor_locator(NullLocator())
-            axes.xaxis.set_major_formatter("{x:g}")
+        if spans_decades(levels):
+            axes.set_yscale("log")
+    if ticks:
+        _tick_at(places[-1, 0], measured)
     shown_by_name: dict[str, Any] = {}
-    for axes in places[0]:  # a panel may lack curves that another has
+    for axes in places[:, 0]:  # a panel may lack curves that another has
         shown_by_name |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     labels = [name for name in names if name and name in shown_by_name]
     if labels:
-        legend_below(figure, min(len(labels), 4), [shown_by_name[name] for name in labels], labels)
+        legend_below(figure, [shown_by_name[name] for name in labels], labels)
     if title:
-        figure.suptitle(title, fontsize=FONT + 1)
+        figure.suptitle(fill(title, _TITLE_LETTERS), fontsize=FONT + 1)
     return figure
+
+
+def _points(curve: Curve) -> FloatArray:
+    """(points, 3) numbers, means and standard errors of a ``curve`` in the order of its numbers, where all is finite
+    but the error."""
+    points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
+    found = np.array(points, dtype=np.float64).reshape(-1, 3)
+    return found[np.isfinite(found[:, :2]).all(axis=1)]
+
+
+def _column(shown: Mapping[str, FloatArray], column: int) -> set[float]:
+    """Different values of a ``column`` of all curves ``shown``."""
+    return {float(value) for points in shown.values() for value in points[:, column]}
+
+
+def spans_decades(values: Iterable[float]) -> bool:
+    """Whether ``values`` are above 0, all of them, and the largest is :data:`LOGARITHMIC` times the least or more."""
+    found = np.array(list(values), dtype=np.float64)
+    return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
+
+
+def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
+    """Ticks along x at those of some ``numbers``, in ascending order, whose text does not run into the one before."""
+    logarithmic = axes.get_xscale() == "log"
+    places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
+    inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
+    kept, end = [], -np.inf
+    for number, place in zip(numbers, inches, strict=True):
+        half = _LETTER * (len(f"{number:g}") + 1) / 2
+        if place - half >= end:
+            kept.append(number)
+            end = place + half
+    axes.xaxis.set_major_locator(FixedLocator(kept))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:g}")
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
@@ -146,7 +198,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
         fits = len(name) * _LETTER <= size + _CAPTION
         line[0].set_ylabel(name if fits else name.replace(", ", ",\n"), fontsize=FONT - 1)
     if title:
-        figure.suptitle(title, fontsize=FONT)
+        figure.suptitle(fill(title, int(figure.get_figwidth() / _LETTER)), fontsize=FONT)
     return figure
 
 
@@ -163,7 +215,7 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
         name of the axis, with its unit.
     """
     ordered = sorted(values.items(), key=lambda item: item[1][0].value)
-    figure, axes = figure_of(0.9 + ROW * len(ordered))
+    figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
     rows = np.arange(len(ordered))
     first, second = (
         np.array([(pair[index].value, pair[index].error) for _, pair in ordered]).reshape(-1, 2).T for index in (0, 1)
@@ -188,7 +240,7 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
     """
     values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
     ordered = sorted(values, key=lambda value: value[0].value)
-    figure, axes = figure_of(1.2 + ROW * len(ordered))
+    figure, axes = figure_of(1.2 + _rows_height(name for _, name, _ in ordered), _BARS)
     for colour, kind in zip((BLUE, PALE), kinds, strict=False):
         own = [(row, mean) for row, (mean, _, of) in enumerate(ordered) if of == kind]
         if own:
@@ -214,7 +266,7 @@ def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
         name of the axis, with its unit.
     """
     parts = list(dict.fromkeys(part for row in rows.values() for part in row))
-    figure, axes = figure_of(1.6 + ROW * len(rows))
+    figure, axes = figure_of(1.6 + ROW * len(rows), _BARS)
     places, ends = np.arange(len(rows))[::-1], np.zeros(len(rows))
     for number, part in enumerate(parts):
         own = np.array([row.get(part, 0.0) for row in rows.values()])
@@ -224,7 +276,7 @@ def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
         ends += own
     axes.set_yticks(places, list(rows), fontsize=FONT)
     label_axes(axes, x, "", grid="x")
-    legend_below(figure, 4, *axes.get_legend_handles_labels())
+    legend_below(figure, *axes.get_legend_handles_labels())
     return figure
 
 
@@ -263,8 +315,8 @@ def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
             label=f"{name}: found, less bias",
         )
     axes.set_yscale("log")
-    label_axes(axes, "number of the singular value", "relative error [1]")
-    legend_below(figure, 4, *axes.get_legend_handles_labels())
+    label_axes(axes, "number of the singular value [1]", "relative error [1]")
+    legend_below(figure, *axes.get_legend_handles_labels())
     return figure
 
 
@@ -372,7 +424,7 @@ class Cost:
 
 
 def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
-    """Error against time, in panels side by side; rings are around what no other in the panel beats in both.
+    """Error against time, in panels below each other; rings are around what no other in the panel beats in both.
 
     Parameters
     ----------
@@ -383,10 +435,10 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
     levels
         errors that others are held against, by name.
     """
-    figure, (places,) = panels_of(1, len(panels), 0.55 * WIDTH, sharey=True)
+    figure, places = panels_of(len(panels), 1, 1.3 + 2.8 * len(panels), _BARS, sharex=True)
     names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
     shown: dict[str, Any] = {}
-    for axes, (title, points) in zip(places, panels.items(), strict=True):
+    for axes, (title, points) in zip(places[:, 0], panels.items(), strict=True):
         for point in points:
             row, column = divmod(names.index(point.name), len(_PALETTE))
             median, least, most = point.seconds
@@ -400,13 +452,13 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
         axes.set(xscale="log", yscale="log", xmargin=0.2)
         axes.set_title(title, fontsize=FONT)
         log_ticks(axes)
-        label_axes(axes, "wall time [s]", error if axes is places[0] else "")
+        label_axes(axes, "wall time [s]" if axes is places[-1, 0] else "", fill(error, _UPRIGHT_LETTERS))
     for text, level in (levels or {}).items():
-        where: Any = places[0].get_yaxis_transform()
-        places[0].axhline(level, color=GREY, lw=1.5, ls="--")
-        places[0].annotate(f"{text}: {scientific(level)}", (0.01, level), (2, 3), xycoords=where,
+        where: Any = places[0, 0].get_yaxis_transform()
+        places[0, 0].axhline(level, color=GREY, lw=1.5, ls="--")
+        places[0, 0].annotate(f"{text}: {scientific(level)}", (0.01, level), (2, 3), xycoords=where,
                            textcoords="offset points", fontsize=FONT - 2, color=GREY)  # fmt: skip
-    legend_below(figure, 3, shown.values(), shown.keys())
+    legend_below(figure, shown.values(), shown.keys())
     return figure
 
 
@@ -424,11 +476,17 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:
     """Names of bars, from below, and a legend above the axes, where no bar is, of two or more kinds."""
-    axes.set_yticks(range(len(names)), [typeset(name) for name in names])
+    axes.set_yticks(range(len(names)), [fill(typeset(name), _NAME_LETTERS) for name in names])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(names) - 0.4)
     if len(axes.get_legend_handles_labels()[0]) > 1:
         axes.legend(fontsize=FONT - 1, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+
+
+def _rows_height(names: Iterable[str]) -> float:
+    """Inches of rows of bars with these ``names``, all as high as the one of the most lines."""
+    lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
+    return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
@@ -470,17 +528,48 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
     axes.set_axisbelow(True)
 
 
-def legend_below(figure: Figure, columns: int, handles: Any, labels: Any) -> None:
-    """A legend below a figure.
+def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
+    """A legend below a figure, in as many columns as its width has room for; none without names.
 
     Parameters
     ----------
-    figure, columns
-        that it is of, and how many it has.
+    figure
+        that it is of.
     handles, labels
         matplotlib's.
     """
-    figure.legend(handles, labels, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
+    names = list(labels)
+    if not names:
+        return
+    room = figure.get_figwidth() / (_HANDLE + _LETTER * max(map(len, names)))
+    columns = max(min(int(room), len(names)), 1)
+    figure.legend(handles, names, fontsize=FONT - 1, frameon=False, loc="outside lower center", ncols=columns)
+
+
+def tells(figure: Figure) -> bool:
+    """Whether a figure shows an image, or two points at least: a chart of nothing, or of one point, is not drawn.
+
+    Parameters
+    ----------
+    figure
+        of any study; only numbers count, and no line across all of the axes.
+    """
+    for axes in figure.axes:
+        if axes.images or any(
+            isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
+        ):
+            return True
+        points = {
+            (float(x), float(y))
+            for line in axes.lines
+            if all(line.get_transform().contains_branch_seperately(axes.transData))
+            for x, y in np.asarray(line.get_xydata(), dtype=np.float64)
+            if np.isfinite((x, y)).all()
+        }
+        bars: list[Any] = [each for each in axes.patches if np.isfinite(each.get_extents().bounds).all()]
+        if len(points) + len(bars) > 1:
+            return True
+    return False
 
 
 def figure_of(

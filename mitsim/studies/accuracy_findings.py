@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from matplotlib.figure import Figure
 
@@ -17,6 +17,7 @@ from mitsim.report.plots import (
     error_bars,
     stacked_bars,
 )
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
 SOLVER = "mitsim study solver"
@@ -165,6 +166,9 @@ class JudgeFacts:
         return float((self.mc_error**2 + self.systematic_error**2) ** 0.5)
 
 
+# -------- All rows in, text, figures and page out
+
+
 @dataclass(frozen=True)
 class AccuracyFindings(Findings):
     """All that was measured, and what did not fit in the time.
@@ -200,6 +204,7 @@ class AccuracyFindings(Findings):
     left_out: tuple[str, ...]
     quoted: float
     took: float
+    title: ClassVar[str] = "What accuracy costs in time"
 
     def payload(self) -> dict[str, Any]:
         """The JSON of the command line."""
@@ -239,6 +244,49 @@ class AccuracyFindings(Findings):
             *equal,
             *(f"Left out, too slow: {name}" for name in self.left_out),
             f"What the solver's precision costs is the same for all scenes: {SOLVER}",
+        ]
+
+    @property
+    def message(self) -> str:
+        """What the run at the default accuracy takes, and how much longer the reference would."""
+        own = [row for row in self.rows if self.quoted in row.accuracies]
+        run = f"At {self.quoted:g} a run takes {own[0].spread.median:.1f} s" if own else ""
+        speedup = self.speedup_at_equal_error
+        more = f"the reference would take {float(f'{speedup:.2g}'):g} times as long as its light" if speedup else ""
+        return "; ".join(part for part in (run, more) if part)
+
+    def parts(self) -> Sequence[Part]:
+        """Of the page: whole runs and the reference, and parts of the light."""
+        runs = [
+            (row.estimator, row.setting, f"{row.spread.median:.2g}", f"{row.error:.1e}", f"{row.mc_error:.1e}",
+             row.extrapolated or ("best for its time" if row.on_front else ""))
+            for row in self.rows
+        ]  # fmt: skip
+        light = [
+            (part.label, f"{part.error_if_off:.1e}", f"{part.error_bound:.1e}", part.cost,
+             "yes" if part.in_plan else "no")
+            for part in self.effects
+        ]  # fmt: skip
+        noise = f" The sensor's noise is {self.sensor_noise:.1e} at equal peak." if self.sensor_noise else ""
+        return [
+            Part(
+                "Whole runs and the reference",
+                "Factored: a whole run, from opening the scene to the last file. Reference: all frames of the scene's "
+                "own integrator, light alone. Errors are of the noise-free frames against the judge, whose own is "
+                f"{self.judge.error:.1e}.{noise}",
+                ("Estimator", "Setting", "Wall time [s]", "Error [1]", "Monte Carlo error [1]", ""),
+                tuple(runs),
+                ("accuracy.png", "stages.png"),
+                tuple(f"Left out, too slow: {name}." for name in self.left_out),
+            ),
+            Part(
+                "Parts of the light",
+                "What the frames would be off by without each part alone, what that is below at 95 %, what the part "
+                f"takes at the samples of {self.parts_accuracy:g}, and whether the plan at {self.quoted:g} has it.",
+                ("Part", "Error without it [1]", "Below [1]", "Time", "Planned"),
+                tuple(light),
+                ("effects.png",),
+            ),
         ]
 
     def figures(self) -> dict[str, Figure]:

@@ -415,6 +415,16 @@ class CalibrationFindings(Findings):
             if row.of == error_budget.UNEXPLAINED and abs(row.squared_error) > error_budget.SURE * row.deviation
         ]
 
+    @property
+    def message(self) -> str:
+        """What costs the image the most; without an image, how good the factors are."""
+        lost = [row for row in self.losses if row.of not in (error_budget.UNEXPLAINED, error_budget.DRIFT)]
+        if not lost:
+            errors = " and ".join(f"{row.error:.1e} ({row.factor})" for row in self.entries)
+            return f"The factors' relative errors are {errors}"
+        most = max(lost, key=lambda row: row.lost_db)
+        return f"{most.name} costs the image most: {most.lost_db:.2f} of {self.image['psnr_db']:.1f} dB"
+
     def figures(self) -> dict[str, Figure]:
         """Maps of the entries' errors, singular values with their errors, and the residual by cause."""
         parts = {_cause(row): row.part for row in self.causes if row.part > 0}

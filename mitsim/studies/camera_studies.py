@@ -30,9 +30,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.pages import Table, Value
-from mitsim.report.plots import curves, image_grid
+from mitsim.report.plots import curves
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds, image_array, measure_image
+from mitsim.studies.framework.claims import Holds, image_arrays, measure_image
 from mitsim.studies.framework.experiment import PRINT_MM, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio
 
@@ -126,7 +126,9 @@ def _binning_measure(studio: Studio, point: Point) -> Found:
     # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
     image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
     pixels = frames.lit.bench.geometry.frame_shape[0] // binning
-    return claims.finding(point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
+    return claims.finding(
+        studio, point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row()
+    )
 
 
 def _binning_claims(results: Results) -> Sequence[Claim]:
@@ -206,7 +208,7 @@ def _resolution_measure(studio: Studio, point: Point) -> Found:
         )
     extremes = float(np.mean([contrast(*half) for half in _halves(image.image)]))
     row |= {"pairs_a_mm": float(frequency), "contrast": _contrast(image.image, own), "contrast_of_extremes": extremes}
-    return Found((row,), image_array(image.image))
+    return Found((row,), image_arrays(image.image, lit.truth))
 
 
 def _pixel_mm(lit: LitScene) -> float:
@@ -291,7 +293,7 @@ def _resolution_figures(results: Results) -> Mapping[str, Figure]:
     both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
     grid = claims.image_rows(results, both, "picture", names, "contrast {contrast:.2f}")
     title = f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}"
-    drawn["images.png"] = image_grid(grid, [name.replace("bars ", "") for name in names], title)
+    drawn["images.png"] = claims.grid_with_truths(grid, [name.replace("bars ", "") for name in names], title)
     return drawn
 
 

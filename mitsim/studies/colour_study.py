@@ -182,7 +182,7 @@ def ladder_figure(rows: Table) -> Figure:
         panels[label(patterns)] = {
             name: {lux: mean for lux, mean in curve.items() if lux} for name, curve in shown.items()
         }
-    return curves(panels, "D65 on the chart [lx]", "mean Delta E 2000 of 24 patches", log=True)
+    return curves(panels, "D65 on the chart [lx]", "mean Delta E 2000 of 24 patches [1]", log=True)
 
 
 def ladder_tables(rows: Table) -> tuple[PageTable, PageTable]:
@@ -389,7 +389,7 @@ def _by_way(table: Table) -> Figure:
         if way != BY_LUX
     }
     floor = {"floor, no camera": rows.mean("floor")._replace(error=0.0)}
-    return bars({"found": means, "floor": floor}, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)}")
+    return bars({"found": means, "floor": floor}, f"mean Delta E 2000 of 24 patches, {label(_SHOWN)} [1]")
 
 
 def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:

@@ -129,7 +129,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
             rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
-                arrays = claims.image_array(solution.image)
+                arrays = claims.image_arrays(solution.image, truth)
     return Found(tuple(rows), arrays)
 
 
@@ -212,7 +212,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         lines = {f"{psf} point spread function": rows.where(psf=psf).means("psnr_db", "patterns") for psf in psfs}
         drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
             {"": lines},
-            "frames",
+            "number of frames [1]",
             log=True,
             title=f"PSNR by the number of frames, exposure {exposure}, best lambda",
         )
@@ -239,7 +239,7 @@ def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:
         }
     figure = curves(
         panels,
-        "frames",
+        "number of frames [1]",
         "processor time [s]",
         log=True,
         title="Time of the solvers by the number of frames, at equal error",

@@ -92,7 +92,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
         # Frames of the sheet elsewhere, factors of the bench as it was aligned.
         image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
-    return claims.finding(point, image.image, scene=setup.scene, **image.row())
+    return claims.finding(studio, point, image.image, scene=setup.scene, **image.row())
 
 
 def _claims(results: Results) -> Sequence[Claim]:

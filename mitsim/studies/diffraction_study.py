@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from textwrap import fill
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +39,7 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import Quality, psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.solver import prepare
-from mitsim.report import plots
+from mitsim.report import label, plots
 from mitsim.report.lit_scene import (
     GEOMETRIC,
     LINE,
@@ -55,6 +55,7 @@ from mitsim.report.lit_scene import (
 )
 from mitsim.report.pages import Mean
 from mitsim.studies.ablation import reform
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
 MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")
@@ -96,6 +97,7 @@ class DiffractionFindings(Findings):
     patterns: str
     shadows: tuple[ShadowRow, ...]
     quality: tuple[QualityRow, ...]
+    title: ClassVar[str] = "What diffraction at the mask does to images"
 
     def loss_db(self, row: QualityRow) -> float:
         """PSNR [dB] lost in a ``row`` against the same frames without diffraction, solved with the factors that fit."""
@@ -127,6 +129,43 @@ class DiffractionFindings(Findings):
             for row in self.quality
         ]
         return [f"{self.verdict}.", *shadows, *quality]
+
+    def parts(self) -> Sequence[Part]:
+        """Of the page: images, and shadows."""
+        images = [
+            (row.frames, row.mask, row.light, label(row.patterns), row.factors, f"{row.psnr_db:.1f}",
+             f"{row.psnr_best_db:.1f}", f"{round(self.loss_db(row), 1) + 0.0:.1f}", f"{row.residual:.1e}")
+            for row in self.quality
+        ]  # fmt: skip
+        shadows = [
+            (row.mask, row.light, f"{100 * row.point_source:.1f}", f"{100 * row.scene_pixel:.1f}",
+             f"{row.separability:.1e}", f"{row.separability_centred:.1e}")
+            for row in self.shadows
+        ]  # fmt: skip
+        return [
+            Part(
+                "Images",
+                "Frames through the mask in each light, solved with factors of its geometric shadow, and with those "
+                "that fit. Lost: against frames without diffraction and factors that fit them.",
+                ("Frames", "Mask", "Light", "Patterns", "Factors", "PSNR [dB]", "With the best lambda [dB]",
+                 "Lost [dB]", "Residual [1]"),
+                tuple(images),
+                ("quality.png",),
+            ),
+            Part(
+                "Shadows",
+                "How far the mask's shadow is off the geometric one, of a point and of a pixel of the scene; and what "
+                "one separable term leaves of it, of the frames as they are and centred.",
+                ("Mask", "Light", "Point [%]", "Pixel [%]", "Not separable [1]", "The same, centred [1]"),
+                tuple(shadows),
+                ("shadow.png",),
+            ),
+        ]  # fmt: skip
+
+    @property
+    def message(self) -> str:
+        """As the last line says."""
+        return self.verdict
 
     @property
     def verdict(self) -> str:
@@ -257,8 +296,8 @@ class _Trials:
 
 # -------- Figures
 
-_TITLE_LETTERS = 100
-"""Of a line above a figure of the page's width."""
+_TITLE_LETTERS = 66
+"""Of a line above a figure of bars."""
 
 
 def quality_by_factors(rows: Sequence[QualityRow], message: str) -> Figure:

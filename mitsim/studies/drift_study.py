@@ -55,9 +55,11 @@ from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import curves, pair_chart
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
-from mitsim.studies.framework.claims import difference, verdict, within
+from mitsim.studies.framework.claims import Cell, difference, grid_with_truths, single_precision, verdict, within
 from mitsim.studies.framework.experiment import (
+    IMAGE,
     TEST_IMAGES,
+    TRUTH,
     Claim,
     Experiment,
     Found,
@@ -116,7 +118,7 @@ class Prediction:
         return abs(self.predicted_before_db - self.predicted_db - self.predicted_lost_db)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outcome(Prediction):
     """Images with and without a drift.
 
@@ -124,10 +126,13 @@ class Outcome(Prediction):
     ----------
     after_db, auto_db
         PSNR [dB] with the drift, by the lambda from before it and by one of its own.
+    image
+        (n, n) with the drift, by the lambda from before it.
     """
 
     after_db: float
     auto_db: float
+    image: FloatArray
 
     @property
     def lost_db(self) -> float:
@@ -174,8 +179,9 @@ class DriftStand:
         lit
             the scene in light of the projector that moved; None: its light as it was.
         """
-        after, auto = self.psnrs(drift, session, lit)
-        return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto)
+        truth, images = (lit or self.lit).truth, self.images(drift, session, lit)
+        after, auto = (psnr(image, truth) for image in images)
+        return Outcome(**vars(self.predict(drift)), after_db=after, auto_db=auto, image=images[0])
 
     def predict(self, drift: Drift) -> Prediction:
         """What a ``drift`` is predicted to do; MitsimError for one that the bench cannot have."""
@@ -184,12 +190,17 @@ class DriftStand:
         )
 
     @property
+    def image(self) -> FloatArray:
+        """(n, n) without a drift."""
+        return self._before.image
+
+    @property
     def before_db(self) -> float:
         """PSNR [dB] without a drift."""
-        return psnr(self._before.image, self.lit.truth)
+        return psnr(self.image, self.lit.truth)
 
-    def psnrs(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> tuple[float, float]:
-        """PSNR [dB] after a drift, with the lambda from before it and with the solver's own.
+    def images(self, drift: Drift, session: Factors | None = None, lit: LitScene | None = None) -> list[FloatArray]:
+        """Both images (n, n) after a drift, with the lambda from before it and with the solver's own.
 
         Parameters
         ----------
@@ -199,9 +210,7 @@ class DriftStand:
         scene, model = lit or self.lit, self._model
         if session is not None:
             model = scene.rendered_frames(session, self.family, self.seed).prepare()
-        solutions = self._solve(drift, scene, model)
-        same, own = (psnr(solution.image, scene.truth) for solution in solutions)
-        return same, own
+        return [solution.image for solution in self._solve(drift, scene, model)]
 
     def _solve(self, drift: Drift, scene: LitScene, model: Prepared) -> tuple[Solution, Solution]:
         bench = scene.bench
@@ -470,6 +479,11 @@ _RIPPLES = "power_ripple", "lamp_ripple"
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Scene with a lamp beside the projector, a tenth as bright on the sheet, for what lamps do where no scene is given."""
 _LINES = ("measured", "predicted")
+_BEFORE = "without the drift"
+_ARRAYS = {_BEFORE: "before_db", IMAGE: "after_db"}
+"""Images that are kept, and columns of their PSNR."""
+_SHOWN = 4
+"""Kinds whose images are shown, those that cost the most: images that lose less than a decibel look alike."""
 AGREE_DB = 0.5
 """Decibels between predicted and measured loss that a prediction is good for: the issue asks as much of plans."""
 
@@ -538,7 +552,8 @@ def _measure(studio: Studio, point: Point) -> Found:
         "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
         "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
     }  # fmt: skip
-    return Found((point.row(**measured),))
+    shown = {IMAGE: found.image, _BEFORE: known.image, TRUTH: lit.truth}
+    return Found((point.row(**measured),), single_precision(shown))
 
 
 def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) -> Factors:
@@ -607,7 +622,22 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             drawn[f"{kind}.png"] = curves(
                 {"": lines}, f"{DRIFT_WORDS[kind]} [{rows.rows[0]['unit']}]", "PSNR lost [dB]"
             )
-    return drawn
+    return drawn | _images(results)
+
+
+def _images(results: Results) -> dict[str, Figure]:
+    """Of the kinds that cost the most, the first seed's image without the drift and with it, beside the truth."""
+    grid: dict[str, list[Cell]] = {}
+    dearest = sorted(_first_amounts(results.table).items(), key=lambda item: -item[1].mean("lost_db").value)
+    for name, rows in dearest[:_SHOWN]:
+        row = rows.rows[0]
+        truth = results.array(row, TRUTH)
+        kept = ((results.array(row, array), row.get(column)) for array, column in _ARRAYS.items())
+        cells = [(image, truth, f"{level:.1f} dB") for image, level in kept if image is not None]
+        if len(cells) == len(_ARRAYS):
+            grid[name] = cells
+    title = "Images of the kinds that cost the most"
+    return {"images.png": grid_with_truths(grid, [_BEFORE, "with it"], title)} if grid else {}
 
 
 EXPERIMENT = Experiment(

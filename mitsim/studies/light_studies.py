@@ -94,7 +94,9 @@ def _patterns_figures(results: Results) -> Mapping[str, Figure]:
         }
 
     known = Table(tuple(row for row in table.rows if row["exposure"] in CONVENTIONS))
-    drawn = dict(claims.by_exposure(known, lines, "patterns_count", "patterns", "PSNR by the number of patterns"))
+    drawn = dict(
+        claims.by_exposure(known, lines, "patterns_count", "number of patterns [1]", "PSNR by the number of patterns")
+    )
     spectra = {
         label(str(row["patterns"])): found for row in table.rows if (found := results.array(row, _SPECTRUM)) is not None
     }
@@ -141,7 +143,7 @@ def _exposure_measure(studio: Studio, point: Point) -> Found:
     if point["model"] == IDEALISED and point["patterns"] == DOTS:
         # Elsewhere the law's model is not that of the frames, or least squares magnifies rounding beyond any image.
         law = _law(frames, seconds)
-    return claims.finding(point, image.image, **image.row(), **law)
+    return claims.finding(studio, point, image.image, **image.row(), **law)
 
 
 def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
@@ -210,7 +212,7 @@ def _ambient_measure(studio: Studio, point: Point) -> Found:
     image = studio.image(setup, RENDERED, patterns, seed)
     low, high = _range(studio.frames(setup, RENDERED, patterns, seed))
     ratio = _ratio(studio.frames(setup, RENDERED, "uniform", seed))
-    return finding(point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
+    return finding(studio, point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
 
 
 def _ratio(uniform: Unexposed) -> float:

@@ -103,7 +103,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         reported["unexplained"] = factors.manifest.result["unexplained_residual"]
     exposed = lit.rendered_frames(factors, lit.bench.family(PATTERNS), seed)
     image = Image.of(exposed, exposed.seconds(EQUAL_PEAK))
-    return finding(point, None, **image.row(), frames=frames, **reported)
+    return finding(studio, point, None, **image.row(), frames=frames, **reported)
 
 
 def _session(studio: Studio, setup: Setup, recipe: SessionRecipe) -> PredictedSession:
@@ -172,7 +172,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
             for name in FACTORS
         }
     title = "PSNR by the frames of the calibration session"
-    return {"psnr.png": curves(panels, "frames of the calibration session", log=True, title=title)}
+    return {"psnr.png": curves(panels, "frames of the calibration session [1]", log=True, title=title)}
 
 
 EXPERIMENT = Experiment(

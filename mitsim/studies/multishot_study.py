@@ -47,7 +47,7 @@ from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODEL
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Table
 from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Lines, image_array, images
+from mitsim.studies.framework.claims import Lines, image_arrays, images
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Image, Studio, reason_of
 
@@ -82,7 +82,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     images = _moving(studio, point, lit) if method in (SWEPT, LINE) else _still(studio, point, lit)
     rows = tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items())
     kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
-    return Found(rows, image_array(images[EQUAL_FRAME].image) if kept else {})
+    return Found(rows, image_arrays(images[EQUAL_FRAME].image, lit.truth) if kept else {})
 
 
 def _still(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
@@ -161,7 +161,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         moved = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
         return {UNIFORM: rows.where(patterns=UNIFORM), **moved}
 
-    drawn = dict(claims.by_exposure(table, lines, "frames", "frames", "PSNR by the number of frames", log=True))
+    drawn = dict(
+        claims.by_exposure(table, lines, "frames", "number of frames [1]", "PSNR by the number of frames", log=True)
+    )
     names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
     shown = claims.by_print(table.where(exposure=EQUAL_FRAME, frames=_FRAMES))
     title = f"Images of 49 frames, exposure {EQUAL_FRAME}"

@@ -65,7 +65,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     tracemalloc.stop()
     best = max(psnr(each, truth) for each in (image, one, *others))
     measured = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds, "peak_mib": peak / 2**20}
-    return claims.finding(point, image if point["patterns"] in _SHOWN else None, **measured)
+    return claims.finding(studio, point, image if point["patterns"] in _SHOWN else None, **measured)
 
 
 def _claims(results: Results) -> Sequence[Claim]:

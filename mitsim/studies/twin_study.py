@@ -367,7 +367,7 @@ def _spectra_figure(twins: Sequence[Twin]) -> Figure:
         axes.set_title(twin.measured.name, fontsize=plots.FONT)
         first = axes is places[0][0]
         plots.label_axes(axes, "frequency [cycles / pixel]", "power [DN\N{SUPERSCRIPT TWO}]" if first else "")
-    plots.legend_below(figure, 2, *places[0][0].get_legend_handles_labels())
+    plots.legend_below(figure, *places[0][0].get_legend_handles_labels())
     return figure
 
 
@@ -378,8 +378,8 @@ def _means_figure(twin: Twin) -> Figure:
         for index, (label, values) in enumerate(twin.means(axis).items()):
             axes.plot(values, label=label, lw=1.5, **plots.line_style(index))
         axes.set_title(f"{twin.measured.name}: means of {name}s, about their mean", fontsize=plots.FONT - 1)
-        plots.label_axes(axes, name, "light [DN]" if axis else "")
-    plots.legend_below(figure, 2, *places[0][0].get_legend_handles_labels())
+        plots.label_axes(axes, f"{name} [pixel]", "light [DN]" if axis else "")
+    plots.legend_below(figure, *places[0][0].get_legend_handles_labels())
     return figure
 
 
@@ -401,5 +401,5 @@ def _rings_figure(twin: DiffuserTwin) -> Figure:
     axes.set_xticks(_TICKS, map(str, _TICKS))
     axes.minorticks_off()
     plots.label_axes(axes, "frequency [cycles / pixel]", "power of light over its mean [1]")
-    plots.legend_below(figure, 3, *axes.get_legend_handles_labels())
+    plots.legend_below(figure, *axes.get_legend_handles_labels())
     return figure

@@ -52,7 +52,7 @@ from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, i
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
-from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Claim, Experiment, Found, Point, Results, Scope
 from mitsim.studies.framework.studio import Studio
 
 # -------- A scene, its camera and names of effects in
@@ -278,7 +278,8 @@ def _measure(studio: Studio, point: Point) -> Found:
         for model in MODELS
     ]
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    return Found(tuple(rows), single_precision(ends_of.get(effect, {})))
+    kept = {**ends_of[effect], TRUTH: lit.truth} if effect in ends_of else {}
+    return Found(tuple(rows), single_precision(kept))
 
 
 def ends(way: str, effect: str) -> tuple[frozenset[str], frozenset[str]]:
@@ -333,12 +334,12 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     panels = {f"model {model}: factors of {_FACTORS[model]}": fall(results.table, model) for model in MODELS}
     drawn = {"waterfall.png": waterfall(panels, seen=_SEEN_DB)}
     if images := _images(results):
-        drawn["images.png"] = image_grid(images, ["idealised", "model assumed", "model calibrated"])
+        drawn["images.png"] = image_grid(images, ["truth", "idealised", "model assumed", "model calibrated"])
     return drawn
 
 
 def _images(results: Results) -> dict[str, list[tuple[FloatArray, str]]]:
-    """The idealised image and both rendered ones of each print, of the first seed."""
+    """The truth, the idealised image and both rendered ones of each print, of the first seed."""
     grid = {}
     table = results.table.where(way=IN_ORDER)
     rendered = [(EFFECTS[-1], model, "with_db") for model in MODELS]
@@ -349,8 +350,10 @@ def _images(results: Results) -> dict[str, list[tuple[FloatArray, str]]]:
             rows = table.where(picture=name, effect=effect, model=model).rows[:1]
             kept = ((results.array(row, model), f"{row[column]:.1f} dB") for row in rows)
             cells += [(image, caption) for image, caption in kept if image is not None]
-        if len(cells) == len(columns):
-            grid[str(name or "scene")] = cells
+        first = table.where(picture=name, effect=EFFECTS[0]).rows[:1]
+        truths = [(truth, "") for row in first if (truth := results.array(row, TRUTH)) is not None]
+        if truths and len(cells) == len(columns):
+            grid[str(name or "scene")] = [*truths, *cells]
     return grid
 
 

@@ -184,7 +184,7 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monk
     assert (study["scene"], study["patterns"], study["output"]) == (str(lab.scene), "uniform", str(tmp_path / "study"))
     assert study["rows"] and study["left_out"] and number(study["took"])
     written = {path.name for path in (tmp_path / "study").iterdir()}
-    assert written == {"accuracy.json", "accuracy.png", "stages.png", "effects.png"}
+    assert written == {"accuracy.json", "accuracy.html", "accuracy.png", "stages.png", "effects.png"}
 
 
 def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +206,7 @@ def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pyt
         "seed",
     }
     assert study["rows"] and all(keys == row.keys() for row in study["rows"])
-    assert {path.name for path in (tmp_path / "study").iterdir()} == {"solver.json", "solver.png"}
+    assert {path.name for path in (tmp_path / "study").iterdir()} == {"solver.json", "solver.html", "solver.png"}
     text = call("study", "solver", "-o", tmp_path / "study", "--quiet").out
     assert "lambda 1e-04  svd" in text and "runs)" in text
 

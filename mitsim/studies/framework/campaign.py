@@ -279,10 +279,9 @@ class _Campaign:
         there, experiment = sum(store.has(point) for point in self.points), self.experiment
         if missing := len(self.points) - there:
             return CampaignResult(self.study, str(folder), there, missing, seconds)
-        results = replace(store.results(self.points), measures=self.scope.measures)
-        claims, figures = tuple(experiment.claims(results)), experiment.figures(results)
+        results = replace(store.results(self.points), scope=self.scope)
+        claims, figures = tuple(experiment.claims(results)), write_figures(folder, experiment.figures(results))
         results.table.write(folder / f"{experiment.name}.csv")
-        write_figures(folder, figures)
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", section.title)
         rows = tuple(dict(row) for row in results.table.rows)

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import pairwise
 
+import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
@@ -19,7 +21,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import Curve, curves, image_grid
-from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, Claim, Found, Point, Results
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Found, Point, Results
 from mitsim.studies.framework.studio import Studio
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
@@ -148,27 +150,30 @@ TOLERANCE_DB = 2.0
 """How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
 Lines = Mapping[str, Table]
 """Rows of a table by what they are called in a figure."""
+Cell = tuple[FloatArray, FloatArray | None, str]
+"""Of a grid of images: the image, the truth where it was kept, and a caption."""
 
 
-def finding(point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
     """What a point came to, in one row.
 
     Parameters
     ----------
-    point
-        that was measured.
+    studio, point
+        where it was measured, and what varies.
     image
-        of it, where it is to be shown; kept for a few prints.
+        of it, where it is to be shown; kept for a few prints, with the truth.
     **measured
         columns of the row.
     """
     kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
-    return Found((point.row(**measured),), image_array(image) if kept and image is not None else {})
+    arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
+    return Found((point.row(**measured),), arrays)
 
 
-def image_array(image: FloatArray) -> dict[str, FloatArray]:
-    """An ``image`` as findings keep it: a page shows no more than single precision."""
-    return single_precision({IMAGE: image})
+def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
+    """An ``image`` and its ``truth`` as findings keep them: a page shows no more than single precision."""
+    return single_precision({IMAGE: image, TRUTH: truth})
 
 
 def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -176,7 +181,7 @@ def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     return {name: array.astype("float32") for name, array in arrays.items()}
 
 
-def measure_image(studio: Studio, point: Point, shown: Collection[str] = ()) -> Found:
+def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
     """The image that a user gets at a point with model, patterns, exposure and seed.
 
     Parameters
@@ -184,12 +189,12 @@ def measure_image(studio: Studio, point: Point, shown: Collection[str] = ()) -> 
     studio, point
         where it is made, and what varies.
     shown
-        patterns whose images are kept.
+        patterns whose images are kept; None: all.
     """
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
     image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
-    return finding(point, image.image if patterns in shown else None, **image.row())
+    return finding(studio, point, image.image if shown is None or patterns in shown else None, **image.row())
 
 
 def by_patterns(table: Table) -> Lines:
@@ -223,7 +228,7 @@ def by_print(table: Table) -> Lines:
 
 def image_rows(
     results: Results, lines: Lines, across: str, columns: Sequence[Value], caption: str = "{psnr_db:.1f} dB"
-) -> dict[str, list[tuple[FloatArray, str]]]:
+) -> dict[str, list[Cell]]:
     """Rows of an image grid, those of which all images were kept.
 
     Parameters
@@ -241,11 +246,56 @@ def image_rows(
     for name, rows in lines.items():
         cells = []
         for value in columns:
-            kept = ((results.array(row), row) for row in rows.where(**{across: value}).rows)
-            cells += [(image, caption.format(**row)) for image, row in kept if image is not None][:1]
+            cells += kept_images(results, rows.where(**{across: value}), caption)[:1]
         if len(cells) == len(columns):
             grid[name] = cells
     return grid
+
+
+def kept_images(results: Results, rows: Table, caption: str = "{psnr_db:.1f} dB") -> list[Cell]:
+    """Those of some rows whose images were kept.
+
+    Parameters
+    ----------
+    results, rows
+        with the images, and of which rows of their table.
+    caption
+        as for :func:`image_rows`; a flagged image says so.
+    """
+    kept = ((results.array(row), row) for row in rows.rows)
+    return [
+        (image, results.array(row, TRUTH), caption.format(**row) + ("\nflagged" if row.get("flagged") else ""))
+        for image, row in kept
+        if image is not None
+    ]
+
+
+def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
+    """Images with their truths: in a column before the others where each row has but one, else in rows above those
+    that have new ones.
+
+    Parameters
+    ----------
+    grid
+        cells by the rows' names.
+    titles, title
+        of the columns, and of all.
+    """
+    truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
+    alone = {name: [(image, caption) for image, _, caption in cells] for name, cells in grid.items()}
+    if any(len(truths[name]) < len(cells) for name, cells in grid.items()):
+        return image_grid(alone, titles, title)
+    if all(np.array_equal(own[0], other) for own in truths.values() for other in own):
+        beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
+        return image_grid(beside, ["truth", *titles], title)
+    rows: dict[str, list[tuple[FloatArray, str]]] = {}
+    before: Sequence[FloatArray] = ()
+    several = any(not all(map(np.array_equal, one, other)) for one, other in pairwise(truths.values()))
+    for name, cells in alone.items():
+        if not before or not all(map(np.array_equal, before, truths[name])):
+            rows[f"truth, {name}" if name and several else "truth"] = [(truth, "") for truth in truths[name]]
+        rows[name or "image"], before = cells, truths[name]
+    return image_grid(rows, titles, title)
 
 
 def images(
@@ -269,7 +319,7 @@ def images(
         of the columns; None: their values.
     """
     grid = image_rows(results, lines, across, columns)
-    return {file: image_grid(grid, names or [str(value) for value in columns], title)} if grid else {}
+    return {file: grid_with_truths(grid, names or [str(value) for value in columns], title)} if grid else {}
 
 
 def family_images(

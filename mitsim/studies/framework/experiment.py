@@ -120,6 +120,8 @@ class Point:
 
 IMAGE = "image"
 """The (n, n) reflectance that a point came to, where it is kept."""
+TRUTH = "truth"
+"""What it would be without any error, kept with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,17 +210,17 @@ class Results:
         all points' rows; the column ``point`` has the points' keys.
     arrays
         by key of the point and name.
-    measures
-        the scope's.
+    scope
+        of the study.
     """
 
     table: Table
     arrays: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
-    measures: tuple[str, ...] = ()
+    scope: Scope = field(default_factory=lambda: Scope(Setup(), (None,)))
 
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
         """The array ``name`` that was kept with a ``row``."""
-        return self.arrays.get((str(row["point"]), name))
+        return self.arrays.get((str(row.get("point")), name))
 
 
 @dataclass(frozen=True)
@@ -256,6 +258,8 @@ class Experiment:
         from all results.
     figures
         from all results, by file name; each has one message.
+    message
+        from all results, what its page says first, beside how many claims hold; empty for those alone.
     about
         what its figures are, for who knows nothing of it; empty for claims of the paper, which the page explains.
     heads
@@ -279,6 +283,7 @@ class Experiment:
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
     tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
+    message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS
     note: str = ""

@@ -13,21 +13,26 @@ from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
 from mitsim.report.pages import page_figure, render_page, write_html
+from mitsim.studies.framework.claims import CONFIRMED, NOT_CONFIRMED
 from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
 _NUMBER = re.compile(r"[+-]?\d|nothing$")
 """How a cell of a column of numbers begins."""
+_IN_PART, _NOT_DECIDED = "confirmed in part", "not decided"
+"""What a tally says of claims that hold somewhere, and of those that more prints or seeds would decide."""
 _LETTERS = 100
 """Of a line of text, as wide as most terminals."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` are figures by file name: what holds each, and its width [pixels]; ``quick``:
-    of a few points alone; ``warnings`` are on what was measured; ``prints``: over how many test images means are."""
+    """One study on a page; ``message`` is what it says first; ``pictures`` are figures by file name: what holds each,
+    and its width [pixels]; ``quick``: of a few points alone; ``warnings`` are on what was measured; ``prints``: over
+    how many test images means are."""
 
     experiment: Experiment
     title: str
+    message: str
     claims: tuple[Claim, ...]
     pictures: Mapping[str, tuple[str, int]]
     count: str
@@ -66,8 +71,9 @@ class Section:
         return cls(
             experiment=experiment,
             title=experiment.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
+            message=experiment.message(results) or tally(claims),
             claims=tuple(claims),
-            pictures={name: page_figure(figure) for name, figure in figures.items()},
+            pictures={name: page_figure(figures[name]) for name in sorted(figures, key=_images_first)},
             count=f"{len(results.table)} measurements{of}{good}",
             command=" ".join(command),
             tables=tuple(experiment.tables(results)),
@@ -113,6 +119,24 @@ def _numeric(rows: Sequence[Sequence[str]]) -> tuple[bool, ...]:
     return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
 
 
+def tally(claims: Sequence[Claim]) -> str:
+    """How many of some ``claims`` hold; empty of none."""
+    counts = Counter(
+        each.verdict
+        if each.verdict in (CONFIRMED, NOT_CONFIRMED)
+        else _IN_PART
+        if each.verdict.startswith(CONFIRMED)
+        else _NOT_DECIDED
+        for each in claims
+    )
+    kinds = [f"{counts[kind]} {kind}" for kind in (CONFIRMED, _IN_PART, NOT_CONFIRMED, _NOT_DECIDED) if counts[kind]]
+    return f"{len(claims)} claim{'s' * (len(claims) > 1)}: {', '.join(kinds)}" if claims else ""
+
+
+def _images_first(file: str) -> bool:
+    return not file.startswith("images")
+
+
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     """That images of the study ``name`` are flagged in its ``results``, how many and what for; empty where none is."""
     # An image may have many rows, such as a transfer function's.
@@ -134,7 +158,7 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
 
 def build_findings(
     name: str,
-    title: str,
+    titles: tuple[str, str],
     where: str,
     parts: Sequence[Part],
     figures: Mapping[str, Figure],
@@ -144,8 +168,8 @@ def build_findings(
 
     Parameters
     ----------
-    name, title
-        of the study, and the page's head.
+    name, titles
+        of the study, and the page's title and message, which may be empty.
     where
         of which scene and patterns it is.
     parts
@@ -155,11 +179,13 @@ def build_findings(
     warnings
         why its findings may not be trusted, for its head.
     """
+    title, message = titles
     pictures = {file: page_figure(figure) for file, figure in figures.items()}
     return render_page(
         "findings.html",
         name=name,
         title=title,
+        message=message or title,
         where=where,
         parts=parts,
         pictures=pictures,
@@ -180,7 +206,9 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     path
         where.
     """
-    return write_html(path, render_page("study.html", title=title, sections=sections, versions=versions()))
+    message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
+    page = render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
+    return write_html(path, page)
 
 
 def _options(scope: Scope) -> list[str]:

@@ -35,11 +35,16 @@ DPI = 150
 """Figures are 8.6 inches wide: 1290 pixels, the width of a page of text on a common screen."""
 
 
-def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
-    """Write ``figures``, by file name, to a ``folder``; MitsimError when one cannot be written."""
-    for file, figure in figures.items():
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figure]:
+    """Write those of some ``figures``, by file name, that tell anything to a ``folder``, and return these; MitsimError
+    when one cannot be written."""
+    from mitsim.report.plots import tells  # not in processes that measure
+
+    drawn = {file: figure for file, figure in figures.items() if tells(figure)}
+    for file, figure in drawn.items():
         with whole_file(folder / file) as part:
             figure.savefig(part, dpi=DPI, format="png")
+    return drawn
 
 
 class Findings:
@@ -67,6 +72,11 @@ class Findings:
     def parts(self) -> Sequence[Part]:
         """Of its page."""
         return ()
+
+    @property
+    def message(self) -> str:
+        """What the page says first; empty for its title alone."""
+        return ""
 
     @property
     def warnings(self) -> Sequence[str]:
@@ -126,14 +136,14 @@ def run_study(
         result = StudyResult(findings, scene, patterns, str(folder))
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
-        figures = findings.figures()
-        write_figures(folder, figures)
+        figures = write_figures(folder, findings.figures())
         if findings.title:
             from mitsim.studies.framework.page import build_findings
 
             scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
             where = f"{scene_name} {request.seed}."
-            page = build_findings(name, findings.title, where, findings.parts(), figures, result.warnings)
+            titles = findings.title, findings.message
+            page = build_findings(name, titles, where, findings.parts(), figures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")
         for file, table in findings.tables().items():

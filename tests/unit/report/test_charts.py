@@ -1,26 +1,31 @@
 """Figures of studies: curves by numbers in order, grids with their own titles."""
 
-import numpy as np
+from itertools import pairwise
 
-from mitsim.report.pages import Mean
-from mitsim.report.plots import bars, curves, image_grid, pair_chart
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mitsim.report.pages import Mean, page_figure
+from mitsim.report.plots import bars, curves, error_bars, figure_of, image_grid, pair_chart, singular_values, tells
 
 
 def test_curves_are_in_the_order_of_their_numbers() -> None:
     """Also where these are text, and a single value has no standard error. (Planted: text in its own order.)"""
     nan = float("nan")
     shown = {"10": Mean(3.0, 0.5, 2), "2.5": Mean(1.0, nan, 1), "4": Mean(2.0, 0.5, 2)}
-    figure = curves({"left": {"a": shown}, "right": {"a": {}}}, "x [mm]")
+    figure = curves({"above": {"a": shown}, "below": {"a": shown}}, "x [mm]")
     line = figure.axes[0].containers[0].lines[0]
     assert np.array_equal(line.get_xdata(), [2.5, 4, 10]) and np.array_equal(line.get_ydata(), [1, 2, 3])
-    assert [axes.get_title() for axes in figure.axes] == ["left", "right"]
-    assert figure.axes[0].get_xlabel() == "x [mm]" and figure.axes[0].get_ylabel() == "PSNR [dB]"
+    assert [axes.get_title() for axes in figure.axes] == ["above", "below"]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["", "x [mm]"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["PSNR [dB]"] * 2
 
 
 def test_a_curve_without_points_keeps_its_colour_from_others() -> None:
     """So that a cause looks alike in two figures, of which one lacks another; and it has no line in the legend.
     (Planted: colours by the curves that there are.)"""
-    there = {"1": Mean(1.0, 0.1, 2)}
+    there = {"1": Mean(1.0, 0.1, 2), "2": Mean(1.0, 0.1, 2)}
     with_all, without = (curves({"": {"a": there, "b": middle, "c": there}}, "x [mm]") for middle in (there, {}))
     colours = [figure.axes[0].containers[-1].lines[0].get_color() for figure in (with_all, without)]
     assert colours[0] == colours[1]
@@ -53,7 +58,8 @@ def test_long_titles_of_columns_take_two_lines() -> None:
 
 def test_a_title_stands_above_all_panels() -> None:
     """(Planted: the last panel's own.)"""
-    figure = curves({"left": {"a": {"1": Mean(1.0, 0.1, 2)}}, "right": {"a": {}}}, "x [mm]", title="both")
+    shown = {"a": {"1": Mean(1.0, 0.1, 2), "2": Mean(1.0, 0.1, 2)}}
+    figure = curves({"above": shown, "below": shown}, "x [mm]", title="both")
     assert figure.get_suptitle() == "both"
 
 
@@ -88,3 +94,68 @@ def test_what_an_image_has_lost_and_would_lose_are_told_apart() -> None:
     assert len({patch.get_facecolor() for patch in axes.patches}) == 2
     single = bars({"has lost": kinds["has lost"], "would lose": {}}, "lost [dB]").axes[0]
     assert single.get_legend() is None
+
+
+def curve(*points: tuple[float, float]) -> dict[float, Mean]:
+    return {x: Mean(y, float("nan"), 1) for x, y in points}
+
+
+@pytest.mark.parametrize(
+    ("points", "scales"),
+    [
+        (((1, 1e-4), (1000, 1e-1)), ("log", "log")),
+        (((1, 20.0), (64, 30.0)), ("log", "linear")),
+        (((380, 20.0), (420, 30.0)), ("linear", "linear")),
+        (((0, 0.0), (1000, 1e-1)), ("linear", "linear")),
+        (((-1, -1e-4), (1000, 1e-1)), ("linear", "linear")),
+    ],
+)
+def test_an_axis_over_decades_is_logarithmic(points: tuple[tuple[float, float], ...], scales: tuple[str, str]) -> None:
+    """Where none of its numbers is 0 or below. (Planted: x as its caller says, y always linear.)"""
+    (axes,) = curves({"": {"a": curve(*points)}}, "x [mm]", "y [1]").axes
+    assert (axes.get_xscale(), axes.get_yscale()) == scales
+
+
+def test_a_panel_of_nothing_is_left_out() -> None:
+    """One point, or none that is a number, tells nothing along x. (Planted: an empty panel beside the other.)"""
+    nothing = {"point": {"a": curve((1, 20.0))}, "nan": {"a": curve((1, float("nan")), (2, float("nan")))}}
+    figure = curves({**nothing, "told": {"a": curve((1, 20.0), (2, 30.0))}}, "x [mm]")
+    assert [axes.get_title() for axes in figure.axes] == ["told"] and tells(figure)
+    assert not curves(nothing, "x [mm]").axes
+
+
+def charts_of_nothing() -> dict[str, Figure]:
+    """By what is wrong with them."""
+    level, axes = figure_of(2.0)
+    axes.axhline(1.0)
+    axes.plot([1.0], [2.0], "o")
+    return {
+        "one point": curves({"": {"a": curve((1, 20.0))}}, "x [mm]"),
+        "no number": singular_values({"a": np.full(3, np.nan)}),
+        "a level and a point": level,
+        "one error": error_bars({"a": 1e-3}, 1e-2),
+        "no axes": Figure(),
+    }
+
+
+def test_a_chart_of_nothing_tells_nothing() -> None:
+    """(Planted: lines across all of the axes counted as data; what is not a number counted.)"""
+    assert {name: tells(figure) for name, figure in charts_of_nothing().items()} == dict.fromkeys(
+        charts_of_nothing(), False
+    )
+    assert tells(image_grid({"a": [(np.zeros((2, 2)), "")]}, [""])) and tells(error_bars({"a": 1e-3, "b": 1e-4}))
+    assert tells(pair_chart({"a": (Mean(2.0, 0.1, 2), Mean(1.0, 0.1, 2))}, ("one", "other"), "x [dB]"))
+
+
+def test_ticks_of_many_numbers_do_not_run_into_each_other() -> None:
+    """(Planted: one at each number that was measured.)"""
+    figure = curves({"": {"a": curve(*((1000 + x, 20.0 + x) for x in range(30)))}}, "x [mm]")
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in figure.axes[0].get_xticklabels() if text.get_text()]
+    assert len(boxes) > 3 and all(one.x1 <= other.x0 for one, other in pairwise(boxes))
+
+
+def test_a_figure_on_a_page_is_the_same_file_each_time() -> None:
+    """(Planted: matplotlib's own names, which are random, and its date.)"""
+    pages = [page_figure(curves({"": {"a": curve((1, 20.0), (2, 30.0))}}, "x [mm]")) for _ in range(2)]
+    assert pages[0] == pages[1] and pages[0][0].startswith("data:image/svg+xml;base64,")

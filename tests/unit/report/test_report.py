@@ -343,15 +343,19 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
     rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)
-    page = build_findings("toy", "A study", "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
-    assert page.count('<th class="n">') == 2 and page.count('<td class="n">') == 4
+    page = build_findings("toy", ("A study", "7 dB"), "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
+    assert (
+        '<p class="verdict">7 dB</p>' in page
+        and page.count('<th class="n">') == 2
+        and page.count('<td class="n">') == 4
+    )
     assert "512 \u00d7 512 pixels" in page and "2.8\u00d710\u00b9\u00b2" in page and "wide small" in page
 
 
 def test_warnings_of_findings_stand_at_the_head_and_notes_below_the_figures() -> None:
     """(Planted: warnings on the command line alone.)"""
     part = Part("Title", "the lead", notes=("how to read it",))
-    page = build_findings("toy", "A study", "Scene toy", [part], {}, ["losses: a cause is missing"])
+    page = build_findings("toy", ("A study", ""), "Scene toy", [part], {}, ["losses: a cause is missing"])
     head, body = page.split("</header>")
     assert "Losses: a cause is missing." in head and body.index("the lead") < body.index("how to read it")
 

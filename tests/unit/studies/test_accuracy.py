@@ -154,7 +154,13 @@ def test_the_front_is_marked_among_what_was_measured(study: AccuracyFindings) ->
 
 
 def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: Path) -> None:
-    assert {path.name for path in folder.iterdir()} == {"accuracy.json", "accuracy.png", "stages.png", "effects.png"}
+    assert {path.name for path in folder.iterdir()} == {
+        "accuracy.json",
+        "accuracy.html",
+        "accuracy.png",
+        "stages.png",
+        "effects.png",
+    }
     assert result.payload()["output"] == str(folder) and result.payload()["patterns"] == PATTERNS
     kept = json.loads((folder / "accuracy.json").read_text())
     assert len(kept["rows"]) == len(study.rows) and kept["judge"]["seed"] == SEED + 1

@@ -299,7 +299,9 @@ def test_the_page_has_every_loss_in_one_table() -> None:
     (line,) = [line for line in found.lines() if "mask down the rows" in line]
     assert line.split("  ")[0] == "drift, not in this image" and line.endswith("3.00 \N{PLUS-MINUS SIGN} 0.20")
     assert "read noise" not in " ".join(found.lines())
-    assert "mask down the rows" in build_findings("calibration", found.title, "toy", found.parts(), found.figures())
+    assert "mask down the rows" in build_findings(
+        "calibration", (found.title, found.message), "toy", found.parts(), found.figures()
+    )
     assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT).parts()[0].figures
 
 

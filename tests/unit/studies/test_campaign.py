@@ -88,7 +88,7 @@ def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path)
     assert reported["rows"][4]["square"] == float(rows[4]["square"]) == pytest.approx(4, abs=0.1)
     assert reported["status"] == "complete" and reported["kind"] == "toy" and reported["figures"] == ["squares.png"]
     page = (folder / "toy.html").read_text()
-    assert "Two squared is four" in page and "data:image/png;base64," in page and "<script" not in page
+    assert "Two squared is four" in page and "data:image/svg+xml;base64," in page and "<script" not in page
 
 
 def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path, whole: Whole) -> None:

@@ -157,7 +157,12 @@ def test_a_camera_without_a_full_well_is_refused_before_any_light_is_traced(benc
 
 def test_files_and_report(result: StudyResult, study: diffraction_study.DiffractionFindings) -> None:
     folder = Path(result.output)
-    assert sorted(path.name for path in folder.iterdir()) == ["diffraction.json", "quality.png", "shadow.png"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "diffraction.html",
+        "diffraction.json",
+        "quality.png",
+        "shadow.png",
+    ]
     kept = json.loads((folder / "diffraction.json").read_text())
     assert len(kept["shadows"]) == 8
     assert len(kept["quality"]) == 2 * 2 * 7 + 2 * 2 * 2, "idealised: one pair of factors without diffraction"

@@ -177,7 +177,8 @@ def test_a_moved_picture_lights_other_places(stand: DriftStand) -> None:
 def test_what_is_predicted_of_a_worse_image() -> None:
     """A drift that adds as much squared error as the image has costs 3 dB; if the model has half of that image's error,
     it alone would say 4.8. (Planted: decibels subtracted.)"""
-    found = Outcome(before_db=30.0, after_db=27.0, auto_db=27.5, predicted_before_db=33.0103, predicted_db=28.2391)
+    levels = {"before_db": 30.0, "after_db": 27.0, "auto_db": 27.5}
+    found = Outcome(**levels, predicted_before_db=33.0103, predicted_db=28.2391, image=np.zeros((1, 1)))
     assert found.predicted_lost_db == pytest.approx(3.0103, abs=1e-3)
     assert found.predicted_error_db == pytest.approx(4.7712 - 3.0103, abs=1e-3)
     assert found.lost_db == 3.0 and found.lost_auto_db == 2.5

@@ -102,7 +102,7 @@ def test_images_are_those_of_their_rows() -> None:
     lines = {name: found.table.where(patterns=name) for name in "ab"}
     grid = image_rows(found, lines, "number", (2, 1), "number {number}")
     assert list(grid) == ["a"]
-    assert [(image[0, 0], caption) for image, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
+    assert [(image[0, 0], caption) for image, _, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
 
 
 def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
@@ -131,7 +131,7 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
         {"point": point.key, **point.row(psnr_db=psnr, misfit=misfit, flagged=off, reason="misfit" if off else "")}
         for point, psnr, misfit, off in values
     ]
-    results = Results(Table(tuple(rows)), measures=measures)
+    results = Results(Table(tuple(rows)), scope=scope)
     assert not experiment.figures(results)
     section = Section.of(experiment, "sweep", scope, (), {}, results)
     page = build_page([section], tmp_path / "sweep.html", section.title).read_text()
@@ -139,8 +139,10 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
         "mitsim study sweep photograph --over mask=separable,flatcam --measure psnr,misfit --patterns dots:4 --seed 3"
     )
     assert section.command == reported and "Sweep of mask" in page and "Zheng" not in page
+    assert "PSNR is highest at mask separable (31.2 dB), lowest at mask flatcam (20.0 dB)" in page
     assert "1 of 2 images are flagged" in page
     (table,) = section.tables
+    assert table.headings == ("mask", "psnr [dB]", "misfit [1]", "flagged")
     assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))
 
 
@@ -212,7 +214,7 @@ def test_a_sweep_of_a_small_scene(small_scene: Callable[..., Path], variant: str
     swept = (("patterns", ("dots:2", "dots:4")), ("sheet_z", ("380", "400", "420")))
     scope = Scope(setup, (None,), sweep=swept, measures=("psnr", "misfit"))
     found = run_experiment("sweep", scope, tmp_path / "out", where=Where(jobs=1))
-    assert found.figures == ("psnr.png", "misfit.png") and found.points == 6
+    assert found.figures == ("images.png", "psnr.png", "misfit.png") and found.points == 6
     for patterns in ("dots:2", "dots:4"):
         rows = {row["sheet_z"]: row for row in found.rows if row["patterns"] == patterns}
         assert min(rows, key=lambda depth: rows[depth]["misfit"]) == "400"

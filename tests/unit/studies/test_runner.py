@@ -35,7 +35,7 @@ class Toy(Findings):
         return [f"It is {self.value:g}."]
 
     def figures(self) -> dict[str, Figure]:
-        return {"toy.png": plots.error_bars({"a": self.value})}
+        return {"toy.png": plots.error_bars({"a": self.value, "b": 1.0}), "none.png": plots.error_bars({"a": 1.0})}
 
 
 def run(folder: Path, value: float = 1.0, name: str = "toy") -> StudyResult:
@@ -43,6 +43,7 @@ def run(folder: Path, value: float = 1.0, name: str = "toy") -> StudyResult:
 
 
 def test_a_study_is_its_measure_and_the_runner_does_the_rest(tmp_path: Path) -> None:
+    """A chart of one point is not drawn. (Planted: it is.)"""
     result = run(tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["toy.json", "toy.png"]
     written = json.loads((tmp_path / "out" / "toy.json").read_text())
