@@ -328,7 +328,8 @@ class Apparatus:
         from mitsim.core.exr import checksum
 
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
-        files = {os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
+        named = self.loaded.own  # wherever they lie
+        files = {named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
         lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
         stated: dict[str, Any] = plain(
             {
@@ -336,7 +337,7 @@ class Apparatus:
                 "colour": None if self.lines is None else {"filters": self.filters is not None, **asdict(self.lines)},
                 "variant": self.variant,
                 "scene": {"its XML": checksum(self.loaded.path), **files},
-                "parameter": self.defines,
+                "parameter": {name: self.defines[name] for name in self.defines.keys() - {*named.values()}},
                 "board": self.board,
                 "camera": {**self.geometry.identity, **own},
                 "projector": {**lit, "black_level": self.projector.black_level},
@@ -457,7 +458,8 @@ def open_apparatus(
     _wear(loaded, mask, sensor_path)
     _tune(loaded, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return Apparatus(loaded, devices, variant, defines)
+    # By their whole paths: who repeats this from another folder finds them.
+    return Apparatus(loaded, devices, variant, {**defines, **{name: path for path, name in loaded.own.items()}})
 
 
 def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:

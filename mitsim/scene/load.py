@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from mitsim.scene.check import check_file, looking_beside
 from mitsim.scene.film import fit_film
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
+from mitsim.scene.own_files import with_own_files
 from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
@@ -48,7 +49,7 @@ class LoadedScene:
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
     side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None where
-    the scene's counts.
+    the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class LoadedScene:
     notes: tuple[str, ...] = ()
     one_way: bool = False
     sensor_note: str | None = None
+    own: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -116,8 +118,8 @@ def load_scene(
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
     sensor_note = None if sensor is None else fit_film(checked, sensor)
-    moved = move_to_camera(checked.outline, checked.state)
-    with looking_beside(checked.outline):
+    with with_own_files(checked), looking_beside(checked.outline):
+        moved = move_to_camera(checked.outline, checked.state)
         notes = emit_by_faces(checked)  # before thin shapes are meshes, too
         with with_thin_shapes_as_meshes(checked.outline, checked.state):
             scene = mi.parser.instantiate(checked.config, checked.state)
@@ -164,6 +166,7 @@ def load_scene(
         notes,
         _faces_one_way(scene),
         sensor_note,
+        checked.own,
     )
 
 
