@@ -26,6 +26,7 @@ DEPTHS = {
     "gift_card": (397.1, 420.0),
     "metal_blade": (395.4, 420.0),
     "cookie_bag": (363.6, 450.0),
+    "shelf": (358.0, 450.0),
 }
 PRINTED = {
     "lamp_bench": ("sheet",),
@@ -35,7 +36,7 @@ PRINTED = {
     "metal_blade": ("blade",),
     "cookie_bag": ("bag", "box"),
 }
-CLOSED = ("cookie_bag/bag.ply", "cookie_bag/box.ply", "metal_blade/blade.ply")
+CLOSED = ("cookie_bag/bag.ply", "cookie_bag/box.ply", "shelf/object.ply", "metal_blade/blade.ply")
 POWER = 151250.0  # scale of the scenes' projector
 FIELD_STOP = math.tan(math.radians(10))
 

@@ -85,8 +85,6 @@ def _stand(props: mi.Properties, path: Path) -> None:
     except (ValueError, RuntimeError, OSError) as error:
         said = str(error).strip().splitlines()[-1]
         raise MitsimError(f"object {path}: the file {said}") from None
-    if not mesh.face_count():
-        raise MitsimError(f"object {path}: the file has no faces, so nothing shows; export a mesh of triangles")
     props.set_plugin_name(kind[1:])
     props["filename"] = str(path)
     _, sides = tilts(props)
