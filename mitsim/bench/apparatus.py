@@ -329,7 +329,9 @@ class Apparatus:
 
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
         named = self.loaded.own  # wherever they lie
-        files = {named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
+        files = {
+            named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]
+        }
         lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
         stated: dict[str, Any] = plain(
             {
@@ -466,7 +468,9 @@ def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Pa
     """MitsimError, which begins with ``where``, for the usual camera in a ``scene`` whose pixels are another's."""
     from mitsim.scene.film import PITCH_TOLERANCE
 
-    pitches = zip(("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1])
+    pitches = zip(
+        ("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1], strict=True
+    )
     for name, own, stated in pitches:
         if abs(own - stated) > PITCH_TOLERANCE * stated:
             raise MitsimError(

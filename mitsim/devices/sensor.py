@@ -253,7 +253,7 @@ class SensorModel(Configuration, defer_build=True):
             found = self.quantum_efficiency if curve is None else curve.at(wavelength_nm)
         except MitsimError as error:
             raise MitsimError(f"sensor {self.name!r}: {error}") from None
-        if found is None:
+        if self.sensor_only or found is None:
             raise MitsimError(
                 f"sensor {self.name!r}: sensor only: its file states no quantum_efficiency, so light makes no known "
                 "number of electrons; characterise works without; else give a file of two lines, base = (this camera) "

@@ -46,7 +46,7 @@ _PLACES = {
     **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
 }
 """What places and sizes are given by, which mitsim reads before Mitsuba does: types of the property, and its tag."""
-PICTURE, OBJECT = PREPARED = "picture", "object"
+PREPARED = PICTURE, _ = "picture", "object"
 """Parameters whose files mitsim prepares where a user names them."""
 _Type = mi.Properties.Type
 

@@ -48,8 +48,8 @@ class LoadedScene:
     differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
-    side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None where
-    the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
+    side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
+    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
     """
 
     path: Path

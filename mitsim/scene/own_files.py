@@ -1,4 +1,4 @@
-"""A checked scene and the picture or mesh that a user names for it in; the same tree, with files that Mitsuba reads, out.
+"""A checked scene and a user's picture or mesh in; the same tree, with files that Mitsuba reads, out.
 
 A picture becomes the reflectances of a sheet, as :func:`mitsim.core.prints.read_reflectance` reads it, in the middle of
 a square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the

@@ -76,7 +76,7 @@ def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
 
 
 def test_a_camera_with_the_scenes_own_pixels_says_nothing(small_scene: Callable[..., Path], variant: str) -> None:
-    """The usual camera, named, gives the frames that it gives unnamed: whatever the film is. (Planted: a note always.)"""
+    """The usual camera, named, gives the frames that it gives unnamed, whatever the film. (Planted: a note always.)"""
     scene = small_scene()
     named, usual = open_bench(scene, variant, camera="imx249"), open_bench(scene, variant)
     assert named.loaded.sensor_note == "" and usual.loaded.sensor_note is None

@@ -71,7 +71,9 @@ def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monke
     values = np.random.default_rng(1).integers(10, 240, (128, 128)).astype(np.uint8)
     Image.fromarray(np.stack([values, values // 2, values], axis=2)).save(tmp_path / "mine.png")
     monkeypatch.chdir(tmp_path)
-    bench = ms.open_bench("photograph", variant, picture="mine.png", sheet_mm=120)
+    Path("small.toml").write_text('base = "imx249"\nrows = 64\ncolumns = 64\n')
+    with pytest.warns(UserWarning, match="32 x 32 pixels of 11.72 um"):
+        bench = ms.open_bench("photograph", variant, "small.toml", picture="mine.png", sheet_mm=120)
     expected = (2 * values.astype(float) + values // 2) / 3 / 255
     assert_allclose(print_of(bench), expected, atol=1e-6)
     assert bench.defines["picture"] == str(tmp_path / "mine.png")
@@ -91,7 +93,7 @@ def test_an_array_is_a_picture(variant: str, tmp_path: Path, monkeypatch: pytest
     assert ms.flat_scene(codes / 255, variant=variant).defines == bench.defines
     assert len(list(tmp_path.rglob("*.npy"))) == 1
     for wrong in (3, [[1, 2], [3]], codes.astype(complex), None):
-        with pytest.raises(ms.ArgumentError, match="picture.*give a file, or an array"):
+        with pytest.raises(ms.ArgumentError, match=r"picture.*give a file, or an array"):
             ms.flat_scene(wrong)
     with pytest.raises(MitsimError, match=r"its numbers reach from 0 to 1\.5; give 0 to 1"):
         ms.flat_scene(np.array([[0, 1.5]]), variant=variant)
