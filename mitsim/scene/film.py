@@ -1,4 +1,4 @@
-"""A checked scene and a camera file's sensor in; the scene's camera with that sensor's pixels, and a sentence on it, out.
+"""A checked scene and a camera file's sensor in; the scene's camera with its pixels, and a sentence on it, out.
 
 A scene's film and ``pixel_pitch`` stand for what no camera file says: a file that is named says what the sensor is.
 """
