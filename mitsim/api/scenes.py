@@ -69,7 +69,7 @@ def shelf_scene(
     MitsimError
         for a mesh that cannot be read, has no faces, or normals that face into it, and as :func:`mitsim.open_bench`.
     """
-    stated = {"object_mm": size_mm, "object_albedo": reflectance, "object_turn": turn_deg}
+    stated: dict[str, Any] = {"object_mm": size_mm, "object_albedo": reflectance, "object_turn": turn_deg}
     return open_bench("shelf", object=mesh, **stated, **options)
 
 
