@@ -78,7 +78,7 @@ def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monke
     assert_allclose(print_of(bench), expected, atol=1e-6)
     assert bench.defines["picture"] == str(tmp_path / "mine.png")
     assert str(tmp_path / "mine.png") in bench.provenance()["scene_files"]
-    truth = bench.capture("uniform", accuracy=0.05, exposure=0.01).truth
+    truth = np.asarray(bench.capture("uniform", accuracy=0.05, exposure=0.01).truth, dtype=np.float64)
     assert np.abs(truth - expected / BOARD).mean() < 1e-4 and np.abs(truth - expected / BOARD).max() < 0.02
 
 
