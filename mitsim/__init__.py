@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from mitsim.acquire.reference import Rendered as Rendered
     from mitsim.api.bench import Bench as Bench
     from mitsim.api.bench import open_bench as open_bench
+    from mitsim.api.scenes import flat_scene as flat_scene
+    from mitsim.api.scenes import shelf_scene as shelf_scene
     from mitsim.bench.request import Request as Request
     from mitsim.calibrate.model import calibrate_model as calibrate_model
     from mitsim.calibrate.session_plan import CalibrationPlan as CalibrationPlan
@@ -61,6 +63,7 @@ _HOMES = {
         "acquire.capture": "Light",
         "acquire.reference": "Rendered",
         "api.bench": "Bench open_bench",
+        "api.scenes": "flat_scene shelf_scene",
         "bench.request": "Request",
         "calibrate.model": "calibrate_model",
         "calibrate.session_plan": "CalibrationPlan plan_calibration",

@@ -257,6 +257,7 @@ TEXTURES: dict[str, Callable[[], Grey]] = {
     "lamp_bench/projector.png": projector_window,
     "lamp_bench/reflectance.png": pictures.bench_chart,
     "cookie_bag/projector.png": projector_window,
+    "shelf/projector.png": projector_window,
     "cookie_bag/bag.png": pictures.cookie_bag,
     "cookie_bag/box.png": pictures.cardboard_box,
     "gift_card/projector.png": projector_window,
@@ -273,6 +274,7 @@ MESHES: dict[str, Callable[[], meshes.Mesh]] = {
     "colour_checker/frame.ply": chart_frame,
     "cookie_bag/bag.ply": meshes.cookie_bag,
     "cookie_bag/box.ply": meshes.box,
+    "shelf/object.ply": meshes.block,
     "metal_blade/blade.ply": meshes.blade,
 }
 TEXTS: dict[str, Callable[[], str]] = {"colour_checker/patches.xml": chart_patches_xml}

@@ -122,6 +122,12 @@ def box() -> Mesh:
     return Mesh(np.array([point for corners, _ in sides for point in corners]), uv, _quads(len(sides)))
 
 
+def block() -> Mesh:
+    """The box, whose longest side is 1, as a user's mesh has before a scene scales it."""
+    whole = box()
+    return Mesh(whole.points / max(BOX_SIZE), whole.uv, whole.faces)
+
+
 def blade() -> Mesh:
     """A closed blade, 92 mm along x with a slanted tip at the right, 38 mm tall: a flat body (y from 0 to 26) whose
     front is at z = -2, and below it a bevel to an edge at y = -12. The picture covers x from -46 to 46, y from -12 to

@@ -5,6 +5,7 @@ The objects below this floor are data; here they have their verbs, each of which
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -51,7 +52,8 @@ def open_bench(
     variant
         of Mitsuba.
     camera, projector
-        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1.
+        name of a shipped device, or path of its TOML file; None: IMX249 and MP-CL1. The pitch of a camera that is
+        named, and its rows and columns where its file states them, count in place of the scene's, which a warning says.
     allow_outside_files
         whether the scene may read files outside its folder.
     for_render
@@ -62,10 +64,12 @@ def open_bench(
     Raises
     ------
     MitsimError
-        for anything wrong with the files, a camera file whose pixel pitch is not the scene's, or a mask of the
-        scene's where the camera file has one.
+        for anything wrong with the files, a scene whose pixels are not the IMX249's where no camera is named, or a
+        mask of the scene's where the camera file has one.
     """
     opened = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
+    if opened.loaded.sensor_note:
+        warnings.warn(opened.loaded.sensor_note, stacklevel=3)  # of who called: check_arguments stands between
     return Bench(**vars(opened))
 
 

@@ -329,7 +329,10 @@ class Apparatus:
         from mitsim.core.exr import checksum
 
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
-        files = {os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]}
+        named = self.loaded.own  # wherever they lie
+        files = {
+            named.get(str(path)) or os.path.relpath(path, folder): checksum(path) for path in self.loaded.files[1:]
+        }
         lit = self.projector.model_dump(mode="json", exclude={"contrast_ratio", *_NOT_SIMULATED})
         stated: dict[str, Any] = plain(
             {
@@ -337,7 +340,7 @@ class Apparatus:
                 "colour": None if self.lines is None else {"filters": self.filters is not None, **asdict(self.lines)},
                 "variant": self.variant,
                 "scene": {"its XML": checksum(self.loaded.path), **files},
-                "parameter": self.defines,
+                "parameter": {name: self.defines[name] for name in self.defines.keys() - {*named.values()}},
                 "board": self.board,
                 "camera": {**self.geometry.identity, **own},
                 "projector": {**lit, "black_level": self.projector.black_level},
@@ -370,8 +373,6 @@ class Apparatus:
 # -------- Opening a scene, a camera and a projector
 
 Opened = TypeVar("Opened", bound=Apparatus)
-_PITCH_TOLERANCE = 1e-3
-"""Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 
 
 def check_scene(
@@ -469,22 +470,33 @@ def open_apparatus(
         try:
             sensor.efficiency(light.effective_wavelength_nm)
         except MitsimError as error:
-            fits = f"it goes with scenes whose pixel_pitch is {sensor.superpixel_pitch_um * 1e-3:g} mm"
-            raise MitsimError(f"camera {sensor_path}: {error}; {fits}") from None
+            raise MitsimError(f"camera {sensor_path}: {error}") from None
     # Only now, with all else checked: the renderer takes a second to import.
-    loaded = _load(variant, path, defines, needs_projector=not for_render, outside=allow_outside_files)
-    row_um = (sensor.row_pitch_um or sensor.pixel_pitch_um) * sensor.binning
-    of_rows, of_columns = zip((row_um, sensor.superpixel_pitch_um), loaded.camera.geometry.pitches, strict=True)
-    for name, (um, stated) in (("pixel_pitch", of_columns), ("row_pitch", of_rows)):
-        if not for_render and abs(um * 1e-3 - stated) > _PITCH_TOLERANCE * stated:
-            raise MitsimError(
-                f"camera {sensor_path}: its binned {name.replace('_', ' ')} is {um:g} um, but {scene} has "
-                f"{stated * 1e3:g} um; use the camera of that scene, or change {name}, or binning"
-            )
+    options = {"needs_projector": not for_render, "outside": allow_outside_files}
+    loaded = _load(variant, path, defines, **options, **({} if camera is None else {"sensor": sensor}))
+    if camera is None and not for_render:
+        _check_pitch(loaded, sensor, f"camera {sensor_path}", scene)
     _wear(loaded, mask, sensor_path)
     _tune(loaded, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
-    return Apparatus(loaded, devices, variant, defines)
+    # By their whole paths: who repeats this from another folder finds them.
+    return Apparatus(loaded, devices, variant, {**defines, **{name: path for path, name in loaded.own.items()}})
+
+
+def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:
+    """MitsimError, which begins with ``where``, for the usual camera in a ``scene`` whose pixels are another's."""
+    from mitsim.scene.film import PITCH_TOLERANCE
+
+    pitches = zip(
+        ("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1], strict=True
+    )
+    for name, own, stated in pitches:
+        if abs(own - stated) > PITCH_TOLERANCE * stated:
+            raise MitsimError(
+                f"{where}: its binned {name.replace('_', ' ')} is {own * 1e3:g} um, but {scene} has "
+                f"{stated * 1e3:g} um; name the scene's own camera by --camera, whose pixels count then, or change "
+                f"{name}"
+            )
 
 
 def reopen(bench: Opened, variant: str) -> Opened:
@@ -493,7 +505,8 @@ def reopen(bench: Opened, variant: str) -> Opened:
     from mitsim.devices.mask_profile import load_mask
 
     camera = Path(bench.devices.camera_file)
-    loaded = _load(variant, bench.loaded.path, bench.defines, outside=True)
+    given = {} if bench.loaded.sensor_note is None else {"sensor": bench.sensor}
+    loaded = _load(variant, bench.loaded.path, bench.defines, outside=True, **given)
     _wear(loaded, load_mask(camera), camera)
     _tune(loaded, bench.projector)
     return replace(bench, loaded=loaded, variant=variant)
@@ -514,7 +527,7 @@ def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
 
 
 @pause_collector()
-def _load(variant: str, path: Path, defines: Mapping[str, str], **options: bool) -> LoadedScene:
+def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) -> LoadedScene:
     """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene

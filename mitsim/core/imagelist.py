@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".tif", ".tiff", ".npy", ".exr", ".dng")
 """Endings of files that say themselves what they hold."""
+JPEG = (".jpg", ".jpeg")
+"""Endings of pictures that no frames are read from."""
+PRINTS = (*FORMATS[:-1], *JPEG)
+"""Of files that pictures to put on a sheet are taken of: all but a camera's raw files."""
 BARE = (".raw", ".bin", ".dat")
 """Endings of files without a header."""
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, read_toml, validate
+from mitsim.core.configuration import Configuration, locate, read_toml, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Digital
 
@@ -21,10 +21,18 @@ EXPOSURE_FRACTION = 1e-6, 1.0
 ExposureFraction = Annotated[
     float, Field(strict=True, ge=EXPOSURE_FRACTION[0], le=EXPOSURE_FRACTION[1], allow_inf_nan=False)
 ]
+MOST_PIXELS = 1 << 20
+"""Along a side of a sensor, before binning: frames are of at most 16 384, binned up to 64 times."""
+BASE = "base"
+"""Name of a file's line that says which camera's fields it takes where it has none of its own."""
+_MOST_BASES = 4
+"""Files that stand on each other; chosen: people need one."""
 _LARGEST_CODE = 2**32 - 1
 """What a frame's uint32 holds."""
 _ALWAYS = {"binning", "dark_current_e_per_s", "black_level_dn", "bits"}
 """Fields that manifests hold whatever they are: calibrations of 0.4 do."""
+_EFFICIENCIES = {"quantum_efficiency"}, {"quantum_efficiency_curve"}, {"mosaic", "mosaic_curves"}
+"""Fields of which one kind replaces the others, in a file that stands on another."""
 _LEVELS = 256
 """Parts of the full well at which the linearity polynomial must rise: its terms end at the fifth power."""
 
@@ -52,6 +60,10 @@ class SensorModel(Configuration, defer_build=True):
     Pixels of telephones have 0.5 um, those of X-ray panels some 100 um."""
     row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
     """Distance between rows of pixels that are not square, um; none: as above."""
+    rows: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
+    """Rows of pixels that are read, about the sensor's middle; none: as many as the scene's film has."""
+    columns: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
+    """Columns of the same."""
     binning: int = Field(default=1, ge=1, le=64)
     """Pixels summed along each side of a superpixel.
 
@@ -166,6 +178,16 @@ class SensorModel(Configuration, defer_build=True):
         return self
 
     @model_validator(mode="after")
+    def _a_format(self) -> SensorModel:
+        if (self.rows is None) != (self.columns is None):
+            raise ValueError("rows and columns go together; give both, or none")
+        if self.rows is not None and self.columns is not None and min(self.rows, self.columns) < self.binning:
+            raise ValueError(
+                f"rows {self.rows} and columns {self.columns} hold no superpixel of binning {self.binning}; bin less"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _effects_are_whole(self) -> SensorModel:
         if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
             raise ValueError(
@@ -231,10 +253,11 @@ class SensorModel(Configuration, defer_build=True):
             found = self.quantum_efficiency if curve is None else curve.at(wavelength_nm)
         except MitsimError as error:
             raise MitsimError(f"sensor {self.name!r}: {error}") from None
-        if found is None:
+        if self.sensor_only or found is None:
             raise MitsimError(
-                f"sensor {self.name!r}: its file states no quantum_efficiency, so light makes no known number of "
-                "electrons; put one, with its source, into a copy of the file (characterise works without)"
+                f"sensor {self.name!r}: sensor only: its file states no quantum_efficiency, so light makes no known "
+                "number of electrons; characterise works without; else give a file of two lines, base = (this camera) "
+                "and quantum_efficiency = (yours)"
             )
         return float(found)
 
@@ -252,6 +275,24 @@ class SensorModel(Configuration, defer_build=True):
     def states_efficiency(self) -> bool:
         """Whether light makes a known number of electrons in a pixel without colour filters."""
         return self.quantum_efficiency is not None or self.quantum_efficiency_curve is not None
+
+    @property
+    def sensor_only(self) -> bool:
+        """Whether it characterises alone: no source gives what light becomes, so it can neither capture nor sense."""
+        return not self.states_efficiency and self.mosaic is None
+
+    @property
+    def frame_shape(self) -> tuple[int, int] | None:
+        """Rows and columns of superpixels that are read, whole ones; None: as many as the scene's film has."""
+        if self.rows is None or self.columns is None:
+            return None
+        return self.rows // self.binning, self.columns // self.binning
+
+    @property
+    def pitches_mm(self) -> tuple[float, float]:
+        """Distances between rows, and between columns of superpixels [mm]."""
+        row = self.pixel_pitch_um if self.row_pitch_um is None else self.row_pitch_um
+        return row * self.binning * 1e-3, self.superpixel_pitch_um * 1e-3
 
     @property
     def identity(self) -> dict[str, object]:
@@ -394,10 +435,26 @@ def check_exposure(seconds: float) -> float:
 
 def load_sensor(path: Path | str) -> SensorModel:
     """The sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
-    (:func:`mitsim.devices.mask_profile.load_mask`). MitsimError names the file, field, value and rule."""
-    table = read_toml(path)
+    (:func:`mitsim.devices.mask_profile.load_mask`). A line ``base`` names a shipped camera, or a file beside it, whose
+    fields count where the file has none of its own. MitsimError names the file, field, value and rule."""
+    table, read, first = read_toml(path), [Path(path).resolve()], path
+    while (base := table.pop(BASE, None)) is not None:
+        if not isinstance(base, str):
+            raise MitsimError(f"file {path}: {BASE}: got {base!r}; give the name of a camera, or a file")
+        beside = Path(path).parent / base
+        path = beside if beside.is_file() else locate(base, "calibration", ".toml")
+        if path.resolve() in read or len(read) > _MOST_BASES:
+            raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
+        read.append(path.resolve())
+        below = read_toml(path)
+        if "mask" in below and "mask" not in table:
+            raise MitsimError(f"file {first}: {BASE}: {path} has a table [mask], which stays there; give one here")
+        if any(kind & table.keys() for kind in _EFFICIENCIES):
+            others = [kind for kind in _EFFICIENCIES if not kind & table.keys()]
+            below = {name: below[name] for name in below.keys() - set().union(*others)}
+        table = {**below, **table}
     table.pop("mask", None)
-    return validate(SensorModel, table, f"file {path}")
+    return validate(SensorModel, table, f"file {first}")
 
 
 def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:

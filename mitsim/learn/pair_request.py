@@ -14,7 +14,7 @@ from pydantic import Field, field_validator
 from mitsim.bench.request import Exposure, Request
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.imagelist import FORMATS
+from mitsim.core.imagelist import PRINTS
 from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 
@@ -22,10 +22,6 @@ MOST_PAIRS = 10**6
 """Pairs that may be asked for: beyond what any network of these was trained on, and within five digits of shards."""
 CALIBRATION = "calibration"
 """CAL folder in a folder of pairs of the idealised model, whose factors are known."""
-JPEG = (".jpg", ".jpeg")
-"""Endings of pictures that no frames are read from."""
-ENDINGS = (*FORMATS[:-1], *JPEG)
-"""Of files that pictures are taken of: all but a camera's raw files."""
 Between = Annotated[tuple[float, float], Field(strict=False)]
 """Least and largest number that are drawn, all between them alike."""
 
@@ -125,7 +121,7 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     """The pictures in a ``folder``, by their names. MitsimError where there are none."""
     if not folder.is_dir():
         raise MitsimError(f"pictures {folder}: is no folder; give one of pictures")
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PRINTS)
     if not found:
-        raise MitsimError(f"pictures {folder}: holds no file that ends in {', '.join(ENDINGS)}")
+        raise MitsimError(f"pictures {folder}: holds no file that ends in {', '.join(PRINTS)}")
     return tuple(found)

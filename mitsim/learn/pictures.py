@@ -20,10 +20,9 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
-from mitsim.core.imagelist import Wanted
-from mitsim.core.images import read_image
+from mitsim.core.prints import read_reflectance
 from mitsim.core.seeds import stream
-from mitsim.learn.pair_request import JPEG, picture_files
+from mitsim.learn.pair_request import picture_files
 
 Codes = npt.NDArray[np.uint8]
 """(n, n) reflectance in steps of 1/255."""
@@ -193,8 +192,6 @@ def _codes(reflectance: FloatArray) -> Codes:
 
 _SMALLEST_CROP = 0.5
 """Least side of a crop over that of the whole: so small that crops differ, so large that they are still pictures."""
-_JPEG_SIDE = 16384
-"""Pixels a side of the largest JPEG that is read, as of other pictures."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +223,7 @@ class FolderPictures:
         MitsimError for a file that cannot be read, or has fewer pixels.
         """
         path = self.files[number % len(self.files)]
-        grey = _read_grey(path)
+        grey = read_reflectance(path)
         whole = min(grey.shape)
         if whole < n:
             raise MitsimError(f"picture {path}: has {whole} pixels on its shorter side, and {n} are shown; give larger")
@@ -239,32 +236,6 @@ class FolderPictures:
             turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
         square = np.rot90(grey[places[0] : places[0] + side, places[1] : places[1] + side], turns)
         return _codes(_shrink(square[:, ::-1] if mirrored else square, n))
-
-
-def _read_grey(path: Path) -> FloatArray:
-    """(rows, columns) numbers of a picture from 0 to 1, the mean of its colours, as they are stored: no gamma."""
-    values = _read_jpeg(path) if path.suffix.lower() in JPEG else read_image(path, Wanted("picture", colour=True))
-    most = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
-    grey = np.asarray(values, dtype=np.float64) / most
-    if grey.ndim == 3:
-        if (grey[..., 3:] < 1).any():
-            raise MitsimError(f"picture {path}: has transparent pixels; lay it on a ground, and save it without")
-        grey = grey[..., :3].mean(axis=2)
-    if not (np.isfinite(grey).all() and grey.min() >= 0 and grey.max() <= 1):
-        raise MitsimError(f"picture {path}: its numbers reach from {grey.min():g} to {grey.max():g}; give 0 to 1")
-    return np.asarray(grey)
-
-
-def _read_jpeg(path: Path) -> npt.NDArray[np.uint8]:
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=("JPEG",)) as picture:
-            if max(picture.size) > _JPEG_SIDE:
-                raise MitsimError(f"picture {path}: {picture.size} pixels; at most {_JPEG_SIDE} a side are read")
-            return np.asarray(picture.convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise MitsimError(f"picture {path}: cannot be read as a JPEG ({error}); write it again") from error
 
 
 def _shrink(square: FloatArray, n: int) -> FloatArray:

@@ -47,6 +47,8 @@ _PLACES = {
     **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
 }
 """What places and sizes are given by, which mitsim reads before Mitsuba does: types of the property, and its tag."""
+PREPARED = PICTURE, _ = "picture", "object"
+"""Parameters whose files mitsim prepares where a user names them."""
 _Type = mi.Properties.Type
 
 
@@ -59,7 +61,8 @@ class CheckedScene:
     ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
     into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``without_normals`` are names
-    of the meshes' files that give their vertices no normals.
+    of the meshes' files that give their vertices no normals; ``own`` are paths of files that a user names and mitsim
+    prepares, with their parameter.
     """
 
     outline: Outline
@@ -74,6 +77,7 @@ class CheckedScene:
     parting: tuple[Tag, ...]
     samples: int | None
     without_normals: frozenset[str]
+    own: Mapping[str, str]
 
 
 def check_file(
@@ -104,16 +108,17 @@ def check_file(
     # Without optimize, for that merges rectangles of one material into a mesh that has lost their boxes and names.
     config.parallel = config.merge_equivalent = config.merge_meshes = False
     with looking_beside(outline):
-        state = mi.parser.parse_file(config, str(path), **defines)
+        state = mi.parser.parse_file(config, str(path), **outline.defines)
         mi.parser.transform_all(config, state)
     tree = _Tree(outline, files, variant, [mi.parser.SceneNode(node) for node in state.nodes])
     tree.check()
     # Groups are in the scene by their instances alone.
     shapes = [plugin for plugin in PLUGINS["shape"].split() if plugin != "shapegroup"]
     facts = tuple(files.used), tree.limits, Unfit.of(outline, tree.nodes)
+    own = {str(path): name for path, name in files.own.items() if name in PREPARED}
     listed = tuple(tree.tags_of(shapes)), tuple(tree.tags_of(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
     without_normals = frozenset(name for name, given in tree.normals.items() if given == {False})
-    return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals)
+    return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals, own)
 
 
 @contextmanager
@@ -229,6 +234,8 @@ class _Tree:
             got = "no text" if "filename" in node.props else "nothing"
             raise tag.refusal("filename", got, f"a {plugin} reads one file")
         path = self.files.resource(tag, name)
+        if self.files.own.get(path) in PREPARED:
+            return  # mitsim reads it itself, and makes a file of it that is as Mitsuba needs it
         try:
             if plugin in _IMAGES:
                 texels, grey = check_image(path)

@@ -90,7 +90,9 @@ def check_obj(path: Path) -> bool:
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
     with open(path, "rb") as file:
-        lines = [line.split()[:4] for line in file if line.split()[:1] in ([b"v"], [b"vn"])]
+        lines = [line.split()[:4] for line in file if line.split()[:1] in ([b"v"], [b"vn"], [b"f"])]
+    faces = sum(key == b"f" for key, *_ in lines)
+    lines = [line for line in lines if line[0] != b"f"]
     try:
         points = np.array([words for key, *words in lines if key == b"v"], dtype=np.float64)
     except ValueError:
@@ -98,6 +100,8 @@ def check_obj(path: Path) -> bool:
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError("is no Wavefront mesh: it has no vertices of three numbers")
     _check_points(points)
+    if not faces:
+        raise ValueError("has no faces: it is a cloud of points; export a mesh")
     return len(lines) > len(points)
 
 

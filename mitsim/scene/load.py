@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +17,15 @@ import numpy.typing as npt
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file, looking_beside
+from mitsim.scene.film import fit_film
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
+from mitsim.scene.own_files import with_own_files
 from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 from mitsim.scene.window import ProjectorGrid, locate_projector
+
+if TYPE_CHECKING:
+    from mitsim.devices.sensor import SensorModel
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
@@ -42,7 +48,8 @@ class LoadedScene:
     differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
-    side that reflects the same way.
+    side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
+    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
     """
 
     path: Path
@@ -62,6 +69,8 @@ class LoadedScene:
     samples: int | None = None
     notes: tuple[str, ...] = ()
     one_way: bool = False
+    sensor_note: str | None = None
+    own: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -78,7 +87,11 @@ class LoadedScene:
 
 @keep_scenes()
 def load_scene(
-    path: Path, defines: Mapping[str, str] | None = None, needs_projector: bool = True, outside: bool = False
+    path: Path,
+    defines: Mapping[str, str] | None = None,
+    needs_projector: bool = True,
+    outside: bool = False,
+    sensor: SensorModel | None = None,
 ) -> LoadedScene:
     """Load a scene XML into the current variant; the plugin ``mitsim_lensless`` must be registered.
 
@@ -92,6 +105,8 @@ def load_scene(
         refuse a scene without exactly one projector, or one that the factored estimator cannot render.
     outside
         allow files outside the scene's folder.
+    sensor
+        whose pitch and format count; None: the scene's.
 
     Raises
     ------
@@ -102,8 +117,9 @@ def load_scene(
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
-    moved = move_to_camera(checked.outline, checked.state)
-    with looking_beside(checked.outline):
+    sensor_note = None if sensor is None else fit_film(checked, sensor)
+    with with_own_files(checked), looking_beside(checked.outline):
+        moved = move_to_camera(checked.outline, checked.state)
         notes = emit_by_faces(checked)  # before thin shapes are meshes, too
         with with_thin_shapes_as_meshes(checked.outline, checked.state):
             scene = mi.parser.instantiate(checked.config, checked.state)
@@ -149,6 +165,8 @@ def load_scene(
         checked.samples,
         notes,
         _faces_one_way(scene),
+        sensor_note,
+        checked.own,
     )
 
 

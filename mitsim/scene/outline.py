@@ -92,13 +92,16 @@ class Outline:
     ----------
     path
         the scene's XML.
+    defines
+        values of parameters by name, where they are files by their whole paths.
     projected
         files that objects inside its projectors name.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
         self._files = files
-        self._values = dict(defines)
+        self._values, self._given = dict(defines), defines
+        self.defines = dict(defines)
         self._defaults: set[str] = set()
         self.path = path
         self._tags: dict[tuple[int, int, str], Tag] = {}
@@ -165,6 +168,8 @@ class Outline:
             if self._elements > MOST_ELEMENTS:
                 raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
+            if (name, attributes.get("name")) == ("string", "filename"):
+                self._name_file(tag)
             texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
                 raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
@@ -206,6 +211,13 @@ class Outline:
             raise MitsimError(f"{path}:{error.lineno}: not well-formed XML ({reason}); mend the file") from None
         except ValueError as error:  # an encoding that Python does not know
             raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
+
+    def _name_file(self, tag: Tag) -> None:
+        """Where the file is that a user gave for the parameter that a ``tag`` is, if it is one."""
+        value = tag.attributes.get("value", "")
+        if value.startswith("$") and value[1:] in self._given:
+            path = str(self._files.named(value[1:], self._given[value[1:]]))
+            self.defines[value[1:]] = self._values[value[1:]] = path
 
     def _with_parameters(self, tag: Tag, text: str) -> str:
         """The text with its parameters put in."""
@@ -305,7 +317,7 @@ _MOST_SPECTRUM = 1 << 20
 
 
 class SceneFiles:
-    """What one scene may read; ``used`` lists it, the scene first.
+    """What one scene may read; ``used`` lists it, the scene first, ``own`` the parameters of files that a user names.
 
     Parameters
     ----------
@@ -318,6 +330,7 @@ class SceneFiles:
     def __init__(self, scene: Path, outside: bool = False) -> None:
         self.folder = scene.parent
         self.outside = outside
+        self.own: dict[Path, str] = {}
         self.used: dict[Path, None] = {}
 
     def scene(self, path: Path) -> Path:
@@ -355,6 +368,36 @@ class SceneFiles:
         file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
         return self._find(tag, self.folder, name)
 
+    def named(self, parameter: str, name: str) -> Path:
+        """The whole path of the file that a user names in place of a scene's own, which may lie anywhere.
+
+        Parameters
+        ----------
+        parameter, name
+            the scene's parameter, and what it was set to: from the working folder if it begins with a dot, in the
+            scene's folder if only that has it.
+
+        Raises
+        ------
+        MitsimError
+            for a file that there is not, and a name that both folders have.
+        """
+        own, here = self.folder / name, Path(name)
+        places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
+        found = {place.resolve(): place for place in places if place.is_file()}
+        if not found:
+            folders = " or ".join(str(folder) for folder in dict.fromkeys((Path.cwd(), self.folder)))
+            raise MitsimError(f"parameter {cut(parameter)}={cut(name)}: no such file in {folders}; mend the name")
+        if len(found) > 1:
+            raise MitsimError(
+                f"parameter {cut(parameter)}={cut(name)}: the scene's folder and the working folder have a file of "
+                f"that name; give ./{cut(name)} or {own}"
+            )
+        path = next(iter(found.values()))
+        path = self.folder.absolute() / name if path == own else path.absolute()
+        self.own[path] = parameter
+        return path
+
     def _find(self, tag: Tag, folder: Path, name: str) -> Path:
         path = folder / name
         try:
@@ -362,7 +405,7 @@ class SceneFiles:
             inside = path.resolve().is_relative_to(self.folder.resolve())
         except (OSError, ValueError, RuntimeError):
             raise tag.refusal("filename", repr(name), f"no such file in {folder}; mend the name") from None
-        if not (inside or self.outside):
+        if not (inside or self.outside or path in self.own):
             rule = f"files lie in the scene's folder {self.folder}; copy it there, or use --allow-outside-files"
             raise tag.refusal("filename", repr(name), rule)
         if not stat.S_ISREG(status.st_mode) or not 0 < status.st_size <= _MOST_BYTES_OF_A_SCENE:

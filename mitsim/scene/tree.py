@@ -419,7 +419,7 @@ def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
         props = node.props
         if props.plugin_name() not in _MESHES or not _emits(props, nodes) or props.get("face_normals", False):
             continue
-        sines, sides = _tilts(props)
+        sines, sides = tilts(props)
         if not sines.size or sines.max() < _FLAT:
             continue
         tag = checked.outline.tag(node)
@@ -444,8 +444,9 @@ def _emits(props: mi.Properties, nodes: Sequence[mi.parser.SceneNode]) -> bool:
     return any(nodes[index].props.plugin_name() == "area" for index in references(props))
 
 
-def _tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
-    """At every corner of the faces, (k,) each: sine of the angle between its normal and the face, and their cosine."""
+def tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
+    """At every corner of the faces of a mesh's ``props``, (k,) each: sine of the angle between its normal and the face,
+    and their cosine; none where vertices have no normals."""
     geometry = {name: props[name] for name in ("filename", "flip_normals", "to_world") if name in props}
     mesh = mi.load_dict({"type": props.plugin_name(), **geometry})
     if not mesh.has_vertex_normals():

@@ -35,7 +35,9 @@ class Loader:
     def loaded(self, variant: str, path: Path, defines: Any, **options: bool) -> Any:
         self.asked.append((variant, path, dict(defines), options))
         geometry = SimpleNamespace(pitches=self.pitches)
-        return SimpleNamespace(camera=SimpleNamespace(geometry=geometry, wear=self.worn.append), path=path, parting=())
+        camera = SimpleNamespace(geometry=geometry, wear=self.worn.append)
+        note = "" if "sensor" in options else None
+        return SimpleNamespace(camera=camera, path=path, parting=(), own={}, sensor_note=note)
 
 
 @pytest.fixture
@@ -133,15 +135,16 @@ def test_pitches_are_the_scenes_to_a_thousandth(
     open_bench(scene, for_render=True)
 
 
-def test_tall_pixels_are_binned_down_the_rows_as_well(loader: Loader, scene: Path, camera: Callable[..., Path]) -> None:
-    """(Planted: the pitch of single rows; that of columns for both.)"""
+def test_pixels_of_a_camera_that_is_named_are_the_scenes(
+    loader: Loader, scene: Path, camera: Callable[..., Path]
+) -> None:
+    """Its sensor goes to the loader, and goes there again. (Planted: left out where a bench is opened anew.)"""
     tall = camera(row_pitch_um="7.0")
-    loader.pitches = 0.014, 0.01172
-    open_bench(scene, camera=tall)
-    for pitches in ((0.007, 0.01172), (0.01172, 0.01172)):
-        loader.pitches = pitches
-        with pytest.raises(MitsimError, match="row pitch is 14 um"):
-            open_bench(scene, camera=tall)
+    bench = open_bench(scene, camera=tall)
+    assert loader.asked[-1][3]["sensor"] == bench.sensor
+    assert bench.sensor.pitches_mm == pytest.approx((0.014, 0.01172), rel=1e-12)
+    opening.reopen(bench, "llvm_ad_rgb")
+    assert loader.asked[-1][3] == {"outside": True, "sensor": bench.sensor}
 
 
 def test_a_camera_that_is_blind_to_the_projector_is_refused(

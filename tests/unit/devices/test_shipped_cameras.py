@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from mitsim.api.bench import open_bench
+from mitsim.bench import apparatus as opening
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.sensor import load_sensor
@@ -29,21 +31,56 @@ def serves(camera: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("camera", SENSORS, ids=lambda path: path.stem)
-def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(camera: Path) -> None:
-    """(Seen failing: files that said nothing, and a refusal that named one of the two things that were missing.)"""
+def test_a_camera_captures_as_its_file_says_or_is_told_what_it_lacks(
+    camera: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before a scene is loaded. (Seen failing: files that said nothing. Planted: one without efficiency let pass.)"""
+    asked: list[Any] = []
+    monkeypatch.setattr(opening, "_load", lambda *_, **options: asked.append(options["sensor"]) or loaded())
     sensor, verbs = load_sensor(camera), serves(camera)
-    pitch = f"{sensor.superpixel_pitch_um * 1e-3:g}"
     assert "characterise" in verbs and {*verbs} <= {"capture", "sense", "characterise"}
-    assert ("sense" in verbs) == (sensor.states_efficiency and sensor.mosaic is None)
+    assert sensor.sensor_only == ("capture" not in verbs) == ("Sensor only" in camera.read_text(encoding="utf-8"))
+    assert ("sense" in verbs) == sensor.states_efficiency
     if "capture" in verbs and sensor.mosaic is None:
-        assert open_bench("photograph", camera=camera).devices.sensor == sensor
+        assert open_bench("photograph", camera=camera).devices.sensor == sensor and asked == [sensor]
         return
     with pytest.raises(MitsimError) as caught:
         open_bench("photograph", camera=camera)
-    lacking = "--colour mosaic" if sensor.mosaic else "put one, with its source, into a copy of the file"
-    assert lacking in (line := str(caught.value)) and line.endswith(f"scenes whose pixel_pitch is {pitch} mm")
-    own = f"`pixel_pitch` is {pitch}" if sensor.mosaic else "`quantum_efficiency`"
-    assert "capture" in verbs or own in camera.read_text(encoding="utf-8")
+    lacking = "--colour mosaic" if sensor.mosaic else "sensor only: its file states no quantum_efficiency"
+    assert lacking in str(caught.value) and not asked
+
+
+def loaded() -> Any:
+    camera = SimpleNamespace(geometry=None)
+    return SimpleNamespace(camera=camera, parting=(), own={}, sensor_note="", path=Path("scene.xml"))
+
+
+@pytest.mark.parametrize("camera", [path for path in SENSORS if load_sensor(path).rows], ids=lambda path: path.stem)
+def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
+    camera: Path, small_scene: Callable[..., Path], tmp_path: Path, variant: str
+) -> None:
+    """A file of two lines that stands on a sensor alone captures with it: its pitch, rows and columns, whatever the
+    scene's film is. (Planted: columns for rows; the scene's pitch kept; the window of its film kept.)"""
+    own, sensor = tmp_path / "own.toml", load_sensor(camera)
+    own.write_text(f'base = "{camera.stem}"\nquantum_efficiency = 0.5\nbinning = 16\n')
+    scene = small_scene()
+    window = "".join(f'<integer name="crop_{name}" value="2"/>' for name in ("offset_x", "offset_y", "width", "height"))
+    scene.write_text(scene.read_text().replace("<rfilter", f"{window}<rfilter"))
+    with pytest.warns(UserWarning, match=f"{sensor.rows // 16} x {sensor.columns // 16} pixels of "):
+        bench = open_bench(scene, variant, camera=own)
+    assert bench.sensor.quantum_efficiency == 0.5 and bench.sensor.mosaic is None
+    assert bench.geometry.shape == (sensor.rows // 16, sensor.columns // 16) and bench.geometry.roi is None
+    assert bench.geometry.pitches == pytest.approx((16e-3 * sensor.pixel_pitch_um,) * 2, rel=1e-12)
+    assert [*bench.loaded.camera.film().size()] == [sensor.columns // 16, sensor.rows // 16]
+    assert bench.in_variant(variant).geometry == bench.geometry
+
+
+def test_a_camera_with_the_scenes_own_pixels_says_nothing(small_scene: Callable[..., Path], variant: str) -> None:
+    """The usual camera, named, gives the frames that it gives unnamed, whatever the film. (Planted: a note always.)"""
+    scene = small_scene()
+    named, usual = open_bench(scene, variant, camera="imx249"), open_bench(scene, variant)
+    assert named.loaded.sensor_note == "" and usual.loaded.sensor_note is None
+    assert named.geometry == usual.geometry and named.identity() == usual.identity()
 
 
 def test_the_page_of_formats_lists_every_camera() -> None:
