@@ -40,6 +40,7 @@ FLOORS = (
     "learn",
     "studies",
     "exchange",
+    "verbs",
     # The command line stands on the face, as a user's own program does.
     "mitsim",
     "cli",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
-from mitsim.core.images import card, normalise, png, span
+from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -34,6 +34,10 @@ from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.subpixel import print_energy
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -163,9 +167,10 @@ class Reconstruction(Solution):
             return self.write(place, more)
 
     @check_arguments
-    def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
+    def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
+        folder = Path(folder)
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
         )
@@ -179,6 +184,31 @@ class Reconstruction(Solution):
             part.write_bytes(png(self.image / self.white))
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
         return folder
+
+    @check_arguments
+    def plot(self, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None) -> Axes:
+        """Draw the image, its standard uncertainty or the depths with a colour bar; returns the axes.
+
+        Parameters
+        ----------
+        quantity
+            what is drawn.
+        ax
+            matplotlib's axes to draw on; None: those of a new figure.
+
+        Raises
+        ------
+        MitsimError
+            for an uncertainty or depths that are not known.
+        """
+        return from_above("report.plots", "draw_image")(self, quantity, ax)
+
+    @check_arguments
+    def to_xarray(self, factors: Factors | None = None) -> Dataset:
+        """The image, and where known its uncertainty and depths, as an ``xarray.Dataset`` with units; by the
+        ``factors`` that it was solved with, coordinates in mm too. MitsimError where xarray, an extra, is not
+        installed."""
+        return from_above("exchange.labelled", "label_image")(self, factors)
 
     def __repr__(self) -> str:
         rows, columns = self.image.shape
