@@ -383,7 +383,7 @@ def scope_of(
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), patterns=patterns)
     if varied or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
-        others = "--measure is for sweep, --over and --patterns for drift and sweep"
+        others = "measure is for sweep, over and patterns for drift and sweep"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 
@@ -420,9 +420,7 @@ def _run_whole(
         settings |= {"variant": asked.variant} if name == "twin" else {}
     run_study = find_study(name, **settings)
     if asked.over or asked.measure != _MAIN_MEASURE or asked.shard != WHOLE or asked.jobs or asked.scheduler:
-        raise MitsimError(
-            f"study {name}: is measured whole, here; leave out --over, --measure, --shard, --jobs, --scheduler"
-        )
+        raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")
     _refuse(given, ["quick"], f"on the study {name}, which has no points to leave out")
     if name in OF_NO_SCENE:
         if scene is not None:
@@ -481,7 +479,7 @@ def characterise(
     asked = dict(options_of(_Simulated, procedure, "characterise"))
     _Simulated(**asked)
     if camera is None:
-        if isinstance(frames, int):
+        if not isinstance(frames, (str, Path)):
             raise MitsimError(
                 "characterise: got no camera; give one to simulate, or as frames the folder of a real one"
             )
@@ -495,7 +493,7 @@ def characterise(
 
         return characterise_frames(listed, output, job)
     sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    if not isinstance(frames, int):
+    if isinstance(frames, (str, Path)):
         raise ArgumentError("frames", f"{frames}: give the frames of each stack, or no camera, to measure a real one")
     if sensor.quantum_efficiency_curve is None:
         _refuse({*asked}, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")

@@ -257,6 +257,7 @@ class Apparatus:
 
         return parse_patterns(patterns, self.n, seed)
 
+    @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
         """Contrast of laser speckle in a sensor pixel: as the projector states it, or, computed, under the patterns of
         a ``family`` (rms over some of its shots; None: a white picture)."""

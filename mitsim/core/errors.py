@@ -114,7 +114,7 @@ _KINDS: dict[str, Kind] = {
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
-    with the argument, the value and what is allowed."""
+    with the argument, the value and what is allowed. Numbers of NumPy come to it as Python's."""
     signature = inspect.signature(function)
     annotated = {name: each.annotation for name, each in signature.parameters.items()}
     kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
@@ -128,9 +128,18 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
                 raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
-        return function(*arguments, **named)
+        plain = {name: _plain(value) for name, value in named.items()}
+        return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
 
     return call
+
+
+def _plain(value: object) -> object:
+    """A number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
+    if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
+        return value
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return value.item() if kind in tuple("biuf") else value  # type: ignore[attr-defined]
 
 
 def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:

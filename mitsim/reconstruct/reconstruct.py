@@ -159,10 +159,7 @@ class Reconstruction(Solution):
         MitsimError
             when the folder holds another image or something else, or cannot be written.
         """
-        try:
-            plain(more)
-        except TypeError as error:
-            raise ArgumentError("more", f"cannot be stored ({error})") from None
+        _check_stored(more)
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 
@@ -170,6 +167,7 @@ class Reconstruction(Solution):
     def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
+        _check_stored(more)
         folder = Path(folder)
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
@@ -224,6 +222,14 @@ class Reconstruction(Solution):
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
         return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
+
+
+def _check_stored(more: object) -> None:
+    """ArgumentError for entries of result.json that JSON cannot hold."""
+    try:
+        plain(more)
+    except TypeError as error:
+        raise ArgumentError("more", f"cannot be stored ({error})") from None
 
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:

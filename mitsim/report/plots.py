@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError
@@ -492,7 +492,7 @@ def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
 def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
     """One of a camera's ``factors``, that of a ``side``, on the axes ``ax``, or those of a new figure; returns them."""
     line = "row" if side == "left" else "column"
-    title = f"{side.capitalize()} factor: {factors.status.verdict.value}"
+    title = f"{side.capitalize()} factor, of {line}s"
     axes = _draw_linear(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]", aspect="auto")
     label_axes(axes, f"scene {line} [projector pixel]", f"sensor {line} [pixel]")
     axes.grid(False)
@@ -591,6 +591,8 @@ def _draw(
     axes.set_title(title, fontsize=FONT)
     axes.set_xlabel("column [pixel]", fontsize=FONT)
     axes.set_ylabel("row [pixel]", fontsize=FONT)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
     axes.figure.colorbar(drawn, ax=axes, extend=extend).set_label(unit, fontsize=FONT - 1)
     return axes
 
