@@ -237,6 +237,15 @@ def test_numpy_scalars_are_numbers(results: dict[str, Any]) -> None:
     assert (asked.seed, asked.accuracy) == (3, 0.25) and type(asked.seed) is int
 
 
+def test_an_image_has_the_options_of_its_verb(results: dict[str, Any]) -> None:
+    """(Planted: bounds that are passed over.)"""
+    shots, factors = results["shots"], results["factors"]
+    image = ms.reconstruct(shots, factors, method="nonnegative", bounds=(0.2, 0.6), iterations=500).image
+    assert image.min() >= 0.2 - 1e-9 and image.max() <= 0.6 + 1e-9
+    with pytest.raises(ms.ArgumentError, match="bound is no option of reconstruct; did you mean bounds"):
+        ms.reconstruct(shots, factors, bound=(0, 1))
+
+
 def test_a_misspelt_option_is_refused_with_what_was_meant() -> None:
     for call, line in (
         (lambda: ms.study("patterns", quik=True), r"quik is no option of study; did you mean quick\? use variant"),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, options_of
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
@@ -299,7 +299,7 @@ def reconstruct(
     method: str | Solver = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
-    depth_range: tuple[float, float] | None = None,
+    **options: Any,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -314,9 +314,8 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
-        bounds, and iterations: :func:`reconstruct_request`), ``tv`` (least total variation), or a solver of one's own,
-        such as a trained network (:func:`mitsim.load_network`).
+        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0), ``tv`` (least total variation),
+        or a solver of one's own, such as a trained network (:func:`mitsim.load_network`).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -324,16 +323,19 @@ def reconstruct(
     margin
         cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
         they take up light from outside the window (:mod:`mitsim.reconstruct.background`). By ``tikhonov``, no focus.
-    depth_range
-        nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
-        calibrated depth.
+    **options
+        ``depth_range``: nearest and farthest depth [mm] that ``auto`` and ``map`` look for, a quarter of 1/z either way
+        of the calibrated depth unless given; ``bounds``, least and largest number of the image, and ``iterations``, at
+        most, of ``nonnegative`` and ``tv``.
+
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
+    known = options_of(ImageRequest, options, "reconstruct")
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, **known))
 
 
 @single_threaded_blas()

@@ -519,7 +519,8 @@ def draw_image(
     if quantity == "image":
         unit = "light [electrons/s]" if POINT_SPREAD in image.inputs else "reflectance, 1 = board"
         return _draw_reflectance(ax, image.image, f"Image: {image.status.verdict.value}", unit, image.white)
-    values = image.uncertainty if quantity == "uncertainty" else image.depths and image.depths.mm
+    depths = None if image.depths is None else image.depths.mm
+    values = image.uncertainty if quantity == "uncertainty" else depths
     if values is None:
         raise ArgumentError("quantity", f"{quantity!r}: is not known of this image; draw image")
     title, unit = {
