@@ -490,7 +490,15 @@ def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
 
 
 def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
-    """One of a camera's ``factors``, that of a ``side``, on the axes ``ax``, or those of a new figure; returns them."""
+    """One of a camera's factors; returns the axes.
+
+    Parameters
+    ----------
+    factors, side
+        which of them: ``left``, of rows, or ``right``, of columns.
+    ax
+        to draw on; None: those of a new figure.
+    """
     line = "row" if side == "left" else "column"
     title = f"{side.capitalize()} factor, of {line}s"
     axes = _draw_linear(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]", aspect="auto")
