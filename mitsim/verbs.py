@@ -298,14 +298,14 @@ def study(
                 "on parts, which say themselves what they are of")  # fmt: skip
         from mitsim.studies.framework.campaign import merge
 
-        return merge([Path(part) for part in _listed(scene)], output, asked.experiment)
+        return merge([Path(part) for part in _scenes_of(scene)], output, asked.experiment)
     _refuse(given, ["experiment"], "but with merge; give the module as the study's name")
     if name not in OF_CAPTURES:
         _refuse(given, ["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
     if asked.recipe is not None and name not in ("calibration", "drift"):
         raise MitsimError(f"study {name}: has no session of its own; a recipe is for calibration and drift")
     request = Request.of(patterns=patterns or _MAIN_PATTERNS, seed=asked.seed)
-    named = _listed(scene)
+    named = _scenes_of(scene)
     if len(named) > 1:
         raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one")
     place = str(named[0]) if named else None
@@ -313,7 +313,7 @@ def study(
     return run(name, place, Path(output), request, job or Job(), asked, given)
 
 
-def _listed(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
+def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
     """The scenes, or folders of parts, that are named."""
     each = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
     if wrong := [one for one in each if not isinstance(one, (str, Path))]:

@@ -197,7 +197,7 @@ def test_wrong_arguments_of_functions_are_refused_in_a_line(
     name: str, results: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every function of the face, with values of every kind: MitsimError, or it works. (Planted: a function that checks
-    nothing; a list for an array; an empty text for a path.)"""
+    nothing; a list for an array.)"""
     monkeypatch.chdir(tmp_path)
     call = getattr(ms, name)
     assert not (wrong := raised(call, results, OF_A_BENCH if name in RENDERS else WRONG)), "\n".join(wrong)

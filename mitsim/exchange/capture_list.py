@@ -344,7 +344,7 @@ class FrameFacts:
         if self.projector_pixels is not None or self.calibration is not None:
             said["n"] = self.projector_pixels
         if self.shape is not None:
-            said["raw"] = Raw.of(_joined(self.shape, "x"), self.bits, self.byte_order or "little")
+            said["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
         if self.seed is not None:
             said["seed"] = self.seed
         known = RealCapture(
@@ -377,13 +377,13 @@ class FrameFacts:
             text = str(self.orientation)
             given["orientation"] = int(text) if text.isascii() and text.isdecimal() else text
         if self.crop is not None:
-            given["crop"] = Crop.of(_joined(self.crop, ","))
+            given["crop"] = Crop.of(_text_of(self.crop, ","))
         if "turn_deg" in given:
             given["turn_about"] = "centre"
         known = {name: value for name, value in listed if name in listed.model_fields_set}
         return validate(type(listed), {**known, **given}, "import")
 
 
-def _joined(parts: str | tuple[int, ...], sign: str) -> str:
+def _text_of(parts: str | tuple[int, ...], sign: str) -> str:
     """Numbers as a text has them, with a ``sign`` between."""
     return parts if isinstance(parts, str) else sign.join(map(str, parts))

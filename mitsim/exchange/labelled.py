@@ -30,19 +30,23 @@ def label_capture(shots: Capture) -> Dataset:
     """
     captures = shots.manifest.patterns.captures
     frame = ("shot", "row", "column")
-    numbers: Labels = {"dn": (frame, shots.dn, _said("DN", "digital number"))}
+    numbers: Labels = {"dn": (frame, shots.dn, _attributes("DN", "digital number"))}
     if shots.electrons is not None:
-        numbers["electrons"] = (frame, shots.electrons, _said("electron", "expected photoelectrons"))
+        numbers["electrons"] = (frame, shots.electrons, _attributes("electron", "expected photoelectrons"))
     if shots.truth is not None:
         scene = ("scene_row", "scene_column")
-        numbers["truth"] = (scene, shots.truth, _said("1", "apparent reflectance, relative to the board"))
+        numbers["truth"] = (scene, shots.truth, _attributes("1", "apparent reflectance, relative to the board"))
         if shots.truth_standard_error is not None:
-            numbers["truth_standard_error"] = (scene, shots.truth_standard_error, _said("1", "its standard error"))
+            numbers["truth_standard_error"] = (
+                scene,
+                shots.truth_standard_error,
+                _attributes("1", "its standard error"),
+            )
     places: Labels = {
-        "shot": ("shot", np.arange(len(captures)), _said("1", "number of the frame")),
-        "pattern_row": ("shot", [each.row for each in captures], _said("1", "index i of the pattern")),
-        "pattern_column": ("shot", [each.column for each in captures], _said("1", "index j of the pattern")),
-        "sign": ("shot", [each.sign for each in captures], _said("1", "half of a signed pattern; 0: unsigned")),
+        "shot": ("shot", np.arange(len(captures)), _attributes("1", "number of the frame")),
+        "pattern_row": ("shot", [each.row for each in captures], _attributes("1", "index i of the pattern")),
+        "pattern_column": ("shot", [each.column for each in captures], _attributes("1", "index j of the pattern")),
+        "sign": ("shot", [each.sign for each in captures], _attributes("1", "half of a signed pattern; 0: unsigned")),
     }
     for name, axis, count in zip(("y", "x"), ("row", "column"), shots.dn.shape[1:], strict=True):
         places |= _sensor_places(shots.manifest.camera, name, axis, count)
@@ -60,7 +64,7 @@ def label_factors(factors: Factors) -> Dataset:
     MitsimError where xarray is not installed.
     """
     numbers: Labels = {
-        name: ((axis, f"scene_{axis}"), side, _said("electron0.5 s-0.5", f"factor of the {axis}s"))
+        name: ((axis, f"scene_{axis}"), side, _attributes("electron0.5 s-0.5", f"factor of the {axis}s"))
         for name, axis, side in (("left", "row", factors.left), ("right", "column", factors.right))
     }
     places = _scene_places(factors)
@@ -95,17 +99,17 @@ def label_image(image: Reconstruction, factors: Factors | None = None) -> Datase
             )
         places = _scene_places(factors)
     rate = POINT_SPREAD in image.inputs
-    words = _said("electron s-1", "light") if rate else _said("1", "reflectance, relative to the board")
+    words = _attributes("electron s-1", "light") if rate else _attributes("1", "reflectance, relative to the board")
     numbers: Labels = {"image": (scene, image.image, words)}
     if image.uncertainty is not None:
-        numbers["uncertainty"] = (scene, image.uncertainty, _said(words["units"], "standard uncertainty"))
+        numbers["uncertainty"] = (scene, image.uncertainty, _attributes(words["units"], "standard uncertainty"))
     if image.depths is not None:
-        numbers["depth"] = (scene, image.depths.mm, _said("mm", "depth"))
+        numbers["depth"] = (scene, image.depths.mm, _attributes("mm", "depth"))
     facts = {"status": str(image.status), "method": str(image.inputs.get("method")), "lambda": image.lam}
     return _dataset("image", numbers, places, {**facts, "residual": image.residual})
 
 
-def _said(units: str, long_name: str) -> dict[str, str]:
+def _attributes(units: str, long_name: str) -> dict[str, str]:
     """Attributes of a variable."""
     return {"units": units, "long_name": long_name}
 
@@ -129,7 +133,7 @@ def _sensor_places(camera: Mapping[str, Any], name: str, axis: str, count: int) 
     whole = known.get("rows" if row else "columns") or known["pixels"]
     first = 0 if not known.get("roi") else known["roi"][0 if row else 1]
     middles: FloatArray = pitch * (first + np.arange(count) - (whole - 1) / 2)
-    said = _said("mm", f"place of the {axis} on the sensor, from the optical axis, growing with its number")
+    said = _attributes("mm", f"place of the {axis} on the sensor, from the optical axis, growing with its number")
     return {name: (axis, middles, said)}
 
 
@@ -143,7 +147,7 @@ def _scene_places(factors: Factors) -> Labels:
     for axis, side, (near, far) in sides:
         count = side.shape[1]
         parts: npt.NDArray[np.float64] = (np.arange(count) + 0.5) / count
-        said = _said("mm", f"place of the scene's {axis} at {parallax.depth_mm:g} mm, from the frame's middle")
+        said = _attributes("mm", f"place of the scene's {axis} at {parallax.depth_mm:g} mm, from the frame's middle")
         found[f"scene_{'y' if axis == 'row' else 'x'}"] = (
             f"scene_{axis}",
             parallax.depth_mm * (near + (far - near) * parts),
