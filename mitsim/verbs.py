@@ -307,7 +307,7 @@ def study(
     request = Request.of(patterns=patterns or _MAIN_PATTERNS, seed=asked.seed)
     named = _scenes_of(scene)
     if len(named) > 1:
-        raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one")
+        raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
     place = str(named[0]) if named else None
     run = _run_points if is_experiment(name) else _run_whole
     return run(name, place, Path(output), request, job or Job(), asked, given)
