@@ -315,7 +315,7 @@ def study(
 
 def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
     """The scenes, or folders of parts, that are named."""
-    each = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
+    each: list[Any] = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
     if wrong := [one for one in each if not isinstance(one, (str, Path))]:
         raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
     return each
@@ -336,9 +336,10 @@ def _run_points(
     from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
     from mitsim.studies.framework.run import Shard
 
-    files = (None if each is None else str(each) for each in (asked.camera, asked.projector))
+    camera = None if asked.camera is None else str(asked.camera)
+    projector = None if asked.projector is None else str(asked.projector)
     parameters = tuple(sorted(asked.texts.items()))
-    setup = Setup(scene or "photograph", None, parameters, *files, asked.variant, asked.allow_outside_files)
+    setup = Setup(scene or "photograph", None, parameters, camera, projector, asked.variant, asked.allow_outside_files)
     pictures: tuple[str | None, ...] = (None,) if scene else QUICK_IMAGES if asked.quick else TEST_IMAGES
     recipe = None if asked.recipe is None else str(asked.recipe)
     if recipe is not None:
@@ -572,15 +573,14 @@ def sense(
     if facts.f_number is not None:
         check_f_number(facts.f_number)
     check_root(seed)
-    in_file = isinstance(image, (str, Path))
-    if in_file:
-        check_image(Path(str(image)))
+    if isinstance(image, str | Path):
+        check_image(Path(image))
     elif facts.channel is not None:
         raise ArgumentError("channel", f"{facts.channel!r}: an array has no channels; leave it out")
     from mitsim.acquire.sense import irradiance_behind_lens, read_image
     from mitsim.acquire.sense import sense as run_sense
 
-    light, notes = read_image(str(image), facts.channel) if in_file else (image, ())
+    light, notes = read_image(image, facts.channel) if isinstance(image, str | Path) else (image, tuple[str, ...]())
     light = light * facts.scale
     if facts.f_number is not None:
         light = irradiance_behind_lens(light, facts.f_number)
