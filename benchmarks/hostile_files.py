@@ -24,7 +24,7 @@ from PIL import Image, ImageCms
 from mitsim.core.environment import versions
 from mitsim.core.exr import write_frame
 from mitsim.core.files import stderr_silenced
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export
 from mitsim.studies.framework.experiment import Found, Point, Scope, Setup
 from mitsim.studies.framework.run import Store
 from tests.exchanged import made
@@ -47,7 +47,7 @@ class Good:
         self.bench = made(folder)
         self.folder = folder
         for ending, name in (("hdf5", "run.h5"), ("mat", "run.mat")):
-            export_run(self.bench.run, ending, folder / name, self.bench.calibration)
+            export(self.bench.run, ending, folder / name, self.bench.calibration)
         numbers = (np.arange(80).reshape(8, 10) * 40).astype(np.uint16)
         for name in ("a.png", "a.tif", "b.tif"):
             Image.fromarray(numbers).save(folder / name, **({"compression": "tiff_lzw"} if name == "b.tif" else {}))
@@ -66,7 +66,7 @@ class Good:
             text = (ROOT / "calibration" / f"{name}.toml").read_text(encoding="utf-8")
             (folder / f"{kept}.toml").write_text(text, encoding="utf-8")
         RealSession().write(folder / "session")
-        export_run(self.bench.run, "png", folder / "shown", None, projector="mp_cl1")
+        export(self.bench.run, "png", folder / "shown", None, projector="mp_cl1")
 
 
 def changed(name: str) -> Callable[[Good], Make]:

@@ -35,12 +35,17 @@ if TYPE_CHECKING:
     from mitsim.core.job import Clock as Clock
     from mitsim.core.job import Job as Job
     from mitsim.core.job import Limits as Limits
+    from mitsim.core.progress import progress as progress
     from mitsim.core.runs import Capture as Capture
     from mitsim.core.runs import MosaicCapture as MosaicCapture
     from mitsim.core.runs import load_mosaic as load_mosaic
     from mitsim.core.runs import load_run as load_run
     from mitsim.devices.session import Modelling as Modelling
     from mitsim.devices.session import load_recipe as load_recipe
+    from mitsim.exchange.formats import export as export
+    from mitsim.exchange.formats import import_file as import_file
+    from mitsim.exchange.formats import import_frames as import_frames
+    from mitsim.exchange.formats import pattern_pictures as pattern_pictures
     from mitsim.learn.pair_store import PairStore as PairStore
     from mitsim.learn.verbs import load_network as load_network
     from mitsim.learn.verbs import make_pairs as make_pairs
@@ -56,6 +61,12 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
+    from mitsim.verbs import characterise as characterise
+    from mitsim.verbs import demo as demo
+    from mitsim.verbs import doctor as doctor
+    from mitsim.verbs import scenes as scenes
+    from mitsim.verbs import sense as sense
+    from mitsim.verbs import study as study
 
 _HOMES = {
     name: home
@@ -69,18 +80,21 @@ _HOMES = {
         "calibrate.session_plan": "CalibrationPlan plan_calibration",
         "core.errors": "ArgumentError MitsimError",
         "core.job": "Clock Job Limits",
+        "core.progress": "progress",
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
+        "exchange.formats": "export import_file import_frames pattern_pictures",
         "learn.pair_store": "PairStore",
         "learn.verbs": "load_network make_pairs train",
         "light.plan": "Plan",
         "metrics": "psnr ssim",
         "reconstruct.captured_session": "calibrate_frames",
-        "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.factors": "Factors load_calibration",
+        "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.quality": "reconstruct_colours",
+        "verbs": "characterise demo doctor scenes sense study",
     }.items()
     for name in names.split()
 }

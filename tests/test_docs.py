@@ -198,10 +198,10 @@ def measured_responses() -> dict[str, object]:
 def exchanged_file() -> dict[str, object]:
     """The files that docs/exchange.md reads."""
     from mitsim.api.bench import open_bench
-    from mitsim.exchange.formats import export_run
+    from mitsim.exchange.formats import export
 
     bench = made(Path())
-    export_run(bench.run, "hdf5", "all.h5", bench.calibration)
+    export(bench.run, "hdf5", "all.h5", bench.calibration)
     open_bench(write_small_scene(Path("scenes"))).light("dots:4", accuracy=0.1).save("light.h5")
     return {}
 
@@ -219,7 +219,14 @@ def stored_pairs() -> dict[str, object]:
     return {}
 
 
+def made_folders() -> dict[str, object]:
+    """The folders `run` and `cal` that docs/api.md reads."""
+    made(Path())
+    return {}
+
+
 GIVEN: dict[str, Callable[[], dict[str, object]]] = {
+    "docs/api.md": made_folders,
     "docs/formats.md": measured_responses,
     "docs/exchange.md": exchanged_file,
     "docs/learned.md": stored_pairs,

@@ -28,6 +28,8 @@ from mitsim.planner.explain import unseen_lamps
 from mitsim.planner.planner import make_plan
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from mitsim.scene.load import LoadedScene
 
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
@@ -82,6 +84,14 @@ class Rendered:
         facts = {key: self.facts[key] for key in ("estimator", "seed", "variant")}
         write_frame(path, channels, {"unit": "W/m^2", **facts, **versions()})
         return Path(path)
+
+    @check_arguments
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the frame, the mean of its channels, with a colour bar, on matplotlib's axes ``ax`` or, where that is
+        None, those of a new figure; returns them."""
+        from mitsim.core.images import from_above
+
+        return from_above("report.plots", "draw_rendered")(self, ax)
 
     def __repr__(self) -> str:
         rows, columns = self.mean.shape[:2]

@@ -10,20 +10,24 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
 from mitsim.core.arrays import FloatArray, Npy
 from mitsim.core.environment import versions
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame, whole_file
+from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
@@ -84,6 +88,21 @@ class Sensed:
             "warnings": list(self.warnings),
         }
 
+    @check_arguments
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw the digital numbers with a colour bar, on matplotlib's axes ``ax`` or, where that is None, those of a
+        new figure; returns them."""
+        return from_above("report.plots", "draw_sensed")(self, ax)
+
+    def __repr__(self) -> str:
+        rows, columns = self.digital.shape
+        return f"Sensed({rows} x {columns}: {self.sensor.name}, exposure {self.exposure_s:.3g} s)"
+
+    def _repr_html_(self) -> str:
+        picture = {f"frame\n{span(self.digital, 'DN')}": normalise(self.digital)}
+        return card(f"Sensed: {self.sensor.name}", picture, (f"exposure {self.exposure_s:.3g} s", *self.warnings))
+
+    @check_arguments
     def save(self, path: Path | str) -> Path:
         """Write the numbers to ``path``, which is replaced, by its ending; returns it.
 

@@ -258,6 +258,7 @@ class Apparatus:
 
         return parse_patterns(patterns, self.n, seed)
 
+    @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
         """Contrast of laser speckle in a sensor pixel: as the projector states it, or, computed, under the patterns of
         a ``family`` (rms over some of its shots; None: a white picture)."""
@@ -447,7 +448,7 @@ def open_apparatus(
     scene, variant, camera, projector, allow_outside_files, for_render, **parameters
         as for :func:`mitsim.api.bench.open_bench`, which has the errors raised as well.
     """
-    defines = {name: _text(value) for name, value in parameters.items()}
+    defines = {name: spelling(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)
     from mitsim.devices.sensor import load_sensor
@@ -558,6 +559,6 @@ def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) ->
     return MitsimError(f"{loaded.path}: shape {contact.shape}: got {got}; {rule}")
 
 
-def _text(value: object) -> str:
-    """A parameter as a scene spells it."""
+def spelling(value: object) -> str:
+    """The ``value`` of a parameter as a scene spells it."""
     return str(value).lower() if isinstance(value, bool) else str(value)

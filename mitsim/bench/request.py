@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import validate
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.mistakes import refusal
@@ -229,6 +229,7 @@ class Request(BaseModel):
             raise refusal(type(self), error, "request") from error
 
     @classmethod
+    @check_arguments
     def of(cls, **values: object) -> Request:
         """The request of these ``values``; effects may be written ``"+ambient,-diffraction"``.
 

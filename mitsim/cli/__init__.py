@@ -173,17 +173,8 @@ def demo(
     common: Common,
 ) -> int:
     """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
-    from mitsim.studies.framework.run import check_study_folder
-
-    request = mitsim.Request.of(**vars(asked))
-    check_study_folder(output, "demo")
-    devices.check_exposure(request.timing)
-    devices.check(scene, request.patterns)
     with common.job() as job:
-        bench = devices.open(scene, common.variant, job)
-        from mitsim.studies.demo import demo as run_demo  # only now: it takes seconds to import
-
-        result = run_demo(bench, output, request, job)
+        result = mitsim.demo(scene, output, job=job, **vars(asked), **devices.arguments, variant=common.variant)
     return finish(common.as_json, result.payload(), result.lines(), result.warnings)
 
 
@@ -498,12 +489,7 @@ def doctor(
     ] = False,
 ) -> int:
     """What works on this machine, and the one command that mends what does not."""
-    from mitsim.core.environment import doctor as run_doctor
-    from mitsim.core.environment import warm_up
-
-    checks = run_doctor()
-    if warm and all(check.ok for check in checks):
-        checks.append(warm_up(common.variant))
+    checks = mitsim.doctor(warm, common.variant)
     lines = [f"{sum(check.ok for check in checks)} of {len(checks)} checks pass"]
     lines += [
         f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.detail}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+import mitsim
 from mitsim.cli.options import (
     Common,
     Devices,
@@ -19,21 +20,15 @@ from mitsim.cli.options import (
     Projector,
     Scene,
     Seed,
-    is_given,
+    given_of,
     option,
     pop_patterns,
     refuse_unused,
     verb,
 )
 from mitsim.cli.screen import finish
-from mitsim.core.configuration import validate
-from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.imagelist import Preparation
-from mitsim.core.seeds import check_root
-from mitsim.devices.patterns import pattern_names, read_name, takes_seed
-
-_OF_BARE = ("shape", "bits", "byte_order")
-"""Options of `mitsim import` for files without a header."""
+from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import pattern_names
 
 
 @dataclass(frozen=True)
@@ -55,11 +50,9 @@ def export(
     common: Common,
 ) -> int:
     """Write a run in a format that other programs read."""
-    from mitsim.exchange.formats import export_run
-
     if exported.format == "png":
         refuse_unused(context, ["overwrite"], "on a folder of pictures, which takes the place of none")
-    payload = export_run(run, **vars(exported))
+    payload = mitsim.export(run, **vars(exported))
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
     lines = [f"{payload['frames']} frames{with_it} as {exported.format}: {payload['output']}", *payload["notes"]]
     return finish(common.as_json, payload, lines, ())
@@ -117,19 +110,18 @@ def import_(
     ] = None,
 ) -> int:
     """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
-    from mitsim.exchange.formats import READERS, import_file
+    from mitsim.exchange.formats import READERS
 
     if output is None and calibration_output is None:
         raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
-    payload: dict[str, Any]
     if source.suffix.lower() in READERS:
         others = [name for name in vars(frames) if name != "channel"]
         refuse_unused(context, others, f"on {source}, which says itself what its frames are")
-        payload = import_file(source, output, calibration_output, frames.channel)
+        payload = mitsim.import_file(source, output, calibration_output, frames.channel)
     elif output is None or calibration_output is not None:
         raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
     else:
-        payload = _import_frames(context, source, output, frames)
+        payload = mitsim.import_frames(source, output, **given_of(context, vars(frames)))
     lines = []
     if payload["output"]:
         lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
@@ -141,63 +133,6 @@ def import_(
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
     return finish(common.as_json, payload, lines, payload["warnings"])
-
-
-def _import_frames(context: typer.Context, source: Path, output: Path, frames: Frames) -> dict[str, Any]:
-    from mitsim.core.imagelist import BARE, Raw
-    from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
-
-    listed = CaptureList() if frames.list is None else load_capture_list(frames.list)
-    bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
-    if frames.shape is None or not bare:
-        refuse_unused(context, _OF_BARE, "on files that have a header, or without --shape")
-    said: dict[str, Any] = {"prepare": _preparation(frames, listed.prepare)}
-    if frames.patterns is not None:
-        said["patterns"] = frames.patterns
-    if frames.ambient_frame is not None:
-        said |= {"ambient": str(frames.ambient_frame), "ambient_shots": frames.ambient_shots}
-    elif listed.ambient_shots is None:
-        said["ambient_shots"] = frames.ambient_shots
-    if frames.projector_pixels is not None or frames.calibration is not None:
-        said["n"] = frames.projector_pixels
-    if frames.shape is not None:
-        said["raw"] = Raw.of(frames.shape, frames.bits, frames.byte_order)
-    if is_given(context, "seed"):
-        said["seed"] = frames.seed
-    known = RealCapture(
-        listed.model_copy(update=said),
-        frames.camera,
-        frames.exposure,
-        calibration=frames.calibration,
-        black_level_dn=frames.black_level,
-    )
-    if not takes_seed(known.patterns):
-        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
-    known.check(source)  # refused before numpy is imported
-    from mitsim.exchange.real import import_frames
-
-    return import_frames(source, output, known)
-
-
-def _preparation(frames: Frames, listed: Preparation) -> Preparation:
-    """What is done to numbers by a list's ``listed``, and options in the place of what it says."""
-    from mitsim.core.imagelist import Crop, check_channel
-
-    paths = {"dark": frames.dark_frame, "flat": frames.flat_frame, "flat_dark": frames.flat_dark_frame}
-    stated = {"channel": frames.channel, "mosaic": frames.mosaic, "divide_by": frames.divide, "turn_deg": frames.turn}
-    given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
-    given.update({name: path for name, path in paths.items() if path is not None})
-    if frames.channel is not None:
-        check_channel(frames.channel)
-    if frames.orientation is not None:
-        number = frames.orientation
-        given["orientation"] = int(number) if number.isascii() and number.isdecimal() else number
-    if frames.crop is not None:
-        given["crop"] = Crop.of(frames.crop)
-    if "turn_deg" in given:
-        given["turn_about"] = "centre"
-    known = {name: value for name, value in listed if name in listed.model_fields_set}
-    return validate(type(listed), {**known, **given}, "import")
 
 
 @dataclass(frozen=True)
@@ -233,32 +168,13 @@ def patterns(
     common: Common,
 ) -> int:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
-    check_root(seed)
-    given = {"camera": stripes.camera, "exposure": stripes.exposure}
-    payload: dict[str, Any]
-    if family == "stripes":
-        from mitsim.exchange.png_files import SESSION, draw_stripes, session_of
-
-        refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
-        if stripes.camera is None or stripes.exposure is None:
-            missing = next(name for name, value in given.items() if value is None)
-            raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
-        session = session_of(stripes.camera, stripes.exposure, screen.projector_pixels, stripes.signed_capture)
-        payload = {**draw_stripes(output, screen.projector, session), "session": str(output / SESSION)}
+    asked = given_of(context, {**vars(stripes), "seed": seed})
+    payload = mitsim.pattern_pictures(family, output, **vars(screen), **asked)
+    if payload["session"]:
         after = (
-            f"Copy {output / SESSION} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
+            f"Copy {payload['session']} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
         )
     else:
-        read_name(family, screen.projector_pixels)  # refused before numpy is imported
-        from mitsim.exchange.png_files import draw_family
-
-        refuse_unused(context, ["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
-        if not takes_seed(family):
-            refuse_unused(context, ["seed"], "on patterns that are not drawn at random")
-        for name, value in given.items():
-            if value is not None:
-                raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
-        payload = {**draw_family(output, family, screen.projector_pixels, screen.projector, seed), "session": None}
         after = f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} -o RUN"
     from mitsim.exchange.png_files import describe_cells
 

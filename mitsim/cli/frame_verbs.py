@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import mitsim
 from mitsim.cli.options import (
     Common,
     ExposureFraction,
     Seed,
+    given_of,
     is_given,
     number_of,
     option,
@@ -358,46 +360,12 @@ def characterise(
     common: Common,
 ) -> int:
     """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames."""
-    from mitsim.studies.framework.run import check_study_folder
-
-    if camera is None:
-        return _characterise_frames(context, asked, output, common)
-    from mitsim.core.configuration import locate
-    from mitsim.devices.sensor import load_sensor
-    from mitsim.studies import emva_options
-
-    sensor = load_sensor(locate(camera, "calibration", ".toml"))
-    if not asked.frames.isdecimal():
-        raise ArgumentError(
-            "frames", f"{asked.frames}: give the frames of each stack, or leave out {camera} to measure a real camera"
-        )
-    procedure = emva_options.Procedure(asked.pixels, asked.steps, int(asked.frames), asked.seed, asked.wavelength)
-    emva_options.capacity_of(sensor)
-    emva_options.efficiency_of(sensor, procedure)
-    if sensor.quantum_efficiency_curve is None:
-        refuse_unused(context, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
-    check_study_folder(output, "characterise")
-    from mitsim.studies.characterise import characterise as run_characterise
-
-    with common.job() as job:
-        done = run_characterise(sensor, procedure, output, job)
-    return finish(common.as_json, done.payload(), done.lines(), done.warnings)
-
-
-def _characterise_frames(context: typer.Context, asked: Procedure, output: Path, common: Common) -> int:
-    """What frames say of the real camera that took them."""
-    from mitsim.devices.flatlist import load_flats
-    from mitsim.studies.framework.run import check_study_folder
-
-    if not is_given(context, "frames"):
+    if camera is None and not is_given(context, "frames"):
         raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
-    refuse_unused(context, ["pixels", "steps", "seed", "wavelength"], "on frames of a real camera")
-    listed = load_flats(Path(asked.frames))
-    check_study_folder(output, "characterise")
-    from mitsim.studies.characterise import characterise_frames
-
+    frames = int(asked.frames) if asked.frames.isdecimal() and camera is not None else Path(asked.frames)
+    procedure = {name: value for name, value in given_of(context, vars(asked)).items() if name != "frames"}
     with common.job() as job:
-        done = characterise_frames(listed, output, job)
+        done = mitsim.characterise(camera, output, frames, job, **procedure)
     return finish(common.as_json, done.payload(), done.lines(), done.warnings)
 
 
@@ -433,35 +401,20 @@ def sense(
     common: Common,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
-    from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
+    from mitsim.bench.request import check_ending, check_image
     from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
-    from mitsim.core.seeds import check_root
     from mitsim.devices.sensor import load_sensor
 
-    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml"))
-    seconds = number_of("exposure", exposed.exposure)
-    if seconds != "auto":
+    words = {**vars(exposed), "exposure": number_of("exposure", exposed.exposure)}
+    if words["exposure"] != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
-    asked = Exposure(None if seconds == "auto" else seconds, exposed.exposure_fraction)
-    if not 0 < irradiance.scale < math.inf:
-        raise MitsimError(f"--scale {irradiance.scale:g}: give a finite number above 0")
+    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml"))
     check_ending(output, sensor)
-    check_wavelength(irradiance.wavelength)
-    if irradiance.f_number is not None:
-        check_f_number(irradiance.f_number)
-    check_root(exposed.seed)
     check_image(image)
     check_apart(output, [image])
     with output_file(output, overwrite=True) as place:
-        from mitsim.acquire.sense import irradiance_behind_lens, read_image
-        from mitsim.acquire.sense import sense as run_sense
-
-        light, notes = read_image(image, irradiance.channel)
-        light = light * irradiance.scale
-        if irradiance.f_number is not None:
-            light = irradiance_behind_lens(light, irradiance.f_number)
-        frame = run_sense(light, sensor, asked, exposed.seed, irradiance.wavelength, notes)
+        frame = mitsim.sense(image, **words, **vars(irradiance))
         payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import mitsim
-from mitsim.cli.screen import showing_progress
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Limits, running_seconds
+from mitsim.core.progress import progress
 from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.devices.patterns import pattern_names
 
@@ -40,6 +40,7 @@ _SPELLED = {
     "everything": "--all",
     "aged": "--from",
     "lam": "--lambda",
+    "parameters": "-D",
 }
 """Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")
@@ -114,12 +115,9 @@ def _option(name: str, hint: Any, default: Any) -> inspect.Parameter:
 
 def _variant(name: str) -> str:
     """The ``name``, refused when it is none that light can be traced in; every verb checks it alike."""
-    from mitsim.core.environment import VARIANTS, check_driver
+    from mitsim.core.environment import check_variant
 
-    # CUDA has the same kinds; whether a driver has a GPU too shows when the variant is loaded.
-    if name.replace("cuda_", "llvm_", 1) not in VARIANTS:
-        raise MitsimError(f"--variant {name!r}: use {', '.join(VARIANTS)}")
-    check_driver(name)
+    check_variant(name)
     return name
 
 
@@ -143,11 +141,8 @@ class Common:
     @contextmanager
     def job(self) -> Iterator[Job]:
         """A job of the verb's limits, with progress on stderr while the context lasts."""
-        from mitsim.core.job import Clock, Job
-
-        limits, start = self.limits, running_seconds()
-        with showing_progress(self.quiet or self.as_json, start) as watch:
-            yield Job(Clock(start, watch), watch.report, limits)
+        with progress(self.limits, self.quiet or self.as_json, running_seconds()) as job:
+            yield job
 
     @property
     def limits(self) -> Limits:
@@ -266,6 +261,12 @@ class Devices(LitScene):
         """
         with nullcontext() if job is None else job.clock.stage("open scene"):
             return mitsim.open_bench(scene, variant, self.camera, self.projector, self.outside, **self.parameters)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What opens the bench in Python, by the names of :class:`mitsim.verbs.Opening`."""
+        named = {"camera": self.camera, "projector": self.projector, "allow_outside_files": self.outside}
+        return {**named, "parameters": self.parameters}
 
     @property
     def models(self) -> list[Path]:
@@ -491,8 +492,7 @@ def message_of(error: MitsimError) -> str:
     """The message of an ``error`` with its arguments written as options."""
     text = str(error)
     if isinstance(error, ArgumentError):
-        option = "lambda" if error.argument == "lam" else error.argument.replace("_", "-")
-        text = f"--{option}{text.removeprefix(error.argument)}"
+        text = f"{option_name(error.argument)}{text.removeprefix(error.argument)}"
     text = re.sub(r"^parameter (?=\w+=)", "-D ", text)
     return re.sub(
         r"(?<!-)\b(\w+(?==True)|max_seconds|max_memory)(=True)?", lambda m: "--" + m[1].replace("_", "-"), text

@@ -21,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from mitsim.core.errors import MitsimError, reason_of
+from mitsim.core.errors import ArgumentError, MitsimError, reason_of
 from mitsim.core.files import write_json
 from mitsim.core.worker import held_back, workers
 from mitsim.version import __version__
@@ -143,6 +143,14 @@ def compiled_arrays() -> tuple[ModuleType, ModuleType]:
         except ImportError as error:
             raise MitsimError(f"drjit: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
     return drjit, drjit.llvm
+
+
+def check_variant(variant: str) -> None:
+    """ArgumentError for a ``variant`` that light cannot be traced in; MitsimError as :func:`check_driver`."""
+    # CUDA has the same kinds; whether a driver has a GPU too shows when the variant is loaded.
+    if variant.replace("cuda_", "llvm_", 1) not in VARIANTS:
+        raise ArgumentError("variant", f"{variant!r}: use {', '.join(VARIANTS)}")
+    check_driver(variant)
 
 
 def check_driver(variant: str) -> None:

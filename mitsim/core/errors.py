@@ -9,6 +9,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields
 from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -62,6 +63,28 @@ def near_name(text: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
+def options_of(made: type, values: Mapping[str, Any], function: str) -> Mapping[str, Any]:
+    """The ``values``, which are fields of a dataclass.
+
+    Parameters
+    ----------
+    made, values
+        the dataclass, and what it is to be made of.
+    function
+        that takes them, for the message.
+
+    Raises
+    ------
+    ArgumentError
+        for a name that is none of them, with those that are.
+    """
+    known = [each.name for each in fields(made)]
+    for name in values:
+        if name not in known:
+            raise ArgumentError(name, f"is no option of {function}; {near_name(name, known)}use {', '.join(known)}")
+    return values
+
+
 # -------- Arguments of public functions
 # Annotations are read as they are written, so that no type of another room is imported for it: a class is known by its
 # name. What a value may be within its kind, such as a range, each function checks itself.
@@ -83,13 +106,16 @@ _KINDS: dict[str, Kind] = {
     "Path": ("a path", lambda value: isinstance(value, os.PathLike) or (isinstance(value, str) and _is_path(value))),
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     "tuple": ("a tuple", lambda value: isinstance(value, tuple)),
+    "Iterable": ("several values", lambda value: isinstance(value, Iterable)),
+    "Sequence": ("a list", lambda value: isinstance(value, (list, tuple))),
     "Progress": ("a function", callable),
+    "FloatArray": ("an array of real numbers", lambda value: _is_real_array(value)),
 }
 
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
-    with the argument, the value and what is allowed."""
+    with the argument, the value and what is allowed. Numbers of NumPy come to it as Python's."""
     signature = inspect.signature(function)
     annotated = {name: each.annotation for name, each in signature.parameters.items()}
     kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
@@ -103,9 +129,18 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
                 raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
-        return function(*arguments, **named)
+        plain = {name: _plain(value) for name, value in named.items()}
+        return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
 
     return call
+
+
+def _plain(value: object) -> object:
+    """A number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
+    if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
+        return value
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    return value.item() if kind in tuple("biuf") else value  # type: ignore[attr-defined]
 
 
 def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
@@ -158,6 +193,11 @@ def _literal(allowed: object) -> Kind:
 
 def _of_class(name: str) -> Kind:
     return f"a {name}", lambda value: name in (each.__name__ for each in type(value).__mro__)
+
+
+def _is_real_array(value: object) -> bool:
+    """Whether a ``value`` is an array of numbers as NumPy has them, which is not imported, of bits, whole or real."""
+    return getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf") and getattr(value, "ndim", 0) > 0
 
 
 def _is_path(text: str) -> bool:

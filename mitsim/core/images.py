@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal, cast
 
@@ -552,6 +553,12 @@ def lightness(reflectance: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
+def linear_light(shade: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """The reflectance 0..1 that :func:`lightness` encodes as a ``shade``."""
+    encoded = np.clip(np.asarray(shade, dtype=np.float64), 0, 1)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
 def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 1) -> bytes:
     """A PNG of ``values`` as they are.
 
@@ -576,6 +583,20 @@ def grey_png(values: npt.ArrayLike, largest: int | None = None, smallest: int = 
     buffer = io.BytesIO()
     picture.save(buffer, format="png", optimize=True)
     return buffer.getvalue()
+
+
+def from_above(module: str, name: str) -> Callable[..., Any]:
+    """A function that draws or labels results of rooms below its own, for the methods by which they offer it.
+
+    These are the only calls up the house; who never draws imports nothing for it.
+
+    Parameters
+    ----------
+    module, name
+        of the function, in mitsim.
+    """
+    found: Callable[..., Any] = getattr(import_module(f"mitsim.{module}"), name)
+    return found
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:

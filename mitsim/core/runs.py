@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -27,10 +27,14 @@ from mitsim.core.exr import (
     write_frame,
 )
 from mitsim.core.files import output_folder
-from mitsim.core.images import card, normalise, span
+from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import MANIFEST, Digital, RunManifest, read_manifest
 from mitsim.core.recorders import TRUTH, Recorder, claim_run, frame_name
 from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
 
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
@@ -77,6 +81,7 @@ class Capture:
         self._memory = memory or {}
 
     @classmethod
+    @check_arguments
     def from_recorder(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
         """The capture whose shots a ``recorder`` has, finished by its ``manifest``."""
         return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
@@ -203,6 +208,8 @@ class Capture:
             if name not in self._memory:
                 raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
             return self._memory[name]
+        if Path(name).name != name or "\0" in name:
+            raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
         verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
         return read_frame(self.folder / name)
 
@@ -269,6 +276,31 @@ class Capture:
                         run.write(name, *self._memory[name])
                 run.finish(self.manifest)
         return run.folder
+
+    @check_arguments
+    def plot(self, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None) -> Axes:
+        """Draw a frame, or the truth, with a colour bar; returns the axes.
+
+        Parameters
+        ----------
+        shot
+            number of the frame, from 0; of no meaning for the truth.
+        quantity
+            ``dn``, digital numbers; ``electrons``, expected ones; ``truth``, apparent reflectance.
+        ax
+            matplotlib's axes to draw on; None: those of a new figure.
+
+        Raises
+        ------
+        MitsimError
+            for a shot that there is not, and a quantity that is not known of a real camera.
+        """
+        return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
+
+    def to_xarray(self) -> Dataset:
+        """Frames, and where known expected electrons and truth, as an ``xarray.Dataset`` with units and coordinates;
+        MitsimError where xarray, an extra, is not installed."""
+        return from_above("exchange.labelled", "label_capture")(self)
 
     def __repr__(self) -> str:
         return f"Capture({self._family}: {self._size}, {self.folder or 'in memory'})"

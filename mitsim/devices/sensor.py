@@ -13,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from mitsim.core.configuration import Configuration, locate, read_toml, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Digital
+from mitsim.core.mistakes import Table
 
 EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""
@@ -446,13 +447,13 @@ def load_sensor(path: Path | str) -> SensorModel:
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
         read.append(path.resolve())
-        below = read_toml(path)
+        below: dict[str, Any] = read_toml(path)
         if "mask" in below and "mask" not in table:
             raise MitsimError(f"file {first}: {BASE}: {path} has a table [mask], which stays there; give one here")
         if any(kind & table.keys() for kind in _EFFICIENCIES):
             others = [kind for kind in _EFFICIENCIES if not kind & table.keys()]
             below = {name: below[name] for name in below.keys() - set().union(*others)}
-        table = {**below, **table}
+        table = Table({**below, **table}, table.text, table.place)
     table.pop("mask", None)
     return validate(SensorModel, table, f"file {first}")
 

@@ -9,14 +9,24 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from mitsim.core.configuration import Configuration, locate, read_table, validate
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, checked_fields
 from mitsim.core.files import check_plain
-from mitsim.core.imagelist import ALL, CORRECTIONS, Preparation, Raw, Wanted, image_files
+from mitsim.core.imagelist import (
+    ALL,
+    BARE,
+    CORRECTIONS,
+    Crop,
+    Preparation,
+    Raw,
+    Wanted,
+    check_channel,
+    image_files,
+)
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
-from mitsim.devices.patterns import read_name
+from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 
 _OTHERS = {
@@ -246,3 +256,132 @@ class RealCapture:
                     f"calibration {folder / line}: is of frames turned by {turned} degrees, not by "
                     f"{self.prepare.turn_deg:g}; give --turn {turned}"
                 )
+
+
+# ---- What is said of frames in the place of a list ----
+
+_OF_BARE = ("shape", "bits", "byte_order")
+"""Of files without a header alone."""
+
+
+@checked_fields
+@dataclass(frozen=True, kw_only=True)
+class FrameFacts:
+    """What is said of a real camera's frames, in the place of what a list says; None: not said.
+
+    Attributes
+    ----------
+    list
+        name or file of a list.
+    patterns
+        of the family, or patterns.json of `mitsim export --format png`.
+    camera
+        electronics, name or TOML file.
+    exposure
+        of each frame [s].
+    calibration
+        CAL folder of the same camera.
+    projector_pixels
+        a side, without a calibration.
+    black_level
+        digital number of a pixel without charge.
+    ambient_frame, ambient_shots
+        frame, or folder of frames, with the projector off; shots that a single one is the mean of.
+    shape, bits, byte_order
+        of files without a header: rows and columns, or "ROWSxCOLUMNS"; bits of a number; little or big.
+    channel, mosaic
+        plane of a colour sensor, or all; filters of the first 2 x 2 pixels.
+    divide
+        factor that all numbers have.
+    dark_frame, flat_frame, flat_dark_frame
+        frames, or folders of them, without light; of even light without a mask; and without light of its exposure.
+    orientation, turn, crop
+        Exif's number or "file"; degrees counter-clockwise after that; row, column, rows and columns in the end, or
+        "ROW,COLUMN[,ROWS,COLUMNS]".
+    seed
+        of patterns that are drawn at random.
+    """
+
+    list: Path | str | None = None
+    patterns: str | None = None
+    camera: Path | str | None = None
+    exposure: float | None = None
+    calibration: Path | str | None = None
+    projector_pixels: int | None = None
+    black_level: float | None = None
+    ambient_frame: Path | str | None = None
+    ambient_shots: int | None = None
+    shape: str | tuple[int, int] | None = None
+    bits: int | None = None
+    byte_order: str | None = None
+    channel: str | None = None
+    mosaic: str | None = None
+    divide: int | None = None
+    dark_frame: Path | str | None = None
+    flat_frame: Path | str | None = None
+    flat_dark_frame: Path | str | None = None
+    orientation: int | str | None = None
+    turn: float | None = None
+    crop: str | tuple[int, ...] | None = None
+    seed: int | None = None
+
+    def of(self, source: Path) -> RealCapture:
+        """What is known of the frames at ``source``, checked before any is opened; MitsimError as
+        :meth:`RealCapture.check`, and for what has no effect."""
+        listed = CaptureList() if self.list is None else load_capture_list(self.list)
+        bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
+        if self.shape is None or not bare:
+            self._refuse(_OF_BARE, "on files that have a header, or without a shape")
+        said: dict[str, Any] = {"prepare": self._preparation(listed.prepare)}
+        if self.patterns is not None:
+            said["patterns"] = self.patterns
+        if self.ambient_frame is not None:
+            said |= {"ambient": str(self.ambient_frame), "ambient_shots": self.ambient_shots}
+        elif listed.ambient_shots is None:
+            said["ambient_shots"] = self.ambient_shots
+        if self.projector_pixels is not None or self.calibration is not None:
+            said["n"] = self.projector_pixels
+        if self.shape is not None:
+            said["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
+        if self.seed is not None:
+            said["seed"] = self.seed
+        known = RealCapture(
+            listed.model_copy(update=said),
+            None if self.camera is None else str(self.camera),
+            self.exposure,
+            calibration=None if self.calibration is None else Path(self.calibration),
+            black_level_dn=self.black_level,
+        )
+        if not takes_seed(known.patterns):
+            self._refuse(("seed",), "on patterns that are not drawn at random")
+        known.check(source)
+        return known
+
+    def _refuse(self, names: tuple[str, ...], where: str) -> None:
+        """ArgumentError for those ``names`` that are said, and have no effect ``where``."""
+        for name in names:
+            if getattr(self, name) is not None:
+                raise ArgumentError(name, f"has no effect {where}; leave it out")
+
+    def _preparation(self, listed: Preparation) -> Preparation:
+        """What is done to numbers by a list's ``listed``, and what is said here in the place of it."""
+        paths = {"dark": self.dark_frame, "flat": self.flat_frame, "flat_dark": self.flat_dark_frame}
+        stated = {"channel": self.channel, "mosaic": self.mosaic, "divide_by": self.divide, "turn_deg": self.turn}
+        given: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+        given |= {name: str(path) for name, path in paths.items() if path is not None}
+        if self.channel is not None:
+            check_channel(self.channel)
+        if self.orientation is not None:
+            text = str(self.orientation)
+            given["orientation"] = int(text) if text.isascii() and text.isdecimal() else text
+        if self.crop is not None:
+            given["crop"] = Crop.of(_text_of(self.crop, ","))
+        if "turn_deg" in given:
+            given["turn_about"] = "centre"
+        known = {name: value for name, value in listed if name in listed.model_fields_set}
+        return validate(type(listed), {**known, **given}, "import")
+
+
+def _text_of(parts: str | tuple[int, ...], sign: str) -> str:
+    """Numbers as a text has them, with a ``sign`` between."""
+    return parts if isinstance(parts, str) else sign.join(map(str, parts))

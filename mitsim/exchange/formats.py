@@ -1,4 +1,5 @@
-"""RUN and CAL folders in, a file or folder of a format that other programs read out; and such a file back to folders.
+"""RUN and CAL folders in, a file or folder of a format that other programs read out; such a file, or a real camera's
+frames, back to folders; and patterns in, pictures for a real projector out.
 
 Each format is a row of :data:`FORMATS`. Its module is imported when it is used: what a request says is checked before.
 """
@@ -12,10 +13,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.imagelist import check_channel
-from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
+from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import (
     RUN,
     check_lines,
@@ -25,7 +27,8 @@ from mitsim.core.spectral_manifests import (
     read_mosaic,
     same_lines,
 )
-from mitsim.exchange.capture_list import TURNED
+from mitsim.devices.patterns import read_name, takes_seed
+from mitsim.exchange.capture_list import TURNED, FrameFacts
 
 if TYPE_CHECKING:
     from mitsim.exchange.packed import Run
@@ -82,7 +85,8 @@ def _function(name: str) -> Callable[..., Any]:
     return found
 
 
-def export_run(
+@check_arguments
+def export(
     run: Path | str,
     format: str,
     output: Path | str,
@@ -171,8 +175,12 @@ def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
     return (read_colours(run, RUN) if calibration is None else same_lines(run, calibration)).names
 
 
+@check_arguments
 def import_file(
-    source: Path, output: Path | None, calibration_output: Path | None = None, channel: str | None = None
+    source: Path | str,
+    output: Path | str | None = None,
+    calibration_output: Path | str | None = None,
+    channel: str | None = None,
 ) -> dict[str, Any]:
     """Write the folders that a file of `mitsim export` holds, each whole or not at all.
 
@@ -198,11 +206,17 @@ def import_file(
     MitsimError
         for a file that is none or is damaged, a part that it does not hold, or a place that holds something.
     """
+    source = Path(source)
+    if output is None and calibration_output is None:
+        raise MitsimError("import: nothing to make; give output, calibration_output, or both")
+    if source.suffix.lower() not in READERS:
+        raise ArgumentError("source", f"{source}: give a file that ends in {', '.join(READERS)}, or use import_frames")
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
         check_channel(channel)
     with _function(READERS[source.suffix.lower()])(source, channel) as loaded:
-        wanted = {"output": (output, loaded.run), "calibration_output": (calibration_output, loaded.calibration)}
+        places = [None if place is None else Path(place) for place in (output, calibration_output)]
+        wanted = {"output": (places[0], loaded.run), "calibration_output": (places[1], loaded.calibration)}
         for argument, (place, held) in wanted.items():
             if place is not None and held is None:
                 raise ArgumentError(argument, f"{place}: {source} holds no {_CALLED[argument]}; leave this out")
@@ -232,3 +246,117 @@ def import_file(
 
 def _frames_of(run: Run) -> int:
     return sum(len(part.manifest.patterns.captures) for part in run.parts.values())
+
+
+@check_arguments
+def import_frames(source: Path | str, output: Path | str, **known: Any) -> dict[str, Any]:
+    """Make a RUN folder of a real camera's frames, whole or not at all.
+
+    Parameters
+    ----------
+    source
+        folder of frames, in the order of the numbers in their names; or one file.
+    output
+        RUN folder to make.
+    **known
+        what is known of them: ``list``, a list's name or file, or in its place ``patterns``, ``camera``, ``exposure``,
+        ``calibration`` and others of :class:`mitsim.exchange.capture_list.FrameFacts`.
+
+    Returns
+    -------
+    dict
+        `frames`, `shape`, `output`, `left_out`, `divided_by`, `planes`, `notes`, `warnings` and others that the command
+        line prints. :func:`mitsim.load_run` reads the folder.
+
+    Raises
+    ------
+    MitsimError
+        for values that cannot be or have no effect, frames that are missing, too many, unlike each other or beyond the
+        camera's range, or a place that holds something.
+    """
+    facts = FrameFacts(**options_of(FrameFacts, known, "import_frames")).of(Path(source))
+    from mitsim.exchange.real import import_capture
+
+    return import_capture(Path(source), Path(output), facts)
+
+
+STRIPES = "stripes"
+"""Pictures of a calibration session, in the place of a family of patterns."""
+
+
+@check_arguments
+def pattern_pictures(
+    patterns: str,
+    output: Path | str,
+    projector: Path | str = "mp_cl1",
+    projector_pixels: int = 128,
+    seed: int | None = None,
+    **session: Any,
+) -> dict[str, Any]:
+    """Draw patterns, or a calibration's stripes, as pictures to show on a real projector.
+
+    Parameters
+    ----------
+    patterns
+        name of a family, or ``stripes``: those of a calibration.
+    output
+        folder to make.
+    projector
+        name or TOML file, of known rows and columns.
+    projector_pixels
+        of the patterns, a side.
+    seed
+        of patterns that are drawn at random; None: 0.
+    **session
+        of stripes: ``camera``, name or TOML file of its electronics; ``exposure`` of each frame [s];
+        ``signed_capture``, ``pair`` or ``uniform``: both halves of each, or one and a uniform frame.
+
+    Returns
+    -------
+    dict
+        `patterns`, `n`, `pictures`, `projector` (its rows and columns, and the grid's place), `output`, and `session`,
+        the list that goes with the frames of stripes.
+
+    Raises
+    ------
+    MitsimError
+        for patterns that there are not or that do not fit the projector, values that cannot be or have no effect, and
+        a place that holds something.
+    """
+    facts, folder = SessionFacts(**options_of(SessionFacts, session, "pattern_pictures")), Path(output)
+    if not 1 <= projector_pixels <= MOST_PIXELS:
+        raise ArgumentError("projector_pixels", f"{projector_pixels}: give 1 to {MOST_PIXELS}, those a side")
+    check_root(seed or 0)
+    drawn_at_random = patterns != STRIPES and takes_seed(patterns)
+    if seed is not None and not drawn_at_random:
+        raise ArgumentError("seed", "has no effect on patterns that are not drawn at random; leave it out")
+    if patterns == STRIPES:
+        if facts.camera is None or facts.exposure is None:
+            missing = "camera" if facts.camera is None else "exposure"
+            raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
+        from mitsim.exchange.png_files import SESSION, draw_stripes, session_of
+
+        capture = facts.signed_capture or "pair"
+        listed = session_of(str(facts.camera), facts.exposure, projector_pixels, capture)
+        return {**draw_stripes(folder, str(projector), listed), "session": str(folder / SESSION)}
+    read_name(patterns, projector_pixels)  # refused before numpy is imported
+    if facts.signed_capture is not None:
+        raise ArgumentError(
+            "signed_capture", "has no effect on patterns, whose signed ones are pairs; it is for stripes; leave it out"
+        )
+    for name in ("camera", "exposure"):
+        if (value := getattr(facts, name)) is not None:
+            raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
+    from mitsim.exchange.png_files import draw_family
+
+    return {**draw_family(folder, patterns, projector_pixels, str(projector), seed or 0), "session": None}
+
+
+@checked_fields
+@dataclass(frozen=True, kw_only=True)
+class SessionFacts:
+    """What the list of a calibration's frames says, as :func:`pattern_pictures` takes it; None: not said."""
+
+    camera: Path | str | None = None
+    exposure: float | None = None
+    signed_capture: Literal["pair", "uniform"] | None = None

@@ -40,7 +40,7 @@ LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
 
-def import_frames(source: Path, output: Path, known: RealCapture) -> dict[str, Any]:
+def import_capture(source: Path, output: Path, known: RealCapture) -> dict[str, Any]:
     """Write the RUN folder of a real capture, of all planes a coloured one, whole or not at all.
 
     Parameters

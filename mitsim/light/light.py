@@ -240,6 +240,7 @@ class SampledLight:
         to it."""
         return replace(self, simulation=Simulation(bench, self.simulation.settings))
 
+    @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
         """Contrast of speckle in frames of a ``family`` (None: of a white picture); 0 where it is left out."""
         return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pydantic
 
@@ -18,12 +18,15 @@ from mitsim.bench.request import Request
 from mitsim.core.configuration import Configuration
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
-from mitsim.core.images import table
+from mitsim.core.images import from_above, table
 from mitsim.core.job import Cost
 from mitsim.core.mistakes import refusal
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 from mitsim.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 State = Literal["exact", "approximate", "off"]
 LEFT_OUT, WITHOUT, NO_TIME, ONE = "left out, the frames change by", "without it the error", "it takes no time", ", one"
@@ -355,6 +358,20 @@ class Plan:
         if row is None or row.state != "off":
             return None
         return ColourChoice(MONO, (ColourCandidate(MONO, row.error_if_off, self.predicted_seconds),))
+
+    @check_arguments
+    def plot(self, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
+        """Draw what each effect would leave in the frames if it were off, or the seconds of each stage; returns the
+        axes.
+
+        Parameters
+        ----------
+        quantity
+            which of both.
+        ax
+            matplotlib's axes to draw on; None: those of a new figure.
+        """
+        return from_above("report.plots", "draw_plan")(self, quantity, ax)
 
     def __repr__(self) -> str:
         states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from mitsim.core.arrays import FloatArray, SeparableTerm
 from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
-from mitsim.core.images import card, normalise, span
+from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
@@ -24,7 +24,9 @@ from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import centre_columns
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from scipy.sparse.linalg import LinearOperator
+    from xarray import Dataset
 
 _LACKING = "lacking"
 """What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
@@ -63,6 +65,7 @@ class Factors:
     lacking: tuple[SeparableTerm, ...] = ()
 
     @classmethod
+    @check_arguments
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
         """The factors of an estimate.
 
@@ -131,8 +134,9 @@ class Factors:
             return self.write(place)
 
     @check_arguments
-    def write(self, folder: Path) -> Path:
+    def write(self, folder: Path | str) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
+        folder = Path(folder)
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
             metadata["reflectance"] = self.manifest.board_reflectance
@@ -217,6 +221,24 @@ class Factors:
         return LinearOperator(
             (int(np.prod(shape)), rows * columns), matvec=forward, rmatvec=adjoint, dtype=np.dtype(np.float64)
         )
+
+    @check_arguments
+    def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
+        """Draw a factor with a colour bar; returns the axes.
+
+        Parameters
+        ----------
+        side
+            ``left``: of rows; ``right``: of columns.
+        ax
+            matplotlib's axes to draw on; None: those of a new figure.
+        """
+        return from_above("report.plots", "draw_factor")(self, side, ax)
+
+    def to_xarray(self) -> Dataset:
+        """Both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm; MitsimError
+        where xarray, an extra, is not installed."""
+        return from_above("exchange.labelled", "label_factors")(self)
 
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name} {side.shape[0]} x {side.shape[1]}" for name, side in self._sides())

@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, options_of
 from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
-from mitsim.core.images import card, normalise, png, span
+from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -34,6 +34,10 @@ from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.subpixel import print_energy
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -155,17 +159,16 @@ class Reconstruction(Solution):
         MitsimError
             when the folder holds another image or something else, or cannot be written.
         """
-        try:
-            plain(more)
-        except TypeError as error:
-            raise ArgumentError("more", f"cannot be stored ({error})") from None
+        _check_stored(more)
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
             return self.write(place, more)
 
     @check_arguments
-    def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
+    def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
+        _check_stored(more)
+        folder = Path(folder)
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
         )
@@ -179,6 +182,31 @@ class Reconstruction(Solution):
             part.write_bytes(png(self.image / self.white))
         write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
         return folder
+
+    @check_arguments
+    def plot(self, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None) -> Axes:
+        """Draw the image, its standard uncertainty or the depths with a colour bar; returns the axes.
+
+        Parameters
+        ----------
+        quantity
+            what is drawn.
+        ax
+            matplotlib's axes to draw on; None: those of a new figure.
+
+        Raises
+        ------
+        MitsimError
+            for an uncertainty or depths that are not known.
+        """
+        return from_above("report.plots", "draw_image")(self, quantity, ax)
+
+    @check_arguments
+    def to_xarray(self, factors: Factors | None = None) -> Dataset:
+        """The image, and where known its uncertainty and depths, as an ``xarray.Dataset`` with units; by the
+        ``factors`` that it was solved with, coordinates in mm too. MitsimError where xarray, an extra, is not
+        installed."""
+        return from_above("exchange.labelled", "label_image")(self, factors)
 
     def __repr__(self) -> str:
         rows, columns = self.image.shape
@@ -194,6 +222,14 @@ class Reconstruction(Solution):
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
         return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
+
+
+def _check_stored(more: object) -> None:
+    """ArgumentError for entries of result.json that JSON cannot hold."""
+    try:
+        plain(more)
+    except TypeError as error:
+        raise ArgumentError("more", f"cannot be stored ({error})") from None
 
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
@@ -263,7 +299,7 @@ def reconstruct(
     method: str | Solver = TIKHONOV,
     focus: float | Literal["auto", "map"] | None = None,
     margin: int = 0,
-    depth_range: tuple[float, float] | None = None,
+    **options: Any,
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -278,9 +314,8 @@ def reconstruct(
         from the data.
     method
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0; other
-        bounds, and iterations: :func:`reconstruct_request`), ``tv`` (least total variation), or a solver of one's own,
-        such as a trained network (:func:`mitsim.load_network`).
+        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0), ``tv`` (least total variation),
+        or a solver of one's own, such as a trained network (:func:`mitsim.load_network`).
     focus
         depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
         least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
@@ -288,16 +323,19 @@ def reconstruct(
     margin
         cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
         they take up light from outside the window (:mod:`mitsim.reconstruct.background`). By ``tikhonov``, no focus.
-    depth_range
-        nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
-        calibrated depth.
+    **options
+        ``depth_range``: nearest and farthest depth [mm] that ``auto`` and ``map`` look for, a quarter of 1/z either way
+        of the calibrated depth unless given; ``bounds``, least and largest number of the image, and ``iterations``, at
+        most, of ``nonnegative`` and ``tv``.
+
     Raises
     ------
     MitsimError
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, depth_range))
+    known = options_of(ImageRequest, options, "reconstruct")
+    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, **known))
 
 
 @single_threaded_blas()

@@ -12,7 +12,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json, write_text
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.png_files import draw_family
 from mitsim.report.pages import Table
 from mitsim.studies.framework.experiment import Found, Point, Setup
@@ -31,7 +31,7 @@ NOISE = np.random.default_rng(4).random((64, 64))
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("bench")
     bench = made(folder, ambient=True)
-    export_run(bench.run, "hdf5", folder / "run.h5", bench.calibration)
+    export(bench.run, "hdf5", folder / "run.h5", bench.calibration)
     return bench
 
 
@@ -47,7 +47,7 @@ def sensed(path: Path) -> None:
 
 def exported(format: str, name: str, **more: str) -> Callable[[Made, Path], object]:
     calibrated = format in ("hdf5", "mat")
-    return lambda bench, place: export_run(
+    return lambda bench, place: export(
         bench.run, format, place / name, bench.calibration if calibrated else None, **more
     )
 

@@ -418,7 +418,7 @@ def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Call
     given |= dict.fromkeys(("image", "truth"), np.ones((2, 2)))
     given |= dict.fromkeys(("folder", "run", "calibration", "output", "path", "frames", "listed", "psf"), "new")
     given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
-    given |= {"method": "unrolled", "pairs": "new"}
+    given |= {"method": "unrolled", "pairs": "new", "source": "new", "format": "mat", "camera": "imx249"}
     given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
     parameters = inspect.signature(called).parameters.values()
     return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}

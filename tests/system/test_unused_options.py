@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export
 from tests.exchanged import Made, made
 
 
@@ -19,8 +19,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """A run and a calibration, the same as files, a picture, and an image of irradiance."""
     bench = made(tmp_path_factory.mktemp("bench"))
     folder = bench.run.parent
-    export_run(bench.run, "hdf5", folder / "run.h5", bench.calibration)
-    export_run(bench.run, "mat", folder / "run.mat", bench.calibration)
+    export(bench.run, "hdf5", folder / "run.h5", bench.calibration)
+    export(bench.run, "mat", folder / "run.mat", bench.calibration)
     Image.new("L", (8, 8)).save(folder / "a.png")
     np.zeros(64, np.uint16).tofile(folder / "a.raw")
     np.save(folder / "light.npy", np.ones((4, 4)))

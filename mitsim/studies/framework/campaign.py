@@ -33,6 +33,7 @@ from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found,
 from mitsim.studies.framework.run import (
     KEPT,
     POINTS,
+    InFolder,
     Shard,
     Store,
     batches,
@@ -78,7 +79,7 @@ class Where:
 
 
 @dataclass(frozen=True)
-class CampaignResult:
+class CampaignResult(InFolder):
     """A study, or the part of it whose points are measured: what the command line reports.
 
     Attributes
@@ -102,6 +103,11 @@ class CampaignResult:
     claims: tuple[Claim, ...] = ()
     figures: tuple[str, ...] = ()
     section: Section | None = None
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """None: what a study of many points found is told by its claims' verdicts."""
+        return ()
 
     def payload(self) -> dict[str, Any]:
         """As JSON."""

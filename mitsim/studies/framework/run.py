@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from functools import partial
 from itertools import groupby
@@ -73,6 +73,14 @@ class Findings:
         """Of its page."""
         return ()
 
+    def records(self) -> list[dict[str, Any]]:
+        """What was measured, a dictionary a row: the first table, or the first list of such in the JSON."""
+        for table in self.tables().values():
+            return [dict(row) for row in table.rows]
+        lists = (value for value in self.payload().values() if isinstance(value, list | tuple))
+        found = ([dict(row) for row in each if isinstance(row, Mapping)] for each in lists)
+        return next((rows for rows in found if rows), [])
+
     @property
     def message(self) -> str:
         """What the page says first; empty for its title alone."""
@@ -84,14 +92,48 @@ class Findings:
         return ()
 
 
+class InFolder:
+    """What a study came to, for programs and notebooks: ``rows`` of its table, and the folder ``output``."""
+
+    rows: tuple[Any, ...]
+    output: str
+
+    def lines(self) -> list[str]:
+        """For people."""
+        raise NotImplementedError
+
+    def to_pandas(self) -> Any:
+        """The rows as a ``pandas.DataFrame``; MitsimError where pandas is not installed."""
+        try:
+            import pandas
+        except ImportError:
+            raise MitsimError("pandas is not installed, which tables need; type: pip install pandas") from None
+        return pandas.DataFrame([*self.rows])
+
+    @property
+    def pictures(self) -> dict[str, Path]:
+        """Files of the figures, by name."""
+        return {path.name: path for path in sorted(Path(self.output).glob("*.png"))}
+
+    def _repr_html_(self) -> str:
+        from mitsim.core.images import card, data_uri
+
+        figures = (
+            f'<img style="max-width:100%" src="{data_uri(each.read_bytes())}">' for each in self.pictures.values()
+        )
+        return card(f"Study in {self.output}", {}, self.lines()) + "".join(figures)
+
+
 @dataclass(frozen=True)
-class StudyResult:
-    """Findings, of which scene and patterns they are (None: of none), and the folder ``output`` that holds them."""
+class StudyResult(InFolder):
+    """Findings, of which scene and patterns they are (None: of none), the folder ``output`` that holds them, and the
+    ``rows`` of their table."""
 
     findings: Findings
     scene: str | None
     patterns: str | None
     output: str
+    rows: tuple[Any, ...] = field(default=(), repr=False)
 
     def payload(self) -> dict[str, Any]:
         """What the command line reports."""
@@ -133,7 +175,7 @@ def run_study(
     with study_folder(output, name) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
-        result = StudyResult(findings, scene, patterns, str(folder))
+        result = StudyResult(findings, scene, patterns, str(folder), tuple(findings.records()))
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = write_figures(folder, findings.figures())

@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from mitsim.cli import screen
+from mitsim.core import progress
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Clock, Cost, Job
 from mitsim.light.plan import Plan, PlanRow, State
@@ -19,15 +20,15 @@ from mitsim.light.plan import Plan, PlanRow, State
 @pytest.fixture
 def every_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that is half a minute further at each look."""
-    ticks = itertools.count(step=screen.SECONDS_A_LINE / 2)
-    monkeypatch.setattr(screen.time, "monotonic", lambda: next(ticks))
+    ticks = itertools.count(step=progress.SECONDS_A_LINE / 2)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(ticks))
 
 
 def test_a_log_gets_a_line_a_minute(capsys: pytest.CaptureFixture[str], every_half_minute: None) -> None:
     """A job of a cluster has no terminal: what is done and what is left stands in its log, but not at every step."""
-    with screen.showing_progress(hidden=False) as watch:
+    with progress.progress() as job:
         for point in range(1, 7):
-            watch.report(f"patterns: {point} of 6 points", point / 6)
+            job.progress(f"patterns: {point} of 6 points", point / 6)
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines() == [
@@ -39,9 +40,9 @@ def test_a_log_gets_a_line_a_minute(capsys: pytest.CaptureFixture[str], every_ha
 
 def test_hidden_progress_leaves_no_line(capsys: pytest.CaptureFixture[str], every_half_minute: None) -> None:
     """``--quiet``."""
-    with screen.showing_progress(hidden=True) as watch:
+    with progress.progress(hidden=True) as job:
         for point in range(6):
-            watch.report("transport", point / 6)
+            job.progress("transport", point / 6)
     assert capsys.readouterr().err == ""
 
 
@@ -54,8 +55,8 @@ class Terminal:
     def __init__(self, patch: pytest.MonkeyPatch, height: int = 24) -> None:
         self.now, self.height = 100.0, height
         for name in ("monotonic", "perf_counter"):
-            patch.setattr(screen.time, name, lambda: self.now)
-        self.rows = screen._Rows(2.0)
+            patch.setattr(progress.time, name, lambda: self.now)
+        self.rows = progress._Rows(2.0)
         self.clock = Clock(0.0, self.rows)
 
     @property
@@ -186,8 +187,8 @@ def test_no_control_character_of_a_file_reaches_the_terminal(capsys: pytest.Capt
     assert out == f"{HARMLESS}\nnext\n" and err == f"mitsim: warning: {HARMLESS}\n"
     screen.finish(True, {"name": HOSTILE}, [], [])
     assert capsys.readouterr().out.isascii()
-    with screen.showing_progress(hidden=False) as watch:
-        watch.report(HOSTILE, 0.5)
+    with progress.progress() as job:
+        job.progress(HOSTILE, 0.5)
     assert "\x1b" not in capsys.readouterr().err
 
 
@@ -308,3 +309,43 @@ def test_output_that_nobody_reads_ends_as_by_a_signal(monkeypatch: pytest.Monkey
     monkeypatch.setattr(screen.sys, "stdout", Full(28))
     with pytest.raises(MitsimError, match="standard output: cannot be written"), screen.write_at_end():
         print("result")
+
+
+# ---- rows of a notebook ----------------------------------------------------------------------------------------------
+
+
+def test_a_notebook_has_the_rows_below_its_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One output, written anew, which stays. (Planted: another output at each stage; nothing written at the end.)"""
+    import IPython
+    import IPython.display
+
+    pages: list[list[str]] = []
+
+    class Handle:
+        """What ``display`` gives for an output."""
+
+        def update(self, page: Any) -> None:
+            """Take the place of it."""
+            pages[-1].append(page.data)
+
+    def display(page: Any, display_id: bool) -> Handle:
+        assert display_id
+        pages.append([page.data])
+        return Handle()
+
+    monkeypatch.setattr(IPython, "get_ipython", lambda: type("Shell", (), {"kernel": object()})())
+    monkeypatch.setattr(IPython.display, "display", display)
+    clock = [100.0]
+    for name in ("monotonic", "perf_counter"):
+        monkeypatch.setattr(progress.time, name, lambda: clock[0])
+    with progress.progress() as job:
+        with job.clock.stage("plan"):
+            clock[0] += 1.0
+        with job.clock.stage("transport"):
+            clock[0] += 1.0
+            job.progress("transport", 0.5)
+            clock[0] += 0.1  # too soon to be written again
+            job.progress("transport", 1.0)
+    (shown,) = pages
+    assert "plan" in shown[0] and "transport" not in shown[0] and "<pre" in shown[0]
+    assert "left" in shown[-2] and "transport" in shown[-1] and "left" not in shown[-1] and "1.1 s" in shown[-1]

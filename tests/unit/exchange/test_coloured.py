@@ -17,9 +17,9 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
 from mitsim.exchange.capture_list import CaptureList, RealCapture
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.hdf5 import open_hdf5
-from mitsim.exchange.real import import_frames
+from mitsim.exchange.real import import_capture
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 from tests.unit.exchange.test_real import known
 
@@ -66,7 +66,7 @@ def whole(folder: Path) -> dict[str, dict[str, bytes]]:
 
 def test_folders_come_back_to_the_byte_by_hdf5(coloured: Coloured, tmp_path: Path) -> None:
     """(Planted: the first line's frames written for all; colour.json written from its model.)"""
-    payload = export_run(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
+    payload = export(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
     result = import_file(tmp_path / "all.h5", tmp_path / "run 2", tmp_path / "cal 2")
     assert whole(tmp_path / "run 2") == whole(coloured.run)
     assert whole(tmp_path / "cal 2") == whole(coloured.calibration)
@@ -74,7 +74,7 @@ def test_folders_come_back_to_the_byte_by_hdf5(coloured: Coloured, tmp_path: Pat
 
 
 def test_a_line_is_read_where_it_lies(coloured: Coloured, tmp_path: Path) -> None:
-    export_run(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
+    export(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
     with open_hdf5(tmp_path / "all.h5", "520nm") as file:
         assert np.array_equal(file.shots.dn, ms.load_run(coloured.run / "520nm").dn)
         assert file.factors is not None
@@ -82,14 +82,14 @@ def test_a_line_is_read_where_it_lies(coloured: Coloured, tmp_path: Path) -> Non
     for line in (None, "521nm"):
         with pytest.raises(MitsimError, match=r"638nm, 520nm, 445.5nm; give one"), open_hdf5(tmp_path / "all.h5", line):
             pass
-    export_run(coloured.run / "520nm", "hdf5", tmp_path / "one.h5")
+    export(coloured.run / "520nm", "hdf5", tmp_path / "one.h5")
     with pytest.raises(MitsimError, match="no lines; leave it out"), open_hdf5(tmp_path / "one.h5", "520nm"):
         pass
 
 
 def test_folders_come_back_by_mat(coloured: Coloured, tmp_path: Path) -> None:
     """All but the expected electrons. (Planted: all lines read by the first one's ending.)"""
-    export_run(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
     import_file(tmp_path / "all.mat", tmp_path / "run 2", tmp_path / "cal 2")
     assert whole(tmp_path / "cal 2") == whole(coloured.calibration)
     assert (tmp_path / "run 2" / "colour.json").read_bytes() == (coloured.run / "colour.json").read_bytes()
@@ -99,7 +99,7 @@ def test_folders_come_back_by_mat(coloured: Coloured, tmp_path: Path) -> None:
 
 def test_each_line_has_the_papers_variables(coloured: Coloured, tmp_path: Path) -> None:
     """phi_left_638nm (P o X) phi_right_638nm' = data_coded_638nm - measBg_638nm, of no other line."""
-    export_run(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
     held = loadmat(tmp_path / "all.mat")
     for end in ("638nm", "520nm", "445_5nm"):
         lit = np.outer(held[f"PL_{end}"][:, 1], held[f"PR_{end}"][:, 2]) * held[f"truth_{end}"]
@@ -110,7 +110,7 @@ def test_each_line_has_the_papers_variables(coloured: Coloured, tmp_path: Path) 
 
 @octave
 def test_octave_reads_and_writes_every_line(coloured: Coloured, tmp_path: Path) -> None:
-    export_run(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
     script = """
 a = load('all.mat');
 found = a.data_coded_520nm(:,:,2,3) - a.measBg_520nm;
@@ -132,7 +132,7 @@ save('-v7', 'again.mat', '-struct', 'a');
 def test_tensors_have_an_axis_of_lines(coloured: Coloured, tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("deepinv")
-    export_run(coloured.run, "deepinv", tmp_path / "run.pt", coloured.calibration)
+    export(coloured.run, "deepinv", tmp_path / "run.pt", coloured.calibration)
     physics, held = tensors.load_physics(tmp_path / "run.pt")
     assert held["wavelengths_nm"].tolist() == [*LINES.values()]
     assert held["y"].shape == (3, 6, ROWS, COLUMNS) and held["x"].shape == (3, *SCENE)
@@ -158,7 +158,7 @@ def test_lines_under_other_patterns_are_no_tensor(
     manifest["patterns"]["P_L"] = manifest["patterns"]["P_L"][::-1]
     place.write_text(json.dumps(manifest))
     with pytest.raises(MitsimError, match="lines differ in their patterns; use the format hdf5"):
-        export_run(coloured.run, "torch", tmp_path / "run.pt", coloured.calibration)
+        export(coloured.run, "torch", tmp_path / "run.pt", coloured.calibration)
     assert not (tmp_path / "run.pt").exists()
 
 
@@ -178,7 +178,7 @@ PLANES = {"r": (1, 1, "638nm"), "gb": (0, 1, "520nm"), "gr": (1, 0, "520nm"), "b
 def test_a_plane_of_flatcam_is_the_whole_frame_of_a_line(coloured: Coloured, tmp_path: Path) -> None:
     """The longest wavelength is red; of each plane P1 X Q1' is the frame less its rows' and columns' means, but for
     noise; folders come back. (Planted: red and blue changed places.)"""
-    export_run(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
     held = loadmat(tmp_path / "all.mat")
     assert held["meas"].shape == (2 * ROWS, 2 * COLUMNS, 6) and held["cSize"].tolist() == [[ROWS, COLUMNS]]
     for plane, (row, column, name) in PLANES.items():
@@ -199,7 +199,7 @@ def test_a_plane_of_flatcam_is_the_whole_frame_of_a_line(coloured: Coloured, tmp
 @octave
 def test_octave_reads_the_planes_of_flatcam(coloured: Coloured, tmp_path: Path) -> None:
     """By the indices of FlatCam's code, from 1; what Octave saves comes back."""
-    export_run(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
     script = """
 a = load('all.mat');
 red = a.meas(2:2:end, 2:2:end, 6);
@@ -222,12 +222,12 @@ def test_lines_that_are_no_planes_of_flatcam_are_refused(coloured: Coloured, tmp
     shutil.rmtree(coloured.run / "520nm")
     made(tmp_path / "signed", signed=True).run.rename(coloured.run / "520nm")
     with pytest.raises(MitsimError, match=r"6 of 638nm, 8 of 520nm, .* use mat"):
-        export_run(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
+        export(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
     for folder in (coloured.run, coloured.calibration):
         colours = json.loads((folder / "colour.json").read_text())
         (folder / "colour.json").write_text(json.dumps({**colours, "channels": colours["channels"][:2]}))
     with pytest.raises(MitsimError, match=r"lines are 638nm, 520nm; FlatCam has red, green and blue"):
-        export_run(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
+        export(coloured.run, "flatcam", tmp_path / "all.mat", coloured.calibration)
     assert not (tmp_path / "all.mat").exists()
 
 
@@ -236,7 +236,7 @@ def test_pictures_of_every_line_are_read_again(coloured: Coloured, tmp_path: Pat
     known(Made(coloured.run / "638nm", coloured.calibration / "638nm", np.zeros(SCENE)))  # writes its camera's file
     projector = tmp_path / "projector.toml"
     projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
-    notes = export_run(coloured.run, "png", tmp_path / "out", projector=str(projector))["notes"]
+    notes = export(coloured.run, "png", tmp_path / "out", projector=str(projector))["notes"]
     assert (tmp_path / "out" / "colour.json").read_bytes() == (coloured.run / "colour.json").read_bytes()
     assert notes[0] == f"Begin with: mkdir RUN; cp {tmp_path / 'out' / 'colour.json'} RUN"
     (tmp_path / "run 2").mkdir()
@@ -251,7 +251,7 @@ def test_pictures_of_every_line_are_read_again(coloured: Coloured, tmp_path: Pat
             CaptureList(patterns=options["--patterns"], **ambient), str(coloured.run / "camera.toml"),
             float(options["--exposure"]), coloured.calibration / name,
         )  # fmt: skip
-        import_frames(Path(words[0]), tmp_path / "run 2" / name, about)
+        import_capture(Path(words[0]), tmp_path / "run 2" / name, about)
         first, again = ms.load_run(coloured.run / name), ms.load_run(tmp_path / "run 2" / name)
         assert np.array_equal(again.dn, first.dn) and (again.ambient is None) == (first.ambient is None)
         assert again.manifest.patterns.captures == first.manifest.patterns.captures
@@ -259,14 +259,14 @@ def test_pictures_of_every_line_are_read_again(coloured: Coloured, tmp_path: Pat
 
 def test_calibrations_of_other_lines_are_refused(coloured: Coloured, tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match=r"is coloured, but .* is not; give a line's folder"):
-        export_run(coloured.run / "638nm", "mat", tmp_path / "x.mat", coloured.calibration)
+        export(coloured.run / "638nm", "mat", tmp_path / "x.mat", coloured.calibration)
     with pytest.raises(MitsimError, match=r"holds no colour.json"):
-        export_run(coloured.run, "mat", tmp_path / "x.mat", coloured.calibration / "638nm")
+        export(coloured.run, "mat", tmp_path / "x.mat", coloured.calibration / "638nm")
     (coloured.calibration / "colour.json").write_text(
         (coloured.calibration / "colour.json").read_text().replace("520", "521")
     )
     with pytest.raises(MitsimError, match="calibrate each line of this projector"):
-        export_run(coloured.run, "hdf5", tmp_path / "x.h5", coloured.calibration)
+        export(coloured.run, "hdf5", tmp_path / "x.h5", coloured.calibration)
     assert not (tmp_path / "x.h5").exists()
 
 
@@ -282,14 +282,14 @@ def test_a_line_that_no_variable_can_end_in_goes_by_hdf5(new: str, coloured: Col
     """One that begins with a letter may end another variable; two names may be the same to MATLAB; one is too long."""
     renamed(coloured, "520nm", new)
     with pytest.raises(MitsimError, match="no variable of MATLAB can end in"):
-        export_run(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
-    export_run(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
+        export(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
     import_file(tmp_path / "all.h5", tmp_path / "run 2", tmp_path / "cal 2")
     assert whole(tmp_path / "run 2") == whole(coloured.run)
 
 
 def test_a_file_that_lost_a_line_leaves_no_folder(coloured: Coloured, tmp_path: Path) -> None:
-    export_run(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
+    export(coloured.run, "mat", tmp_path / "all.mat", coloured.calibration)
     held = {key: value for key, value in loadmat(tmp_path / "all.mat").items() if not key.startswith("__")}
     cases = {
         "run_manifest": {key: value for key, value in held.items() if not key.endswith("520nm")},

@@ -14,7 +14,7 @@ from scipy.io import loadmat, savemat
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.reconstruct.colour import behind
 from tests.coloured import WEIGHTS, mosaic_folders
@@ -41,7 +41,7 @@ def same_folders(again: Path, first: Path) -> None:
 def test_folders_come_back(format: str, name: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
     """Frames, every line's truth and factors, and colour.json. (Planted: the first line's truth for all.)"""
     run, calibration = folders
-    payload = export_run(run, format, tmp_path / name, calibration)
+    payload = export(run, format, tmp_path / name, calibration)
     result = import_file(tmp_path / name, tmp_path / "run", tmp_path / "cal")
     same_folders(tmp_path / "run", run)
     assert whole(tmp_path / "cal") == whole(calibration)
@@ -52,7 +52,7 @@ def test_folders_come_back(format: str, name: str, folders: tuple[Path, Path], t
 def test_a_run_without_truths_and_calibration(format: str, name: str, tmp_path: Path) -> None:
     """As of a real camera."""
     run, _ = mosaic_folders(tmp_path, "dots:2", truths=False)
-    export_run(run, format, tmp_path / name)
+    export(run, format, tmp_path / name)
     import_file(tmp_path / name, tmp_path / "run 2")
     same_folders(tmp_path / "run 2", run)
     with pytest.raises(MitsimError, match="holds no calibration"):
@@ -68,7 +68,7 @@ def expected_of(held: dict[str, np.ndarray], i: int, j: int) -> np.ndarray:
 
 def test_the_variables_are_the_papers_model_behind_filters(folders: tuple[Path, Path], tmp_path: Path) -> None:
     """(Planted: rows and columns of the filters changed places.)"""
-    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+    export(folders[0], "mat", tmp_path / "all.mat", folders[1])
     held = loadmat(tmp_path / "all.mat")
     assert np.array_equal(held["weights"], WEIGHTS)
     found = held["data_coded"][:, :, 1, 0] - held["measBg"]
@@ -78,7 +78,7 @@ def test_the_variables_are_the_papers_model_behind_filters(folders: tuple[Path, 
 
 @octave
 def test_octave_reads_and_writes_every_line(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+    export(folders[0], "mat", tmp_path / "all.mat", folders[1])
     script = """
 a = load('all.mat');
 seen = 0;
@@ -101,7 +101,7 @@ save('-v7', 'again.mat', '-struct', 'a');
 
 
 def test_frames_and_factors_are_read_where_they_lie(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    export_run(folders[0], "hdf5", tmp_path / "all.h5", folders[1])
+    export(folders[0], "hdf5", tmp_path / "all.h5", folders[1])
     with open_hdf5(tmp_path / "all.h5") as file:
         assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is None
     with open_hdf5(tmp_path / "all.h5", "520nm") as file:
@@ -115,7 +115,7 @@ def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) ->
     """<A x, y> = <x, A^T y> in double precision, and A of the truths is what was measured, but for noise."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("deepinv")
-    export_run(folders[0], "deepinv", tmp_path / "run.pt", folders[1])
+    export(folders[0], "deepinv", tmp_path / "run.pt", folders[1])
     physics, held = tensors.load_physics(tmp_path / "run.pt")
     assert np.array_equal(held["y"].numpy(), tensors.measurements(ms.load_run(folders[0])))
     seen = physics.A(held["x"][None])[0]
@@ -131,7 +131,7 @@ def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) ->
 def test_formats_that_know_no_filters_say_so(format: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
     calibration = folders[1] if format == "flatcam" else None
     with pytest.raises(MitsimError, match=rf"is behind colour filters, of which {format} .*; use hdf5, mat, deepinv"):
-        export_run(folders[0], format, tmp_path / "out", calibration)
+        export(folders[0], format, tmp_path / "out", calibration)
     assert not (tmp_path / "out").exists()
 
 
@@ -139,8 +139,8 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(folders: tuple[Path,
     other = shutil.copytree(folders[1], tmp_path / "other")
     (other / "colour.json").write_text((other / "colour.json").read_text().replace("520", "521"))
     with pytest.raises(MitsimError, match="calibrate each line of this projector"):
-        export_run(folders[0], "hdf5", tmp_path / "all.h5", other)
-    export_run(folders[0], "mat", tmp_path / "all.mat", folders[1])
+        export(folders[0], "hdf5", tmp_path / "all.h5", other)
+    export(folders[0], "mat", tmp_path / "all.mat", folders[1])
     held = {key: value for key, value in loadmat(tmp_path / "all.mat").items() if not key.startswith("__")}
     colours = json.loads(held["mosaic_run"].item())
     wrong = [{**line, "name": "frame_00000.exr"} for line in colours["channels"]]

@@ -15,7 +15,7 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import export, import_file
 from mitsim.exchange.hdf5 import open_hdf5
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
@@ -26,7 +26,7 @@ def bench(tmp_path: Path) -> Made:
 
 
 def exported(bench: Made, tmp_path: Path) -> Path:
-    export_run(bench.run, "hdf5", tmp_path / "all.h5", bench.calibration)
+    export(bench.run, "hdf5", tmp_path / "all.h5", bench.calibration)
     return tmp_path / "all.h5"
 
 

@@ -18,7 +18,7 @@ from mitsim.core import arrays
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.exchange import matlab
-from mitsim.exchange.formats import export_run, import_file
+from mitsim.exchange.formats import export, import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
 
 CASES = ["dots", "signed", "real output", "ambient"]
@@ -34,7 +34,7 @@ def test_folders_come_back_without_the_expected_electrons(format: str, case: str
     """Digital numbers, ambient frame, truth, factors and manifests to the bit, and so the image. (Planted: rows of the
     pattern's index for columns; the negative half not added again; factors divided by the scale, not by its root.)"""
     bench = bench_of(case, tmp_path)
-    export_run(bench.run, format, tmp_path / "all.mat", bench.calibration)
+    export(bench.run, format, tmp_path / "all.mat", bench.calibration)
     result = import_file(tmp_path / "all.mat", tmp_path / "run 2", tmp_path / "cal 2")
     assert result["left_out"] == [matlab.ELECTRONS]
     first, again = ms.load_run(bench.run), ms.load_run(tmp_path / "run 2")
@@ -57,7 +57,7 @@ def test_folders_come_back_without_the_expected_electrons(format: str, case: str
 def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
     """phi_left (P o X) phi_right' = data_coded - measBg for every pattern, but for the noise, a few digital numbers."""
     bench = bench_of(case, tmp_path)
-    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     held = loadmat(tmp_path / "all.mat")
     left, right = held["PL"], held["PR"]
     assert held["data_coded"].shape == (ROWS, COLUMNS, left.shape[1], right.shape[1])
@@ -74,7 +74,7 @@ def test_flatcams_variables_are_its_model(tmp_path: Path) -> None:
     """A plane of a frame, less its rows' and columns' means, is P1 X Q1' less noise, plane by plane as its loader takes
     them. (Planted: gb and gr changed places; factors with their means.)"""
     bench = made(tmp_path)
-    export_run(bench.run, "flatcam", tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "flatcam", tmp_path / "all.mat", bench.calibration)
     held = loadmat(tmp_path / "all.mat")
     assert held["cSize"].tolist() == [[ROWS / 2, COLUMNS / 2]] and held["angle"].item() == 0
     lit = np.outer(held["PL"][:, 1], held["PR"][:, 2]) * bench.scene
@@ -95,12 +95,12 @@ def test_flatcams_variables_are_its_model(tmp_path: Path) -> None:
 
 
 def test_background_is_black_level_and_dark_current_or_the_ambient_frame(tmp_path: Path) -> None:
-    export_run(made(tmp_path / "a").run, "mat", tmp_path / "a.mat")
+    export(made(tmp_path / "a").run, "mat", tmp_path / "a.mat")
     held = loadmat(tmp_path / "a.mat")
     dark = DIGITAL.black_level_dn + DIGITAL.dark_current_e_per_s * DIGITAL.exposure_s * DIGITAL.gain_dn_per_e
     assert np.array_equal(held["measBg"], np.full((ROWS, COLUMNS), dark)) and "phi_left" not in held
     bench = made(tmp_path / "b", ambient=True)
-    export_run(bench.run, "mat", tmp_path / "b.mat")
+    export(bench.run, "mat", tmp_path / "b.mat")
     assert np.array_equal(loadmat(tmp_path / "b.mat")["measBg"], read_frame(bench.run / "ambient.exr")[0]["DN"])
 
 
@@ -121,7 +121,7 @@ save('-v7', 'again.mat', '-struct', 'a');
 @pytest.mark.parametrize("case", ["signed", "ambient"])
 def test_octave_reads_what_is_written_and_writes_what_is_read(case: str, tmp_path: Path) -> None:
     bench = bench_of(case, tmp_path)
-    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     script = (
         OCTAVE
         if case == "ambient"
@@ -148,7 +148,7 @@ def test_octave_reads_what_is_written_and_writes_what_is_read(case: str, tmp_pat
 
 def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -> None:
     bench = made(tmp_path)
-    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     held = {name: value for name, value in loadmat(tmp_path / "all.mat").items() if not name.startswith("__")}
 
     def changed(words: str, **values: object) -> None:
@@ -176,13 +176,13 @@ def test_files_that_are_none_are_refused_and_no_folder_is_left(tmp_path: Path) -
 def test_a_run_larger_than_such_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrays, "LARGEST_VARIABLE", 1000)
     with pytest.raises(MitsimError, match=r"data_coded takes .* hdf5"):
-        export_run(made(tmp_path).run, "mat", tmp_path / "all.mat")
+        export(made(tmp_path).run, "mat", tmp_path / "all.mat")
     assert not (tmp_path / "all.mat").exists()
 
 
 def test_flatcam_needs_a_calibration(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match="calibration is not given"):
-        export_run(made(tmp_path).run, "flatcam", tmp_path / "all.mat")
+        export(made(tmp_path).run, "flatcam", tmp_path / "all.mat")
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["status"] == "complete"
 

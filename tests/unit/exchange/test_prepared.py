@@ -35,8 +35,8 @@ from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.devices.framelist import load_frames
 from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
-from mitsim.exchange.formats import export_run, import_file
-from mitsim.exchange.real import import_frames
+from mitsim.exchange.formats import export, import_file
+from mitsim.exchange.real import import_capture
 from mitsim.reconstruct.captured_session import calibrate_frames
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, made
 from tests.real_session import RealSession, write_list
@@ -200,7 +200,7 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     about = replace(known(bench), camera=twelve(tmp_path))
     written(tmp_path / "a", "png", dn * 16)
     np.save(tmp_path / "dark.npy", dn[0] * 16 / 3)
-    result = import_frames(
+    result = import_capture(
         tmp_path / "a",
         tmp_path / "run a",
         replace(known(bench, ambient=tmp_path / "dark.npy"), camera=twelve(tmp_path)),
@@ -222,7 +222,7 @@ def test_numbers_in_the_high_bits_are_found_and_named(tmp_path: Path) -> None:
     eight.write_text(ELECTRONICS.replace("bits = 16", "bits = 8"))
     written(tmp_path / "b", "png", dn // 16 * 257)
     about = replace(known(bench, black_level_dn=10.0), camera=str(eight))
-    result = import_frames(tmp_path / "b", tmp_path / "run b", about)
+    result = import_capture(tmp_path / "b", tmp_path / "run b", about)
     assert np.array_equal(ms.load_run(tmp_path / "run b").dn, dn // 16) and result["divided_by"] == 257
 
 
@@ -231,11 +231,11 @@ def test_a_factor_within_the_cameras_range_is_doubted_unless_it_is_stated(tmp_pa
     bench = made(tmp_path)
     dn = ms.load_run(bench.run).dn // 4
     written(tmp_path / "a", "png", dn * 4)
-    result = import_frames(tmp_path / "a", tmp_path / "run a", known(bench))
+    result = import_capture(tmp_path / "a", tmp_path / "run a", known(bench))
     assert "multiples of 4, and are taken as they are" in result["warnings"][0] and result["divided_by"] == 1
     for factor, kept in ((4, dn), (2, 2 * dn), (1, 4 * dn)):
         about = known(bench, prepare=Preparation(divide_by=factor))
-        result = import_frames(tmp_path / "a", tmp_path / f"by {factor}", about)
+        result = import_capture(tmp_path / "a", tmp_path / f"by {factor}", about)
         assert not result["warnings"] and np.array_equal(ms.load_run(tmp_path / f"by {factor}").dn, kept)
     refused("the numbers' common factor is 4", tmp_path, tmp_path / "a", known(bench, prepare=Preparation(divide_by=8)))
 
@@ -252,7 +252,7 @@ def test_few_numbers_of_a_dark_frame_tell_a_shift(
     dark = np.random.default_rng(2).choice(list(numbers), (40, 36)).astype(np.uint16)
     np.save(tmp_path / "dark.npy", dark * times)
     about = RealCapture(CaptureList(patterns="uniform", n=4), twelve(tmp_path), 0.02, black_level_dn=10.0)
-    (*warning,) = import_frames(tmp_path / "dark.npy", tmp_path / "run", about)["warnings"]
+    (*warning,) = import_capture(tmp_path / "dark.npy", tmp_path / "run", about)["warnings"]
     assert len(warning) == (doubted > 1) and all(f"give --divide {doubted}, else" in each for each in warning)
 
 
@@ -446,7 +446,7 @@ def test_matlab_files_of_version_7_3(tmp_path: Path) -> None:
         assert np.array_equal(factors.right, sides[f"Q1{name}"].astype(np.float32))
         assert factors.manifest.camera == {"name": "calib", "channel": name}
     bench = made(tmp_path / "bench")
-    export_run(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     from mitsim.exchange.matlab import variables_in
 
     held = {name: value for name, value in variables_in(tmp_path / "all.mat").items() if name[0] != "_"}
@@ -631,10 +631,10 @@ def test_hostile_and_odd_files(name: str, tmp_path: Path) -> None:
     about = RealCapture(listed, twelve(tmp_path), 0.02, black_level_dn=40.0)
     if name in HOSTILE:
         with pytest.raises(MitsimError, match=re.escape(HOSTILE[name][1])):
-            import_frames(path, output, about)
+            import_capture(path, output, about)
         assert not output.exists()
         return
-    result = import_frames(path, output, about)
+    result = import_capture(path, output, about)
     expected = np.arange(300, 420).reshape(12, 10)
     assert result["divided_by"] == 16
     turns = -1 if "quarter" in name else 2 if "turned" in name else 0

@@ -23,8 +23,8 @@ from mitsim.core.imagelist import Preparation, Raw, Wanted
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.exchange import real
 from mitsim.exchange.capture_list import CaptureList, RealCapture
-from mitsim.exchange.formats import export_run
-from mitsim.exchange.real import LEFT_OUT, import_frames
+from mitsim.exchange.formats import export
+from mitsim.exchange.real import LEFT_OUT, import_capture
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, made
@@ -77,7 +77,7 @@ def test_frames_give_the_image_of_the_run_that_they_are_of(kind: str, tmp_path: 
     shots = ms.load_run(bench.run)
     written(tmp_path / "frames", kind, shots.dn)
     raw = Raw.of(f"{ROWS}x{COLUMNS}", 16, "big") if kind == "raw" else None
-    result = import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, raw=raw))
+    result = import_capture(tmp_path / "frames", tmp_path / "run 2", known(bench, raw=raw))
     again, factors = ms.load_run(tmp_path / "run 2"), ms.load_calibration(bench.calibration)
     assert result["left_out"] == list(LEFT_OUT) and result["shape"] == [ROWS, COLUMNS] and result["frames"] == 6
     assert np.array_equal(again.dn, shots.dn) and again.dn.dtype == np.uint32
@@ -95,7 +95,7 @@ def test_signed_pairs_come_as_they_are_shown(tmp_path: Path) -> None:
     shots = ms.load_run(bench.run)
     swapped = shots.dn[np.array([1, 0, 3, 2, 5, 4, 7, 6])]  # the run has the negative half first
     written(tmp_path / "frames", "npy", swapped)
-    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, "hadamard:2"))
+    import_capture(tmp_path / "frames", tmp_path / "run 2", known(bench, "hadamard:2"))
     images = [
         ms.reconstruct(ms.load_run(run), ms.load_calibration(bench.calibration)).image
         for run in (bench.run, tmp_path / "run 2")
@@ -110,7 +110,7 @@ def test_frames_with_the_projector_off_are_taken_off(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     dark = rng.integers(100, 900, (4, ROWS, COLUMNS))
     written(tmp_path / "dark", "png", dark)
-    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, ambient=tmp_path / "dark"))
+    import_capture(tmp_path / "frames", tmp_path / "run 2", known(bench, ambient=tmp_path / "dark"))
     again = ms.load_run(tmp_path / "run 2")
     assert again.ambient is not None and again.ambient.shots == 4
     assert np.array_equal(again.read("ambient.exr")[0]["DN"], dark.mean(axis=0).astype(np.float32))
@@ -121,10 +121,10 @@ def test_pictures_and_frames_of_a_run_are_read_again(tmp_path: Path) -> None:
     bench = made(tmp_path, ambient=True)
     projector = tmp_path / "projector.toml"
     projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
-    export_run(bench.run, "png", tmp_path / "out", projector=str(projector))
+    export(bench.run, "png", tmp_path / "out", projector=str(projector))
     out, shots = tmp_path / "out", ms.load_run(bench.run)
     more = {"ambient": out / "ambient.npy", "ambient_shots": 5}
-    import_frames(out / "frames", tmp_path / "run 2", known(bench, str(out / "patterns.json"), **more))
+    import_capture(out / "frames", tmp_path / "run 2", known(bench, str(out / "patterns.json"), **more))
     again = ms.load_run(tmp_path / "run 2")
     assert np.array_equal(again.dn, shots.dn) and again.ambient is not None and shots.ambient is not None
     assert np.array_equal(again.ambient.rate, shots.ambient.rate) and again.ambient.shots == 5
@@ -138,7 +138,7 @@ def test_pictures_show_each_pattern_in_the_middle_of_the_projector(signed: bool,
     bench = made(tmp_path, signed=signed)
     projector = tmp_path / "projector.toml"
     projector.write_text('name = "p"\neffective_wavelength_nm = 550.0\ncolumns = 96\nrows = 54\n')
-    export_run(bench.run, "png", tmp_path / "out", projector=str(projector))
+    export(bench.run, "png", tmp_path / "out", projector=str(projector))
     described = json.loads((tmp_path / "out" / "patterns.json").read_text())
     cell = {"cell": 5, "cell_columns": 5, "cell_shape": 1.0}
     assert described["projector"] == {"rows": 54, "columns": 96, **cell, "first_row": 2, "first_column": 13}
@@ -164,7 +164,7 @@ def test_a_plane_of_a_colour_sensor_is_cut_as_flatcams_loader_does(tmp_path: Pat
     mosaic = np.arange(84 * 110).reshape(84, 110)
     written(tmp_path / "frames", "png", np.stack([mosaic] * 6))
     for channel, corner in {"r": (1, 1), "gb": (0, 1), "gr": (1, 0), "b": (0, 0)}.items():
-        import_frames(tmp_path / "frames", tmp_path / channel, known(bench, prepare=Preparation(channel=channel)))
+        import_capture(tmp_path / "frames", tmp_path / channel, known(bench, prepare=Preparation(channel=channel)))
         plane = mosaic[corner[0] :: 2, corner[1] :: 2]
         assert plane.shape == (42, 55)
         assert np.array_equal(ms.load_run(tmp_path / channel).dn[0], plane[1:41, 1:53])
@@ -173,13 +173,13 @@ def test_a_plane_of_a_colour_sensor_is_cut_as_flatcams_loader_does(tmp_path: Pat
 def test_the_black_level_that_is_stated_is_taken(tmp_path: Path) -> None:
     bench = made(tmp_path)
     written(tmp_path / "frames", "png", ms.load_run(bench.run).dn)
-    import_frames(tmp_path / "frames", tmp_path / "run 2", known(bench, black_level_dn=151.5))
+    import_capture(tmp_path / "frames", tmp_path / "run 2", known(bench, black_level_dn=151.5))
     assert ms.load_run(tmp_path / "run 2").manifest.digital.black_level_dn == 151.5
 
 
 def refused(words: str, tmp_path: Path, source: Path, about: RealCapture) -> None:
     with pytest.raises(MitsimError, match=words):
-        import_frames(source, tmp_path / "run 2", about)
+        import_capture(source, tmp_path / "run 2", about)
     assert not (tmp_path / "run 2").exists()
 
 
@@ -225,7 +225,7 @@ def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypat
             yield page
 
     monkeypatch.setattr(real, "read_images", counted)
-    import_frames(tmp_path / "stack.tif", tmp_path / "run 2", known(bench))
+    import_capture(tmp_path / "stack.tif", tmp_path / "run 2", known(bench))
     assert len(seen) == 2 * len(dn)
     assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, dn)
 
@@ -251,7 +251,7 @@ def test_pictures_as_large_as_flatcams_give_their_scene(tmp_path: Path) -> None:
     bench = Made(tmp_path / "run", tmp_path / "cal", scene)
     for folder, channel in (("whole", None), ("planes", "gr")):
         about = known(bench, "uniform", prepare=Preparation(channel=channel))
-        result = import_frames(tmp_path / folder, tmp_path / f"run {folder}", about)
+        result = import_capture(tmp_path / folder, tmp_path / f"run {folder}", about)
         assert result["shape"] == [500, 256]
         image = ms.reconstruct(ms.load_run(tmp_path / f"run {folder}"), ms.load_calibration(tmp_path / "cal")).image
         assert np.abs(image - scene).max() < 1e-3

@@ -11,7 +11,7 @@ import pytest
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
-from mitsim.exchange.formats import export_run
+from mitsim.exchange.formats import export
 from tests.exchanged import COLUMNS, ROWS, SCENE, made
 
 
@@ -20,7 +20,7 @@ def test_a_missing_package_is_told_in_a_line(format: str, tmp_path: Path, monkey
     bench = made(tmp_path)
     monkeypatch.setitem(sys.modules, format, None)
     with pytest.raises(MitsimError, match=rf"{format} is not installed .* pip install 'mitsim\[{format}\]'"):
-        export_run(bench.run, format, tmp_path / "run.pt", bench.calibration)
+        export(bench.run, format, tmp_path / "run.pt", bench.calibration)
     assert not (tmp_path / "run.pt").exists()
 
 
@@ -47,7 +47,7 @@ def test_the_file_holds_what_the_solver_sees(tmp_path: Path) -> None:
     pytest.importorskip("deepinv")
     bench = made(tmp_path, signed=True)
     shots = ms.load_run(bench.run)
-    export_run(bench.run, "deepinv", tmp_path / "run.pt", bench.calibration)
+    export(bench.run, "deepinv", tmp_path / "run.pt", bench.calibration)
     physics, held = tensors.load_physics(tmp_path / "run.pt")
     columns = shots.patterns[1].shape[1]
     for frame, i, j in shots.measurements():
@@ -71,7 +71,7 @@ def test_a_full_disk_is_told_in_a_line(tmp_path: Path) -> None:
         with pytest.raises(
             MitsimError, match=r"run\.pt: cannot be written \(torch: .* choose a writable folder"
         ) as told:
-            export_run(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
+            export(bench.run, "torch", tmp_path / "run.pt", bench.calibration)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "\n" not in str(told.value) and not (tmp_path / "run.pt").exists()

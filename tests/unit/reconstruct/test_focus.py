@@ -296,7 +296,7 @@ def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
         ((-1.0, 350.0), "auto", "above 0"),
         ((350.0, np.inf), "auto", "two depths"),
         ((350.0,), "map", "two depths"),
-        ("ab", "auto", "a tuple or None"),
+        ("ab", "auto", "give two depths"),
         ((350.0, np.nan), "auto", "two depths"),
         ((350.0, 450.0), None, "focus auto or map"),
         ((350.0, 450.0), 400.0, "focus auto or map"),

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+import mitsim as ms
+from mitsim.acquire.reference import Rendered
+from mitsim.core.images import lightness, linear_light
 from mitsim.report import demo_page, plots
 from mitsim.report.pages import Mean, typeset
 from mitsim.studies import diffraction_study, solver_study
 from mitsim.studies.diffraction_study import ASSUMED, SEPARABLE, QualityRow
 from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
+from tests.exchanged import made
+from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
 SOLVER_ROWS = [
     SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
@@ -168,3 +178,92 @@ def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
 def test_maps_of_errors_say_of_which_factor() -> None:
     axes, _ = plots.deviations([[1.0, -2.0]], 4.0, "left factor").axes
     assert axes.get_title() == "left factor" and axes.images[0].get_clim() == (-4.0, 4.0)
+
+
+# ---- results on axes -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[ms.Capture, ms.Factors, ms.Reconstruction]:
+    """Of a camera that nobody rendered."""
+    bench = made(tmp_path_factory.mktemp("plots") / "made")
+    shots, factors = ms.load_run(bench.run), ms.load_calibration(bench.calibration)
+    return shots, factors, ms.reconstruct(shots, factors)
+
+
+def axes() -> Axes:
+    return Figure().subplots()
+
+
+def test_results_are_drawn_on_the_axes_that_are_given(results: tuple[Any, Any, Any]) -> None:
+    """Their own numbers, with a title, units on axes and colour bar, and how numbers become greys. (Planted: a frame's
+    digital numbers for its electrons; a colour bar without its mapping; axes of a new figure.)"""
+    shots, factors, image = results
+    sensed = ms.sense(np.outer(np.ones(5), np.linspace(1e-3, 1e-2, 6)), "imx249")
+    rendered = Rendered(np.full((4, 6, 3), 0.5), np.zeros((4, 6, 3)), {"estimator": "factored"})
+    drawings: list[tuple[Any, dict[str, Any], Any, str]] = [
+        (shots, {"shot": 2}, shots.dn[2], "[DN], linear"),
+        (shots, {"shot": 1, "quantity": "electrons"}, shots.electrons[1], "[e-], linear"),
+        (shots, {"quantity": "truth"}, shots.truth, "reflectance, 1 = board, shown by the sRGB curve"),
+        (factors, {}, factors.left, "e^-/s"),
+        (factors, {"side": "right"}, factors.right, "linear"),
+        (image, {}, image.image, "reflectance, 1 = board, shown by the sRGB curve"),
+        (image, {"quantity": "uncertainty"}, image.uncertainty, "reflectance, 1 = board, linear"),
+        (sensed, {}, sensed.digital, "[DN], linear"),
+        (rendered, {}, np.full((4, 6), 0.5), "[W/m$^2$], linear"),
+    ]
+    for result, options, values, unit in drawings:
+        own = axes()
+        drawn = result.plot(**options, ax=own)
+        assert drawn is own and np.array_equal(np.asarray(own.images[0].get_array()), values), (result, options)
+        assert own.get_title() and "pixel]" in own.get_xlabel() and "pixel]" in own.get_ylabel()
+        (bar,) = (other for other in own.figure.axes if other is not own)
+        assert unit in bar.get_ylabel(), bar.get_ylabel()
+        own.figure.canvas.draw()
+
+
+def test_reflectances_are_shown_as_a_screen_shows_them(results: tuple[Any, Any, Any]) -> None:
+    """Half of the light is three quarters of the way to white, as in image.png; the bar is told of what is cut.
+    (Planted: greys in equal steps.)"""
+    drawn = results[2].plot(ax=axes())
+    picture = drawn.images[0]
+    assert picture.norm(0.5) == pytest.approx(0.7354, abs=1e-4) and picture.get_clim() == (0.0, 1.0)
+    shades = np.linspace(0, 1, 50)
+    assert np.allclose(lightness(linear_light(shades)), shades, atol=1e-7)
+
+
+def test_a_plan_is_drawn_as_errors_and_as_seconds() -> None:
+    """(Planted: an effect that is left out of the chart; seconds of the wrong stage.)"""
+    kept = replace(invented_plan(1e-3), predicted={"plan": 1.0, "transport": 2.5, "write": 0.2})
+    own = kept.plot(ax=axes())
+    named = {text.get_text().partition(" (")[0] for text in own.get_yticklabels()}
+    assert named == {row.name for row in kept.effects if row.error_if_off is not None}
+    assert "[1]" in own.get_xlabel() and own.get_xscale() == "log"
+    stages = kept.plot("seconds", ax=axes())
+    widths = {
+        text.get_text(): bar.get_width() for text, bar in zip(stages.get_yticklabels(), stages.patches, strict=True)
+    }
+    assert widths == kept.predicted and "[s]" in stages.get_xlabel()
+
+
+def test_what_is_not_known_is_not_drawn(results: tuple[Any, Any, Any]) -> None:
+    shots, _, image = results
+    for draw, line in (
+        (lambda: shots.plot(shot=99), "shot 99: give 0 to 5"),
+        (lambda: shots.plot(quantity="light"), "quantity 'light': give 'dn' or 'electrons' or 'truth'"),
+        (lambda: image.plot("depth"), "quantity 'depth': is not known of this image"),
+        (lambda: image.plot(ax="here"), "ax 'here': give a Axes or None"),
+    ):
+        with pytest.raises(ms.ArgumentError, match=line):
+            draw()
+
+
+def test_without_axes_there_is_a_figure_of_pyplot(results: tuple[Any, Any, Any]) -> None:
+    """Which notebooks show."""
+    from matplotlib import pyplot
+
+    before = pyplot.get_fignums()
+    with pyplot.rc_context({"backend": "agg"}):
+        drawn = results[0].plot()
+    assert pyplot.fignum_exists(drawn.figure.number) and len(pyplot.get_fignums()) == len(before) + 1
+    pyplot.close(drawn.figure)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from mitsim.acquire.drifting import drift_mask, drift_projector
-from mitsim.cli.study_verb import recipe_for, scope_of
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
@@ -23,6 +22,7 @@ from mitsim.report.pages import Table
 from mitsim.studies.drift_study import SESSION, DriftStand, Outcome, _move_projector
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
+from mitsim.verbs import StudyOptions, scope_of, study
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
@@ -214,14 +214,16 @@ def test_points_are_every_kind_alone() -> None:
 def test_options_of_the_study() -> None:
     """(Planted: a recipe for any study; a ripple without a frequency refused.)"""
     scope = Scope(Setup(), (None,))
-    assert scope_of("drift", scope, "dots:7", ["power=0.1,0.2"], "psnr").sweep == (("power", ("0.1", "0.2")),)
+    assert scope_of("drift", scope, "dots:7", [("power", ("0.1", "0.2"))], "psnr").sweep == (("power", ("0.1", "0.2")),)
     assert scope_of("drift", scope, "hadamard:8", (), "psnr").patterns == "hadamard:8"
     # Whose frequency the recipe states.
-    assert scope_of("drift", scope, "dots:7", ["lamp_ripple=0.3"], "psnr").sweep == (("lamp_ripple", ("0.3",)),)
-    with pytest.raises(MitsimError, match="--over and --patterns for drift and sweep"):
-        scope_of("patterns", scope, "dots:7", ["power=0.1"], "psnr")
-    with pytest.raises(MitsimError, match="--recipe is for calibration and drift"):
-        recipe_for("sweep", Path("any.toml"))
+    assert scope_of("drift", scope, "dots:7", StudyOptions(over=["lamp_ripple=0.3"]).varied, "psnr").sweep == (
+        ("lamp_ripple", ("0.3",)),
+    )
+    with pytest.raises(MitsimError, match="over and patterns for drift and sweep"):
+        scope_of("patterns", scope, "dots:7", [("power", ("0.1",))], "psnr")
+    with pytest.raises(MitsimError, match="a recipe is for calibration and drift"):
+        study("sweep", recipe=Path("any.toml"))
     with pytest.raises(MitsimError, match="there is no such kind"):
         find_experiment("drift").points(Scope(Setup(), (None,), sweep=(("sheet_z", ("390",)),)))
     unknown = Scope(Setup(camera="mt9m034"), (None,), sweep=(("power", ("0.1",)),))

@@ -1,0 +1,289 @@
+"""The Python face has a call for each verb of the command line, with its options, and refuses wrong arguments.
+
+Quick: nothing is rendered. What a bench does with arguments of the right kind is tests/system/test_wrong_arguments.py.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.bench.request import Request
+from mitsim.cli.options import message_of
+from mitsim.core.errors import ArgumentError
+from mitsim.exchange.capture_list import FrameFacts
+from mitsim.exchange.formats import SessionFacts
+from mitsim.verbs import Opening, StudyOptions, _Irradiance, _Simulated
+from tests.exchanged import made
+
+CALLS = {
+    "demo": ["demo"],
+    "plan": ["Bench.plan", "Bench.choose_colour", "Plan.save"],
+    "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.load", "Light.expose"],
+    "calibrate": ["Bench.calibrate", "Bench.calibrate_lines", "Bench.calibrate_mosaic", "Bench.calibrate_depths",
+                  "Bench.write_session", "calibrate_frames", "calibrate_known", "calibrate_model", "plan_calibration"],
+    "reconstruct": ["reconstruct", "reconstruct_colours", "reconstruct_psf", "Reconstruction.save"],
+    "render": ["Bench.render", "Rendered.save"],
+    "study": ["study"],
+    "pairs": ["make_pairs"],
+    "train": ["train"],
+    "export": ["export"],
+    "import": ["import_file", "import_frames"],
+    "patterns": ["pattern_pictures"],
+    "transport": ["Bench.light", "Light.save"],
+    "characterise": ["characterise"],
+    "sense": ["sense"],
+    "doctor": ["doctor"],
+}  # fmt: skip
+"""Python calls that do what a verb does, by its name."""
+FURTHER: dict[str, list[Any]] = {
+    "demo": [Opening],
+    "study": [StudyOptions],
+    "import": [FrameFacts],
+    "patterns": [SessionFacts],
+    "characterise": [_Simulated],
+    "sense": [_Irradiance],
+    "doctor": [],
+    "export": [],
+}
+"""Classes whose fields a verb's call takes by name, of verbs that are one call with the same options."""
+ALIKE = {"define": "parameters", "outside": "allow_outside_files", "scenes": "scene", "family": "patterns"}
+"""Arguments that the command line calls otherwise."""
+OF_THE_COMMAND_LINE = {"as_json", "quiet", "help", "variant"}
+"""Options that say how it is reported; the variant is a bench's."""
+ANYWAY = {("sense", "output")}
+"""Of the verb and option, what a method of the result is for."""
+
+
+def verbs() -> dict[str, Any]:
+    import typer
+
+    from mitsim.cli import app
+
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    return commands
+
+
+def called(name: str) -> Callable[..., Any]:
+    """The call of a dotted name of the face."""
+    found: Any = ms
+    for part in name.split("."):
+        found = getattr(found, part)
+    assert callable(found), name
+    return found  # type: ignore[no-any-return]
+
+
+def test_every_verb_has_a_python_call() -> None:
+    """A new verb needs a row here, and what it names must be there. (Planted: a verb that the table lacks; a name that
+    the face lacks.)"""
+    assert verbs().keys() == CALLS.keys()
+    for names in CALLS.values():
+        for name in names:
+            called(name)
+
+
+@pytest.mark.parametrize("verb", FURTHER)
+def test_every_option_of_a_verb_is_an_argument(verb: str) -> None:
+    """(Planted: an option that the call does not take.)"""
+    known = {each for name in CALLS[verb] for each in inspect.signature(called(name)).parameters}
+    known |= {each.name for one in FURTHER[verb] for each in fields(one)}
+    options = {ALIKE.get(each.name, each.name) for each in verbs()[verb].params} - OF_THE_COMMAND_LINE
+    missing = {name for name in options - known if (verb, name) not in ANYWAY}
+    assert not missing, missing
+
+
+@pytest.mark.parametrize(
+    ("argument", "option"), [("lam", "--lambda"), ("parameters", "-D"), ("flat_dark_frame", "--flat-dark-frame")]
+)
+def test_refusals_name_options_on_the_command_line(argument: str, option: str) -> None:
+    assert message_of(ArgumentError(argument, "has no effect")) == f"{option} has no effect"
+
+
+# ---- wrong arguments -------------------------------------------------------------------------------------------------
+
+WRONG: list[Any] = [
+    *(
+        object(),
+        b"x",
+        1j,
+        None,
+        True,
+        False,
+        0,
+        -1,
+        10**40,
+        0.5,
+        -1e300,
+        math.nan,
+        math.inf,
+        "",
+        "x",
+        "a\0b",
+        "n" * 5000,
+    ),
+    *((), [], {}, [1, "x"], (1.0, 2.0), {"x": object()}, type, Path("no such"), Path(__file__).parent),
+    *(np.array([]), np.ones((2, 3)), np.array([1j]), np.array([None, "x"]), np.float32("nan"), np.int8(-1)),
+]
+"""Values that are wrong for most arguments; a folder where a file belongs is the last path."""
+OF_A_BENCH = [object(), b"x", 1j, np.array([]), np.array([1j]), np.array([None])]
+"""Values that no argument of a bench may be."""
+RENDERS = {"open_bench", "make_pairs", "calibrate_model", "plan_calibration", "demo", "study", "doctor", "train"}
+"""What may begin long work by an argument of the right kind: it gets those of no kind alone."""
+CLASSES = ["Clock", "Job", "Limits", "Modelling", "Request"]
+"""Classes that users make things of."""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """A capture, factors and an image that nobody rendered, and what cannot be without a scene: an empty bench."""
+    bench = made(tmp_path_factory.mktemp("verbs") / "made")
+    shots, factors = ms.load_run(bench.run), ms.load_calibration(bench.calibration)
+    sensed = ms.sense(np.full((4, 4), 1e-3), "imx249")
+    owners = {"shots": shots, "factors": factors, "image": ms.reconstruct(shots, factors), "sensed": sensed}
+    return {**owners, "bench": object.__new__(ms.Bench), "light": object.__new__(ms.Light)}
+
+
+def methods(owner: object) -> list[str]:
+    """Public methods of an object, of classes of mitsim's own, that take arguments."""
+    found = []
+    for name in dir(type(owner)):
+        if name.startswith("_") or isinstance(inspect.getattr_static(type(owner), name), property):
+            continue
+        method = getattr(type(owner), name, None)
+        if callable(method) and (method.__module__ or "").startswith("mitsim"):
+            found.append(name)
+    return found
+
+
+def right(call: Callable[..., Any], results: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of the right kind for parameters without a default."""
+    texts = dict.fromkeys(inspect.signature(call).parameters, "new")
+    given = {**texts, **results, "image": np.ones((8, 8)), "truth": np.ones((8, 8)), "count": 1, "depth": 400.0}
+    given |= {"modelling": ms.Modelling("wave"), "reflectance": 0.5, "stages": {}, "psnr": 30.0, "method": "unrolled"}
+    given |= {"model": "wave", "irradiance": np.ones((4, 4)), "format": "mat", "camera": "imx249"}
+    parameters = inspect.signature(call).parameters.values()
+    return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
+
+
+def raised(call: Callable[..., Any], results: dict[str, Any], values: list[Any]) -> list[str]:
+    """What is raised for wrong values, one argument after the other, but for MitsimError of one line."""
+    found = []
+    for parameter in inspect.signature(call).parameters.values():
+        if parameter.kind == parameter.VAR_POSITIONAL or parameter.annotation in ("object", "Any"):
+            continue
+        name = "no_such_name" if parameter.kind == parameter.VAR_KEYWORD else parameter.name
+        for value in values:
+            try:
+                call(**{**right(call, results), name: value})
+            except ms.MitsimError as refusal:
+                if len(str(refusal).splitlines()) != 1 or not str(refusal).isprintable():
+                    found.append(f"{name}={value!r:.40}: {refusal!r:.200}")
+            except Exception as error:
+                found.append(f"{name}={value!r:.40}: {error!r:.200}")
+    return found
+
+
+@pytest.mark.parametrize("name", [name for name in ms.__all__ if not name[0].isupper()] + CLASSES)
+def test_wrong_arguments_of_functions_are_refused_in_a_line(
+    name: str, results: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every function of the face, with values of every kind: MitsimError, or it works. (Planted: a function that checks
+    nothing; a list for an array.)"""
+    monkeypatch.chdir(tmp_path)
+    call = getattr(ms, name)
+    assert not (wrong := raised(call, results, OF_A_BENCH if name in RENDERS else WRONG)), "\n".join(wrong)
+
+
+@pytest.mark.parametrize("of", ["shots", "factors", "image", "sensed", "bench", "light"])
+def test_wrong_arguments_of_methods_are_refused_in_a_line(
+    of: str, results: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every public method of what functions give; of a bench and its light by kind alone, for they have no scene here.
+    (Planted: a method that checks nothing.)"""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("matplotlib.pyplot.subplots", no_figure)
+    owner, wrong = results[of], []
+    for name in methods(owner):
+        values = OF_A_BENCH if of in ("bench", "light") else WRONG
+        wrong += [f"{name}: {line}" for line in raised(getattr(owner, name), results, values)]
+    assert not wrong, "\n".join(wrong)
+
+
+def no_figure(**_: Any) -> Any:
+    """A figure that pyplot does not hold."""
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    return figure, figure.subplots()
+
+
+def test_numpy_scalars_are_numbers(results: dict[str, Any]) -> None:
+    """Also where a function looks closer than its annotation. (Seen: a margin of ``np.int8(0)`` refused.)"""
+    frame = ms.sense(np.full((3, 3), 1e-3), "imx249", exposure=np.float32(0.01), seed=np.int64(2))
+    assert np.array_equal(
+        frame.digital, ms.sense(np.full((3, 3), 1e-3), "imx249", float(np.float32(0.01)), seed=2).digital
+    )
+    assert ms.reconstruct(results["shots"], results["factors"], lam=np.float64(1.0), margin=np.int8(0)).lam == 1.0
+    asked = Request.of(seed=np.int64(3), accuracy=np.float32(0.25))
+    assert (asked.seed, asked.accuracy) == (3, 0.25) and type(asked.seed) is int
+
+
+def test_an_image_has_the_options_of_its_verb(results: dict[str, Any]) -> None:
+    """(Planted: bounds that are passed over.)"""
+    shots, factors = results["shots"], results["factors"]
+    image = ms.reconstruct(shots, factors, method="nonnegative", bounds=(0.2, 0.6), iterations=500).image
+    assert image.min() >= 0.2 - 1e-9 and image.max() <= 0.6 + 1e-9
+    with pytest.raises(ms.ArgumentError, match="bound is no option of reconstruct; did you mean bounds"):
+        ms.reconstruct(shots, factors, bound=(0, 1))
+
+
+def test_a_misspelt_option_is_refused_with_what_was_meant() -> None:
+    for call, line in (
+        (lambda: ms.study("patterns", quik=True), r"quik is no option of study; did you mean quick\? use variant"),
+        (
+            lambda: ms.import_frames("x", "y", expsure=1),
+            r"expsure is no option of import_frames; did you mean exposure\?",
+        ),
+        (lambda: ms.characterise("imx249", step=3), r"step is no option of characterise; did you mean steps\?"),
+    ):
+        with pytest.raises(ms.ArgumentError, match=line):
+            call()
+
+
+def test_groups_of_options_are_checked() -> None:
+    """All of them, whatever is added. (Planted: a group that checks nothing.)"""
+    for group in (Opening, StudyOptions, FrameFacts, SessionFacts, _Simulated, _Irradiance):
+        assert is_dataclass(group)
+        for each in fields(group):
+            with pytest.raises(ms.ArgumentError, match=f"^{each.name} "):
+                group(**{each.name: object()})
+
+
+# ---- what is shipped, and this machine -------------------------------------------------------------------------------
+
+
+def test_scenes_are_told_in_a_sentence() -> None:
+    found = ms.scenes()
+    assert {"photograph", "cookie_bag", "lamp_bench"} <= found.keys() and len(found) == 14
+    assert all(text and text[0].isupper() and "\n" not in text for text in found.values())
+
+
+def test_the_doctor_tells_its_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And compiles kernels only where all else works. (Planted: kernels that are compiled whatever the checks say.)"""
+    environment = importlib.import_module("mitsim.core.environment")
+    for ok in (True, False):
+        checks = [environment.Check("python", ok, "3.11")]
+        monkeypatch.setattr(environment, "doctor", lambda checks=checks: checks)
+        monkeypatch.setattr(environment, "warm_up", lambda variant: environment.Check("kernels", True, variant))
+        assert [each.name for each in ms.doctor(warm=True)] == ["python", "kernels"][: 1 + ok]
+    with pytest.raises(ms.ArgumentError, match="variant 'x': use llvm_ad_mono"):
+        ms.doctor(variant="x")
