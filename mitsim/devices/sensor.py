@@ -447,7 +447,7 @@ def load_sensor(path: Path | str) -> SensorModel:
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
         read.append(path.resolve())
-        below: dict[str, Any] = read_toml(path)
+        below: dict[str, object] = read_toml(path)
         if "mask" in below and "mask" not in table:
             raise MitsimError(f"file {first}: {BASE}: {path} has a table [mask], which stays there; give one here")
         if any(kind & table.keys() for kind in _EFFICIENCIES):
