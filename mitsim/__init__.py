@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
+    from mitsim.report.folders import report_folder as report_folder
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
 
 _HOMES = {
@@ -77,6 +78,7 @@ _HOMES = {
         "reconstruct.factors": "Factors load_calibration",
         "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
+        "report.folders": "report_folder",
         "report.quality": "reconstruct_colours",
     }.items()
     for name in names.split()

@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import inspect
 import re
+import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, is_dataclass
@@ -20,7 +22,7 @@ import typer
 import mitsim
 from mitsim.cli.screen import showing_progress
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.job import Limits, running_seconds
 from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.devices.patterns import pattern_names
@@ -141,7 +143,7 @@ class Common:
 
         limits, start = self.limits, running_seconds()
         with showing_progress(self.quiet or self.as_json, start) as watch:
-            yield Job(Clock(start, watch), watch.report, limits)
+            yield Job(Clock(start, watch), watch.report, limits, command_line())
 
     @property
     def limits(self) -> Limits:
@@ -162,6 +164,18 @@ class Limited(Common):
     def limits(self) -> Limits:
         """Those that are asked for."""
         return Limits(self.max_seconds, None if self.max_memory is None else self.max_memory * 2**30)
+
+
+@dataclass(frozen=True)
+class Pictured(Common):
+    """Options of verbs whose work has pictures."""
+
+    no_pictures: bool = option(False, "leave out pictures and the page report.html", "--no-pictures")
+
+
+@dataclass(frozen=True)
+class LimitedPictured(Limited, Pictured):
+    """The same of those that may work for long."""
 
 
 @dataclass(frozen=True)
@@ -370,6 +384,14 @@ def by_line(colour: str) -> bool:
 def in_colour(bench: Bench, colour: str) -> Bench:
     """The ``bench`` with the lines that ``colour`` names; MitsimError for more bands than its projector has lines."""
     return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
+
+
+def command_line() -> str | None:
+    """The command line of this program, as a shell takes it; None where another program calls what serves it."""
+    program = Path(sys.argv[0])
+    if program.stem != "mitsim" and (program.parent.name, program.stem) != ("mitsim", "__main__"):
+        return None
+    return printable(shlex.join(["mitsim", *sys.argv[1:]]))
 
 
 # ---- what words say --------------------------------------------------------------------------------------------------

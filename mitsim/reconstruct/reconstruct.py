@@ -15,7 +15,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.exr import write_frame
-from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
+from mitsim.core.files import output_folder, plain, read_json, remove_page, whole_file, write_json
 from mitsim.core.images import card, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
@@ -39,6 +39,8 @@ from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertai
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
+MADE_OF = "made_of"
+"""Key of the folders that an image was made of: whoever shows it finds its truth there."""
 POINT_SPREAD = "psf"
 """Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
 
@@ -131,6 +133,7 @@ class Reconstruction(Solution):
             "misfit": self.misfit and self.misfit.summary(),
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
+            "warnings": () if self.ok else (str(self.status),),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
             "predicted": self.predicted and self.predicted.seconds,
             "predicted_seconds": self.predicted and sum(self.predicted.seconds.values()),
@@ -166,6 +169,7 @@ class Reconstruction(Solution):
     def write(self, folder: Path, more: Mapping[str, Any] | None = None) -> Path:
         """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
         are further entries of result.json."""
+        remove_page(folder)
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
         )

@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -54,10 +54,11 @@ def reconstruct_mosaic(
     overwrite: bool = False,
     way: str = JOINT,
     lam: Lambda = "auto",
+    **origin: Any,
 ) -> JudgedColours:
     """Recover the image of every line of a run behind colour filters, and bring them together.
 
-    Writes image.exr and image.png in colour and of each line, colour.json and report.html.
+    Writes image.exr and image.png in colour and of each line, and colour.json.
 
     Parameters
     ----------
@@ -70,6 +71,8 @@ def reconstruct_mosaic(
     lam
         lambda above 0 in the unit of (Phi_L Phi_R)^2, of each plane or channel where these are solved one by one;
         ``auto`` chooses it from the data.
+    **origin
+        entries of colour.json on where the image comes from.
 
     Raises
     ------
@@ -139,7 +142,7 @@ def reconstruct_mosaic(
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
                 with whole_file(place / "image.png") as part:
                     part.write_bytes(png(image))
-        found.write(folder, inputs=options)
+        found.write(folder, inputs=options, **origin)
     return found
 
 
