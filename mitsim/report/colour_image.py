@@ -397,7 +397,7 @@ def _truth_of(folder: Path, data: Mapping[str, Any], lines: ColourManifest) -> F
 
 
 def _pictures(image: ColourImage) -> Iterator[Picture]:
-    size = f"sRGB under D65, {image.images.shape[0]} x {image.images.shape[1]} projector pixels"
+    size = f"in sRGB under D65, {image.images.shape[0]} x {image.images.shape[1]} projector pixels"
     shown = {"image": ("The image", image.xyz), "truth": ("The truth", image.truth_xyz)}
     for name, (title, xyz) in shown.items():
         if xyz is not None:

@@ -43,6 +43,9 @@ _ELSEWHERE = {
 }
 """Keys of a manifest that are no lines of the table of numbers: they stand elsewhere on the page, or for programs."""
 
+_MISFIT = 2.0
+"""Chi-square a datum that is white at least: chance alone, some hundredths about 1, would fill any smaller scale."""
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -116,8 +119,9 @@ def write_page(folder: Path, pictures: tuple[Picture, ...], template: str, **sho
         of the page, and what it shows.
     """
     remove_page(folder)
-    tools = {"folder": folder.absolute(), "stages_of": stages_of, "total_of": total_of}
-    text = render_page(template, pictures=pictures, **tools, **shown)
+    text = render_page(
+        template, pictures=pictures, folder=folder.absolute(), stages_of=stages_of, total_of=total_of, **shown
+    )
     try:
         if pictures:
             prepare_output(folder / PICTURES, overwrite=True)
@@ -336,7 +340,8 @@ def _image_pictures(
     tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
     if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
         about = "chi-square a datum by place on the sensor, 1 where only noise is left"
-        yield Picture.of("misfit", "Where the frames do not fit", tiles, Scale.of(tiles, "a datum", 0.0), about)
+        scale = Scale(0.0, max(float(tiles.max()), _MISFIT), "a datum")
+        yield Picture.of("misfit", "Where the frames do not fit", tiles, scale, about)
 
 
 def truth_of(result: Mapping[str, Any]) -> FloatArray | None:

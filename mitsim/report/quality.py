@@ -145,7 +145,6 @@ def reconstruct_colours(
     chart: ChartPlace | None = None,
     overwrite: bool = False,
     job: Job | None = None,
-    page: bool = True,
     **options: Any,
 ) -> JudgedColours:
     """Recover the image of every line of a coloured run, and bring them together.
@@ -165,11 +164,10 @@ def reconstruct_colours(
         whether an earlier image of other inputs may be replaced.
     job
         its clock.
-    page
-        whether pictures and report.html are made (:func:`mitsim.report_folder` makes them later).
     **options
         of :func:`reconstruct`, for every line; of a run behind colour filters, ``way`` and
-        ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`.
+        ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`; ``page=False`` leaves out pictures and
+        report.html, which :func:`mitsim.report_folder` makes later.
 
     Raises
     ------
@@ -181,10 +179,10 @@ def reconstruct_colours(
     from mitsim.report.mosaic_images import reconstruct_mosaic
 
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
-    origin = _origin(job, run, calibration)
+    origin, page = _origin(job, run, calibration), options.pop("page", True)
     if is_mosaic(run):
         with job.clock.stage("images"):
-            found = reconstruct_mosaic(run, calibration, output, chart, overwrite, **options, **origin)
+            found = reconstruct_mosaic(run, calibration, output, chart, overwrite, origin, **options)
         if page:
             report_folder(output)
         return found
