@@ -45,7 +45,15 @@ class Scale:
 
     @classmethod
     def of(cls, values: npt.ArrayLike, unit: str, black: float | None = None) -> Scale:
-        """From the least of the ``values``, or a known ``black``, to the largest, in their ``unit``."""
+        """The scale of numbers.
+
+        Parameters
+        ----------
+        values, unit
+            the largest of these is white.
+        black
+            what is black; None: the least of them.
+        """
         return cls(float(np.min(values)) if black is None else black, float(np.max(values)), unit)
 
     def levels(self, values: npt.NDArray[Any]) -> FloatArray:
