@@ -85,7 +85,7 @@ def picture(folder: Path, name: str) -> np.ndarray:
 
 
 def test_a_run_shows_its_frames_its_truth_and_how_it_was_made(folders: Made, tmp_path: Path) -> None:
-    """(Planted: the command left out of the page; warnings below the pictures.)"""
+    """(Planted: the command left out of the page.)"""
     command = "mitsim capture 'my scene' -o run"
     changes = {"command": command, "warnings": ["saturation: 3 frames"], "seconds": {"optics": 2.0, "total": 2.5}}
     plan = {"accuracy": 1e-3, "effects": [*EFFECTS, {"name": "of others"}]}
@@ -105,7 +105,7 @@ def test_a_run_shows_its_frames_its_truth_and_how_it_was_made(folders: Made, tmp
 
 
 def test_a_contact_sheet_is_of_the_frames_on_one_scale(folders: Made, tmp_path: Path) -> None:
-    """Pattern by pattern, black at the black level. (Planted: the black level left in; each frame on its own scale.)"""
+    """Pattern by pattern, black at the black level. (Planted: the black level left in.)"""
     run = copy(folders.run, tmp_path / "run")
     text = words(page_of(run))
     sheet, shots = picture(run, "frames"), load_run(run)
@@ -151,7 +151,7 @@ def test_a_picture_says_what_is_black_white_and_beyond() -> None:
 
 
 def test_an_image_shows_what_is_known_of_it(image: Path) -> None:
-    """(Planted: the truth not scaled to the calibration's board, and the error against it.)"""
+    """The same files give the same page, byte for byte."""
     text = words(page_of(image))
     result = json.loads((image / "result.json").read_text())
     assert f"PSNR {result['psnr']:.1f} dB" in text and "mitsim reconstruct &#39;my run&#39;" in text
@@ -224,7 +224,7 @@ def test_a_page_is_gone_before_what_it_shows_changes(folders: Made, image: Path,
 def test_a_full_disk_costs_the_page_alone(
     folders: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """(Planted: the error raised, and the page written before its pictures.)"""
+    """(Planted: the error raised.)"""
     run = copy(folders.run, tmp_path / "run")
     report_folder(run)
     before, replace = {path.name for path in run.iterdir()} - {"report.html", "pictures"}, os.replace
