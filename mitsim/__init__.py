@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
+    from mitsim.report.folders import report_folder as report_folder
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
     from mitsim.verbs import characterise as characterise
     from mitsim.verbs import demo as demo
@@ -93,6 +94,7 @@ _HOMES = {
         "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
+        "report.folders": "report_folder",
         "report.quality": "reconstruct_colours",
         "verbs": "characterise demo doctor scenes sense study",
     }.items()

@@ -358,6 +358,7 @@ def _run(
         predicted_memory_bytes=frames_cost(bench, plan.settings, family.lighting).memory_bytes,
         warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
         versions=versions(),
+        command=job.command,
     )
     foreign = _foreign(light, totals, request)
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run

@@ -280,6 +280,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         result=result,
         warnings=warnings,
         versions=versions(),
+        command=job.command,
     )
     much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
     factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())

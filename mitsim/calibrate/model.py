@@ -126,6 +126,7 @@ def _fit_factors(
         digital=digital,
         parallax=bench.parallax,
         versions=versions(),
+        command=job.command,
     )
     return modelled_factors(camera, fitted, used, manifest, job)
 

@@ -34,7 +34,7 @@ from mitsim.cli.options import (
     Effects,
     ExposureFraction,
     KnownPlan,
-    Limited,
+    LimitedPictured,
     LitScene,
     OfPatterns,
     Overwrite,
@@ -56,6 +56,7 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
+from mitsim.cli.report_verb import finish_folder, finish_frame, report
 from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
@@ -270,7 +271,7 @@ def capture(
     capturing: Capturing,
     made: Made,
     devices: Coloured,
-    limited: Limited,
+    limited: LimitedPictured,
 ) -> int:
     """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
     from mitsim.bench.request import Task
@@ -305,7 +306,7 @@ def capture(
         else:
             payload = _capture(bench, colour, known or request.pop("patterns"), request, Task(output, made.resume, job))
     payload["memory_bytes"] = memory_since(held)
-    return finish(limited.as_json, payload, _capture_lines(payload, limited), payload["warnings"])
+    return finish_folder(limited, output, payload, _capture_lines(payload, limited), payload["warnings"])
 
 
 def _capture(bench: Bench, colour: str, what: Plan | str, request: dict[str, Any], task: Task) -> dict[str, Any]:
@@ -452,7 +453,7 @@ def render(
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimating: Estimating,
     lit: LitScene,
-    limited: Limited,
+    limited: LimitedPictured,
 ) -> int:
     """Expected irradiance under the scene's own light, by either estimator."""
     from mitsim.bench.request import check_samples
@@ -478,7 +479,8 @@ def render(
         f"{payload['seconds']:.2f} s: {payload['output']}",
         *payload["notes"],
     ]
-    return finish(limited.as_json, payload, lines, frame.warnings)
+    shown = frame.mean[..., 0] if frame.mean.shape[2] == 1 else frame.mean
+    return finish_frame(limited, (output, shown, "W/m^2"), payload, lines, frame.warnings)
 
 
 @verb
@@ -504,5 +506,5 @@ def doctor(
 
 # In the order of the help.
 _SCENE = demo, plan, capture, calibrate, reconstruct, render, study
-for _verb in (*_SCENE, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
+for _verb in (*_SCENE, report, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
     app.command(_verb.__name__.rstrip("_"))(_verb)

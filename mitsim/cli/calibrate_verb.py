@@ -21,7 +21,7 @@ from mitsim.cli.options import (
     Accuracy,
     Coloured,
     Common,
-    Limited,
+    LimitedPictured,
     Resume,
     Seed,
     check_work,
@@ -32,6 +32,7 @@ from mitsim.cli.options import (
     request_of,
     verb,
 )
+from mitsim.cli.report_verb import finish_folder
 from mitsim.cli.screen import finish, memory_line, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
 from mitsim.core.spectral_manifests import CALIBRATION
@@ -41,9 +42,9 @@ if TYPE_CHECKING:
     from mitsim.devices.session import Modelling
     from mitsim.reconstruct.factors import Factors
 
-_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet", "verbose"}
+_OF_FRAMES = {"frames", "camera", "output", "as_json", "quiet", "verbose", "no_pictures"}
 """Options of `mitsim calibrate` that go with --frames."""
-_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose"}
+_OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose", "no_pictures"}
 """Those that go with --known."""
 
 
@@ -121,7 +122,7 @@ def calibrate(
     planned: Planned,
     modelled: Modelled,
     devices: Coloured,
-    limited: Limited,
+    limited: LimitedPictured,
 ) -> int:
     """Render a Hadamard session on a white board, or read the frames of a real one or of known pictures, and estimate
     the camera's factors."""
@@ -159,7 +160,7 @@ def _check_alone(context: typer.Context, reason: str, taken: set[str]) -> None:
 # ---- a simulated session ---------------------------------------------------------------------------------------------
 
 
-def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured, limited: Limited) -> int:
+def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured, limited: LimitedPictured) -> int:
     from mitsim.bench.request import Exposure
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
@@ -195,7 +196,7 @@ def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured
             shown = None if session.recipe is None else recipe
             payload, lines = _of_lines(by_line(**whole, recipe=shown, resume=session.resume), folder)
             payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, payload["warnings"])
+            return finish_folder(limited, folder, payload, lines, payload["warnings"])
         if session.write_frames is not None:
             found = [bench.write_session(session.write_frames, **whole, recipe=recipe)]
         elif recipe.depths:
@@ -211,9 +212,9 @@ def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured
     lines = [line for payload in payloads for line in _session_lines(payload, limited)]
     warnings = [text for factors in found for text in factors.warnings]
     if not recipe.depths:
-        return finish(limited.as_json, payloads[0], lines, warnings)
+        return finish_folder(limited, folder, payloads[0], lines, warnings)
     whole = {"depths": payloads, "output": str(folder), "warnings": warnings}
-    return finish(limited.as_json, whole, lines, warnings)
+    return finish_folder(limited, folder, whole, lines, warnings)
 
 
 def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
@@ -261,7 +262,7 @@ def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
 # ---- frames of a real session ----------------------------------------------------------------------------------------
 
 
-def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: Limited) -> int:
+def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: LimitedPictured) -> int:
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
@@ -273,7 +274,7 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
         if session.planes != ("",):
             payload, lines = _of_lines(calibrate_planes(session, output, job, camera), output)
             payload["memory_bytes"] = memory_since(held)
-            return finish(limited.as_json, payload, lines, payload["warnings"])
+            return finish_folder(limited, output, payload, lines, payload["warnings"])
         factors = calibrate_frames(session, output, job, camera)
     payload = {**factors.manifest.result, "memory_bytes": memory_since(held), "output": str(output)}
     residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
@@ -284,13 +285,13 @@ def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: L
         *([] if payload["divided_by"] == 1 else [f"Numbers are divided by {payload['divided_by']}, which all have"]),
         *(f"Not known: {text}" for text in payload["not_known"]),
     ]
-    return finish(limited.as_json, payload, lines, factors.warnings)
+    return finish_folder(limited, output, payload, lines, factors.warnings)
 
 
 # ---- captures of known pictures --------------------------------------------------------------------------------------
 
 
-def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Limited) -> int:
+def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: LimitedPictured) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.knownlist import load_known
@@ -316,7 +317,8 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
     said = f"{first['frames']} frames of {pictures} in {first['seconds']['total']:.1f} s: {output}"
     if aged is not None:
         left = f"Left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
-        return finish(limited.as_json, payload, [said, f"Moved: {moved_in_words(first['moved'])}", left], warnings)
+        moved = f"Moved: {moved_in_words(first['moved'])}"
+        return finish_folder(limited, output, payload, [said, moved, left], warnings)
     rows, columns = first["scale"]
     lines = [
         said,
@@ -329,13 +331,13 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
             for name, each in results.items()
         ),
     ]
-    return finish(limited.as_json, payload, lines, warnings)
+    return finish_folder(limited, output, payload, lines, warnings)
 
 
 # ---- `mitsim calibrate --plan` ---------------------------------------------------------------------------------------
 
 
-def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, limited: Limited) -> int:
+def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, limited: LimitedPictured) -> int:
     from mitsim.bench.request import Exposure, Request, check_psnr
     from mitsim.core.files import output_file, prepare_output, whole_file
     from mitsim.devices.session import load_recipe, recipe_text
@@ -350,6 +352,8 @@ def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, lim
         )
     if planned.psnr is None:
         raise MitsimError("--plan: give the PSNR that the image is to have, such as --psnr 35")
+    if limited.no_pictures:
+        raise MitsimError("--no-pictures: a plan has none; leave it out")
     if session.resume:
         raise MitsimError("--resume: a plan writes no parts to go on with; leave it out")
     if output is not None:
@@ -383,7 +387,7 @@ def _fit(
     folder: Path,
     session: Session,
     devices: Coloured,
-    limited: Limited,
+    limited: LimitedPictured,
 ) -> int:
     from mitsim.bench.request import Exposure
     from mitsim.core.files import check_output
@@ -409,7 +413,7 @@ def _fit(
         factors = calibrate_model(bench, modelling, frames, recipe, seed, folder, job)
     result = factors.manifest.result
     lines = _model_lines(result, folder)
-    return finish(limited.as_json, {**result, "output": str(folder)}, lines, factors.warnings)
+    return finish_folder(limited, folder, {**result, "output": str(folder)}, lines, factors.warnings)
 
 
 def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:

@@ -13,6 +13,7 @@ import mitsim
 from mitsim.cli.options import (
     Common,
     ExposureFraction,
+    Pictured,
     Seed,
     given_of,
     is_given,
@@ -22,6 +23,7 @@ from mitsim.cli.options import (
     refuse_unused,
     verb,
 )
+from mitsim.cli.report_verb import finish_folder, finish_frame
 from mitsim.cli.screen import finish
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.spectral_manifests import (
@@ -143,7 +145,7 @@ def reconstruct(
     solving: Solving,
     camera: OfPointSpread,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
-    common: Common,
+    common: Pictured,
 ) -> int:
     """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
     from mitsim.core.files import check_output
@@ -190,7 +192,7 @@ def reconstruct(
     return _finish_image(result, payload, common)
 
 
-def _finish_image(result: Judged, payload: dict[str, Any], common: Common) -> int:
+def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> int:
     """Print a ``result``, whose JSON is the ``payload``; the exit status."""
     image, rank = result.reconstruction, payload["rank"]
     verdict = image.status.verdict.value.capitalize()
@@ -208,10 +210,10 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Common) -> in
             *image.trust,
         ),
     ]
-    return finish(common.as_json, payload, lines, () if result.reconstruction.ok else (payload["status"],))
+    return finish_folder(common, Path(result.output), payload, lines, payload["warnings"])
 
 
-def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dict[str, Any], common: Common) -> int:
+def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dict[str, Any], common: Pictured) -> int:
     """The image of a ``run`` by a point spread function, solved with ``options``."""
     from mitsim.core.files import check_output
     from mitsim.core.manifests import RunManifest, read_manifest
@@ -262,7 +264,7 @@ def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
 
 
 def _reconstruct_colours(
-    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], common: Common
+    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], common: Pictured
 ) -> int:
     """The image of every line of a coloured run, each solved with ``options``, and one in colour."""
     from mitsim.core.files import check_output
@@ -286,9 +288,9 @@ def _reconstruct_colours(
 
     held = memory_from_here()
     with common.job() as job:
-        found = reconstruct_colours(run, calibration, output, place, job=job, **options)
+        found = reconstruct_colours(run, calibration, output, place, job=job, page=False, **options)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    return finish(common.as_json, payload, _colours_lines(found, common), found.warnings)
+    return finish_folder(common, output, payload, _colours_lines(found, common), found.warnings)
 
 
 # ---- what is said of images, and words of options --------------------------------------------------------------------
@@ -398,7 +400,7 @@ def sense(
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
     exposed: Exposed,
     irradiance: Irradiance,
-    common: Common,
+    common: Pictured,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
     from mitsim.bench.request import check_ending, check_image
@@ -421,4 +423,4 @@ def sense(
         f"mean {payload['mean_dn']:.5g} DN, largest {payload['largest_dn']:.5g}: {payload['output']}",
         *frame.notes,
     ]
-    return finish(common.as_json, payload, lines, frame.warnings)
+    return finish_frame(common, (output, frame.digital, "DN"), payload, lines, frame.warnings)

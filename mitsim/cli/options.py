@@ -9,9 +9,11 @@ from __future__ import annotations
 import functools
 import inspect
 import re
+import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import MISSING, dataclass, field, is_dataclass
+from dataclasses import MISSING, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -19,7 +21,7 @@ import typer
 
 import mitsim
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.job import Limits, running_seconds
 from mitsim.core.progress import progress
 from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
@@ -142,7 +144,7 @@ class Common:
     def job(self) -> Iterator[Job]:
         """A job of the verb's limits, with progress on stderr while the context lasts."""
         with progress(self.limits, self.quiet or self.as_json, running_seconds()) as job:
-            yield job
+            yield replace(job, command=command_line())
 
     @property
     def limits(self) -> Limits:
@@ -163,6 +165,18 @@ class Limited(Common):
     def limits(self) -> Limits:
         """Those that are asked for."""
         return Limits(self.max_seconds, None if self.max_memory is None else self.max_memory * 2**30)
+
+
+@dataclass(frozen=True)
+class Pictured(Common):
+    """Options of verbs whose work has pictures."""
+
+    no_pictures: bool = option(False, "leave out pictures and the page report.html", "--no-pictures")
+
+
+@dataclass(frozen=True)
+class LimitedPictured(Limited, Pictured):
+    """The same of those that may work for long."""
 
 
 @dataclass(frozen=True)
@@ -377,6 +391,14 @@ def by_line(colour: str) -> bool:
 def in_colour(bench: Bench, colour: str) -> Bench:
     """The ``bench`` with the lines that ``colour`` names; MitsimError for more bands than its projector has lines."""
     return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
+
+
+def command_line() -> str | None:
+    """The command line of this program, as a shell takes it; None where another program calls what serves it."""
+    program = Path(sys.argv[0])
+    if program.stem != "mitsim" and (program.parent.name, program.stem) != ("mitsim", "__main__"):
+        return None
+    return printable(shlex.join(["mitsim", *sys.argv[1:]]))
 
 
 # ---- what words say --------------------------------------------------------------------------------------------------

@@ -63,6 +63,19 @@ def write_text(path: Path | str, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+PAGE, PICTURES = "report.html", "pictures"
+"""What shows a folder to people, and the folder of the pictures in it."""
+
+
+def remove_page(folder: Path) -> None:
+    """Remove the page of a ``folder`` and its pictures: what it shows is about to change."""
+    (folder / PAGE).unlink(missing_ok=True)
+    for picture in (folder / PICTURES).glob("*.png"):
+        picture.unlink()
+    with suppress(OSError):  # none, or it holds what others put there
+        (folder / PICTURES).rmdir()
+
+
 def sweep(folder: Path) -> None:
     """Remove what killed processes left half-written in a ``folder`` that this one holds."""
     for part in folder.glob(".*.part"):

@@ -193,12 +193,12 @@ class Cost:
         allowed = free if limits.memory_bytes is None else min(limits.memory_bytes, free)
         if not self.memory_bytes <= allowed:
             raise MitsimError(
-                f"{what}: would take about {_size(self.memory_bytes)} of memory; allowed are {_size(allowed)}; "
+                f"{what}: would take about {size_text(self.memory_bytes)} of memory; allowed are {size_text(allowed)}; "
                 "ask for fewer pixels or patterns, or free memory"
             )
         if output is not None and not self.disk_bytes <= (left := free_disk(output)):
             raise MitsimError(
-                f"{what}: would write about {_size(self.disk_bytes)}, but {output} has {_size(left)} left; "
+                f"{what}: would write about {size_text(self.disk_bytes)}, but {output} has {size_text(left)} left; "
                 "choose another place or fewer frames"
             )
 
@@ -219,11 +219,14 @@ class Job:
         is told each stage and its finished part.
     limits
         beyond which the work is refused before it begins.
+    command
+        command line that asks for it, which manifests keep; None: Python does.
     """
 
     clock: Clock = field(default_factory=Clock)
     progress: Progress = silent
     limits: Limits = field(default_factory=Limits)
+    command: str | None = None
 
     def apart(self, prefix: str) -> Job:
         """The same for a part of the work whose seconds are its own, ``prefix`` before its stages' names."""
@@ -387,5 +390,6 @@ def free_disk(path: Path) -> float:
     return float(shutil.disk_usage(existing).free)
 
 
-def _size(count: float) -> str:
+def size_text(count: float) -> str:
+    """A ``count`` of bytes for people."""
     return f"{count / 2**30:.3g} GiB" if count >= 2**30 else f"{count / 2**20:.3g} MiB"

@@ -261,6 +261,8 @@ class _Head(_Part):
     """Why the folder is flagged; an image made of it is flagged too."""
     versions: dict[str, str] = {}
     """Of mitsim, Python and packages."""
+    command: str | None = None
+    """Command line that finished it; none: Python, or not stated."""
 
 
 class AmbientFile(_Part):

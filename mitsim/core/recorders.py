@@ -23,7 +23,7 @@ from mitsim.core.exr import (
     read_frame,
     write_frame,
 )
-from mitsim.core.files import output_folder, sweep
+from mitsim.core.files import output_folder, remove_page, sweep
 from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
 
 TRUTH, AMBIENT = "truth.exr", "ambient.exr"
@@ -130,6 +130,7 @@ class RunFolder(Recorder):
     def begin(self) -> None:
         """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
         sweep(self.folder)
+        remove_page(self.folder)
         configuration, digest = self.head.configuration, self.head.configuration_sha256
         head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)
         write_manifest(self.folder, head)

@@ -506,6 +506,7 @@ def _mended_factors(
             "result": result,
             "warnings": warnings,
             "versions": versions(),
+            "command": job.command,
             "estimate": str(status),
             "verdict": status.verdict.value,
         }

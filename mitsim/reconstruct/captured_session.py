@@ -217,6 +217,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         result=result,
         warnings=warnings,
         versions=versions(),
+        command=job.command,
     )
     return Factors.of(estimate, manifest)
 

@@ -185,6 +185,7 @@ def _factors(
         result=result,
         warnings=warnings,
         versions=versions(),
+        command=job.command,
         estimate=str(status),
         verdict=status.verdict.value,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, options_of
 from mitsim.core.exr import write_frame
-from mitsim.core.files import output_folder, plain, read_json, whole_file, write_json
+from mitsim.core.files import output_folder, plain, read_json, remove_page, whole_file, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 RESULT_FILE = "result.json"
+MADE_OF = "made_of"
+"""Key of the folders that an image was made of: whoever shows it finds its truth there."""
 POINT_SPREAD = "psf"
 """Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
 
@@ -135,6 +137,7 @@ class Reconstruction(Solution):
             "misfit": self.misfit and self.misfit.summary(),
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
+            "warnings": () if self.ok else (str(self.status),),
             "seconds": {**self.seconds, "total": sum(self.seconds.values())},
             "predicted": self.predicted and self.predicted.seconds,
             "predicted_seconds": self.predicted and sum(self.predicted.seconds.values()),
@@ -169,6 +172,7 @@ class Reconstruction(Solution):
         are further entries of result.json."""
         _check_stored(more)
         folder = Path(folder)
+        remove_page(folder)
         write_frame(
             folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
         )

@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import write_frame
-from mitsim.core.files import whole_file
-from mitsim.core.images import card, data_uri, grey_png, lightness, png
+from mitsim.core.exr import finite_channel, read_frame, write_frame
+from mitsim.core.files import PAGE, output_folder, read_json, remove_page, whole_file
+from mitsim.core.images import card, lightness, png
 from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.spectral_manifests import ColourManifest, write_colours
+from mitsim.core.runs import load_mosaic
+from mitsim.core.spectral_manifests import COLOUR, IMAGE, ColourManifest, checked_colours, is_mosaic, write_colours
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
+from mitsim.reconstruct.reconstruct import MADE_OF, RESULT_FILE
 from mitsim.reconstruct.request import IMAGE_FILE
-from mitsim.report.pages import page_figure, render_page, write_html
-from mitsim.report.plots import BLUE, FONT, GREEN, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.report.folder_page import truth_of, write_folder, write_page
+from mitsim.report.folder_pictures import LARGEST, REFLECTANCE, SMALLEST, Picture, Scale, shown_error
 
 
 @dataclass(frozen=True)
@@ -295,13 +297,14 @@ class JudgedColours:
             ],
             "ssim": mean_of(known),
             **self.colours.summary(),
+            "warnings": self.warnings,
             "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
             "seconds": dict(self.seconds),
             "output": self.output,
         }
 
     def write(self, folder: Path, **inputs: Any) -> None:
-        """Write the image in colour, its page, and colour.json last, to a ``folder``.
+        """Write the image in colour, and colour.json last, to a ``folder``; a page of an earlier one is removed.
 
         Parameters
         ----------
@@ -310,71 +313,106 @@ class JudgedColours:
         **inputs
             further entries of colour.json.
         """
+        remove_page(folder)
         self.colours.write(folder)
-        write_page(folder / PAGE, self.colours, self.qualities, self.facts, self.warnings)
         parts = {key: value for key, value in self.summary().items() if key != "channels"}
         lines = ColourManifest(kind="colour-image", channels=self.colours.lines.channels)
-        write_colours(folder, lines, **inputs, **parts)
+        made = {"facts": self.facts, "board_reflectance": self.colours.board, "chart": self.colours.chart}
+        write_colours(folder, lines, **inputs, **parts, **made)
 
     def _repr_html_(self) -> str:
         return self.colours._repr_html_()
 
 
-# -------- An image in colour in, one self-contained HTML page out
-
-PAGE = "report.html"
-_SMALLEST = 512
-"""Pixels a side of a picture, in two dots each of a column of the page."""
-_INK = 0.5
-"""Of a colour's lightness, below which letters on it are white."""
+# -------- A folder of an image in colour in, its pictures and page out
 
 
-def write_page(
-    path: Path,
-    image: ColourImage,
-    qualities: Mapping[str, Quality | None],
-    facts: Mapping[str, str],
-    warnings: Sequence[str],
-) -> Path:
-    """Write the page of an image, all or nothing, and return its path.
+def report_colours(folder: Path) -> Path:
+    """Write the pictures and the page of an image in colour, and of those of its lines, from their files alone.
 
     Parameters
     ----------
-    path
-        where.
-    image
-        in colour.
-    qualities
-        of each line's image, by its name.
-    facts
-        how it was made, by name.
-    warnings
-        what is wrong with it.
+    folder
+        of the image; the page's path is returned.
 
     Raises
     ------
     MitsimError
-        when it cannot be written.
+        when its files are damaged or missing, or the folder cannot be written.
     """
-    seen = {"image": image.xyz} | ({} if image.truth_xyz is None else {"truth": image.truth_xyz})
-    text = render_page(
-        "colour.html",
-        verdict=_verdict(image),
-        pictures={name: data_uri(png(linear_srgb(xyz), smallest=_SMALLEST)) for name, xyz in seen.items()},
-        lines=[_line(image, number, qualities[name]) for number, name in enumerate(image.lines.names)],
-        figures=_figures(image),
-        patches=image.patches,
-        means=image.patch_means,
-        matrix=[(axis, [f"{value:.4f}" for value in row]) for axis, row in zip("XYZ", image.model.matrix, strict=True)],
-        names=[f"{line.wavelength_nm:g} nm" for line in image.lines.channels],
-        model=image.model.summary(),
-        facts=facts,
-        warnings=warnings,
-        size=image.images.shape[:2],
-        board=image.board,
-        versions=versions(),
+    data = read_json(folder / COLOUR)
+    lines = checked_colours(data, IMAGE, folder)
+    for name in lines.names:
+        if (folder / name / RESULT_FILE).is_file():
+            write_folder(folder / name)
+    files = [folder / name / IMAGE_FILE for name in lines.names]
+    stack = np.stack([finite_channel(read_frame(file)[0], "reflectance", file) for file in files], axis=-1)
+    place = None if data.get("chart") is None else validate(ChartPlace, data["chart"], f"{folder / COLOUR}: chart")
+    truth = _truth_of(folder, data, lines)
+    image = ColourImage.of(
+        lines,
+        stack,
+        data.get("board_reflectance"),
+        truth if truth is not None and truth.shape == stack.shape else None,
+        place,
     )
-    return write_html(path, text)
+    with output_folder(folder, overwrite=True):
+        write_page(
+            folder,
+            tuple(_pictures(image)),
+            "colour.html",
+            verdict=_verdict(image),
+            lines=[_line(image, number) for number in range(len(lines.names))],
+            patches=_patches(image),
+            means=image.patch_means,
+            matrix=[
+                (axis, [f"{value:.4f}" for value in row]) for axis, row in zip("XYZ", image.model.matrix, strict=True)
+            ],
+            names=[f"{line.wavelength_nm:g} nm" for line in lines.channels],
+            model=image.model.summary(),
+            facts=data.get("facts") or {},
+            warnings=data.get("warnings") or (),
+            command=data.get("command"),
+            board=image.board,
+            versions=versions(),
+        )
+    return folder / PAGE
+
+
+def _truth_of(folder: Path, data: Mapping[str, Any], lines: ColourManifest) -> FloatArray | None:
+    """(n, n', lines) truths of the image in a ``folder`` whose colour.json has this ``data``, while its run is where it
+    was."""
+    run = Path(str((data.get(MADE_OF) or {}).get("run", folder)))
+    if is_mosaic(run):
+        try:
+            shots = load_mosaic(run)
+        except MitsimError:
+            return None
+        same = (data.get("inputs") or {}).get("run") == shots.shots.fingerprint
+        return shots.truth(data.get("board_reflectance")) if same else None
+    results = [folder / name / RESULT_FILE for name in lines.names]
+    truths = [truth_of(read_json(path)) if path.is_file() else None for path in results]
+    known = [truth for truth in truths if truth is not None]
+    return np.stack(known, axis=-1) if len(known) == len(truths) else None
+
+
+def _pictures(image: ColourImage) -> Iterator[Picture]:
+    size = f"in sRGB under D65, {image.images.shape[0]} x {image.images.shape[1]} projector pixels"
+    shown = {"image": ("The image", image.xyz), "truth": ("The truth", image.truth_xyz)}
+    for name, (title, xyz) in shown.items():
+        if xyz is not None:
+            about = size if name == "image" else "what a perfect image of the same lines would show, by the same matrix"
+            caption = f"{about}; white is a perfect reflector, and what lies beyond the screen's colours is cut"
+            yield Picture(name, title, caption, png(linear_srgb(xyz), LARGEST, SMALLEST))
+    if image.delta_e is not None:
+        scale = Scale(0.0, max(shown_error(image.delta_e), 1.0), "Delta E 2000")
+        about = "1 is about the least difference that an eye sees side by side"
+        yield Picture.of("error", "How they differ", image.delta_e, scale, about)
+    for number, line in enumerate(image.lines.channels):
+        title = f"{line.wavelength_nm:g} nm"
+        yield Picture.of(f"image_{line.name}", title, image.images[..., number], REFLECTANCE)
+        if image.truth is not None:
+            yield Picture.of(f"truth_{line.name}", f"{title}, truth", image.truth[..., number], REFLECTANCE)
 
 
 def _verdict(image: ColourImage) -> tuple[str, str]:
@@ -391,105 +429,24 @@ def _verdict(image: ColourImage) -> tuple[str, str]:
     return f"An image from {len(image.lines.names)} spectral lines", "No truth to compare it with."
 
 
-def _line(image: ColourImage, number: int, quality: Quality | None) -> dict[str, Any]:
-    """What is shown of one spectral line."""
+def _line(image: ColourImage, number: int) -> dict[str, Any]:
+    """What is said of one spectral line."""
     line, truth = image.lines.channels[number], image.truth
+    quality = None if truth is None else Quality.of(image.images[..., number], truth[..., number])
     return {
         "name": f"{line.wavelength_nm:g} nm",
         "share": None if line.radiant_share is None else f"{100 * line.radiant_share:.0f} %",
-        "image": _grey(image.images[..., number]),
-        "truth": None if truth is None else _grey(truth[..., number]),
-        "quality": None if quality is None else f"{quality.psnr_db:.1f} dB",
-        "ssim": None if quality is None or quality.ssim is None else f"{quality.ssim:.3f}",
+        "quality": quality,
     }
 
 
-def _grey(values: Any) -> str:
-    return data_uri(grey_png(lightness(values), smallest=_SMALLEST))
+def _patches(image: ColourImage) -> list[dict[str, Any]]:
+    """What is said of each patch, with the colours of its spectrum and of this image as a page names them."""
+    if image.chart is None:
+        return []
+    colours = zip(_hexes(chart().xyz), _hexes(image.chart.means(image.xyz)), strict=True)
+    return [{**vars(patch), "known": a, "seen": b} for patch, (a, b) in zip(image.patches, colours, strict=True)]
 
 
-def _figures(image: ColourImage) -> dict[str, tuple[str, int]]:
-    """The page's figures by name: what holds each, and its width [pixels]."""
-    drawn: dict[str, Figure] = {}
-    if image.delta_e is not None:
-        drawn["differences"] = differences(image.delta_e)
-    if image.patches and image.chart is not None:
-        names, found = [patch.name for patch in image.patches], [patch.delta_e for patch in image.patches]
-        drawn["by_patch"] = by_patch(names, [patch.floor for patch in image.patches], {"this image": found})
-        title = "Left half: the patch's spectrum in D65. Right half: this image. Number: Delta E 2000"
-        drawn["halves"] = halves(names, found, chart().xyz, image.chart.means(image.xyz), title)
-    return {name: page_figure(figure) for name, figure in drawn.items()}
-
-
-# -------- Colours of a chart's patches in, matplotlib Figures out
-
-_TILE = 24
-"""Pixels a side of a patch in the picture of the chart."""
-_SHOWN_PERCENT = 99.0
-"""Of the pixels, those that the scale holds: single ones near black are off by far more, and nobody sees them."""
-_BAR = "#c7d2de"
-"""What is below every marker: lighter than these."""
-
-
-def by_patch(names: Sequence[str], floor: Sequence[float], found: Mapping[str, Sequence[float]]) -> Figure:
-    """Delta E of each patch.
-
-    Parameters
-    ----------
-    names
-        of the patches.
-    floor
-        what no camera is below, of each.
-    found
-        of each, by what found them; three at most.
-    """
-    figure, axes = figure_of(4.4)
-    place = np.arange(len(names))
-    axes.bar(place, floor, 0.8, color=_BAR, label="floor: no camera, these lines alone")
-    for (label, values), colour, marker in zip(found.items(), (VERMILION, BLUE, GREEN), ("s", "o", "^"), strict=False):
-        axes.plot(place, values, marker, ms=5, color=colour, label=label)
-    axes.set_xticks(place, names, rotation=45, ha="right", rotation_mode="anchor", fontsize=FONT - 2)
-    axes.margins(x=0.01)
-    label_axes(axes, "", "Delta E 2000 to the spectrum in D65", grid="y")
-    axes.legend(fontsize=FONT - 1, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0))
-    return figure
-
-
-def halves(names: Sequence[str], values: Sequence[float], known: FloatArray, seen: FloatArray, title: str) -> Figure:
-    """The chart: left half of a patch the colour of its spectrum, right half what was found.
-
-    Parameters
-    ----------
-    names, values
-        of the patches, row by row of six, and the numbers that stand below them.
-    known, seen
-        (24, 3) CIE XYZ under D65.
-    title
-        above all.
-    """
-    truth, found = (lightness(linear_srgb(each)) for each in (known, seen))
-    figure, axes = figure_of(0.62 * WIDTH)
-    axes.set_facecolor("#3a3a3a")
-    for number, (name, value) in enumerate(zip(names, values, strict=True)):
-        top, left = divmod(number, 6)
-        tile = np.concatenate([np.tile(each[number], (_TILE, _TILE // 2, 1)) for each in (truth, found)], axis=1)
-        axes.imshow(tile, extent=(left + 0.06, left + 0.94, top + 0.78, top + 0.06), interpolation="none")
-        axes.text(
-            left + 0.5, top + 0.98, f"{name}  {value:.1f}", ha="center", va="bottom", color="white", fontsize=FONT - 3
-        )
-    axes.set(xlim=(0, 6), ylim=(4.05, 0), xticks=[], yticks=[], aspect="auto")
-    axes.set_title(title, fontsize=FONT)
-    return figure
-
-
-def differences(values: FloatArray) -> Figure:
-    """Delta E 2000 ``values`` (n, n') of each pixel to the truth, with its scale."""
-    # Beside pictures of the same pixels, and as wide: no room for axes of its own, which they have not either.
-    figure, axes = figure_of(0.43 * WIDTH, 0.36 * WIDTH)
-    most = max(float(np.percentile(values, _SHOWN_PERCENT)), 1.0)
-    drawn = axes.imshow(values, vmin=0, vmax=most, cmap="viridis", interpolation="none")
-    axes.set(xticks=[], yticks=[])
-    bar = figure.colorbar(drawn, ax=axes, extend="max", orientation="horizontal", pad=0.03, aspect=25)
-    bar.set_label("Delta E 2000 to the truth", fontsize=FONT)
-    bar.ax.tick_params(labelsize=FONT - 1)
-    return figure
+def _hexes(xyz: FloatArray) -> list[str]:
+    return [f"#{bytes(level).hex()}" for level in np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)]

@@ -26,6 +26,7 @@ from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
 from mitsim.report.pages import DASH, Mean, figure_uri, reflectance, render_page, sentence, write_html
+from mitsim.report.parts import PlanChart, stages_of, total_of
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
 
 _PATTERN_CORNER = 40
@@ -36,8 +37,6 @@ _FIGURE_DPI = 160
 """Figures are 8.6 inches wide: 1376 pixels, what the page's width shows on the same screen."""
 _TELLS_DB = 0.5
 """A gain that counts: a tenth of the squared error."""
-_WORTH_TELLING = 0.01
-"""Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,10 +154,9 @@ def build_report(report: ReportData, path: Path) -> Path:
 def render_html(report: ReportData) -> str:
     """The page of a ``report`` as text; `build_report` writes it."""
     filters: dict[str, Callable[..., str]] = {
-        "chi": lambda value: DASH if value is None else chi_square_text(value),
+        "chi": _chi_square,
         "db": _decibel,
         "rms": reflectance,
-        "seconds": _seconds,
         "trouble": _trouble,
         "reflectance": _reflectance,
         "pattern": _pattern,
@@ -191,7 +189,8 @@ def _finite(image: npt.ArrayLike, name: str) -> FloatArray:
 
 def _figures(report: ReportData) -> dict[str, Any]:
     """The page's plots as data URIs, by name, where there are data for them; and the total time in s."""
-    figures: dict[str, Any] = {"total": report.seconds.get("total", math.fsum(report.seconds.values()))}
+    figures: dict[str, Any] = {"total": total_of(report.seconds), "stages": stages_of(report.seconds)}
+    figures["plan"] = PlanChart.of(report.effects, report.accuracy) if report.effects else None
     figures["frames"] = {name: _picture(frame(_finite(dn, name))) for name, dn in report.frames.items()}
     curves = {f.label: f.singular_values for f in report.families if f.singular_values is not None}
     if curves:
@@ -209,17 +208,7 @@ def _figures(report: ReportData) -> dict[str, Any]:
     positive = {row.name: row.value for row in report.budget if row.value}
     if positive:
         figures["budget"] = _picture(plots.error_bars(positive, report.accuracy))
-    figures["stages"] = _stages(report.seconds)
     return figures
-
-
-def _stages(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Seconds of each stage that is worth telling, and as "all else" what the total holds beside them."""
-    stages = {name: value for name, value in seconds.items() if name != "total"}
-    total = seconds.get("total", math.fsum(stages.values()))
-    reported = {name: value for name, value in stages.items() if value >= _WORTH_TELLING * total}
-    rest = total - math.fsum(reported.values())
-    return reported | ({"all else": rest} if stages and rest > _WORTH_TELLING * total else {})
 
 
 def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
@@ -231,12 +220,12 @@ def _best(families: tuple[FamilyResult, ...]) -> dict[str, str]:
     return best
 
 
+def _chi_square(value: float | None) -> str:
+    return DASH if value is None else chi_square_text(value)
+
+
 def _decibel(value: float | None) -> str:
     return DASH if value is None else f"{value:.1f} dB"
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def _trouble(status: str) -> str:

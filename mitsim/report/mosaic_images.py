@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -52,12 +52,12 @@ def reconstruct_mosaic(
     output: Path | str,
     chart: ChartPlace | None = None,
     overwrite: bool = False,
-    way: str = JOINT,
-    lam: Lambda = "auto",
+    origin: Mapping[str, Any] | None = None,
+    **options: Any,
 ) -> JudgedColours:
     """Recover the image of every line of a run behind colour filters, and bring them together.
 
-    Writes image.exr and image.png in colour and of each line, colour.json and report.html.
+    Writes image.exr and image.png in colour and of each line, and colour.json.
 
     Parameters
     ----------
@@ -65,11 +65,11 @@ def reconstruct_mosaic(
         folders of `mitsim capture --colour mosaic` and `mitsim calibrate --colour mosaic`.
     output, chart, overwrite
         as :func:`mitsim.report.quality.reconstruct_colours`.
-    way
-        one of :data:`mitsim.core.spectral_manifests.WAYS`.
-    lam
-        lambda above 0 in the unit of (Phi_L Phi_R)^2, of each plane or channel where these are solved one by one;
-        ``auto`` chooses it from the data.
+    origin
+        entries of colour.json on where the image comes from.
+    **options
+        ``way``, one of :data:`mitsim.core.spectral_manifests.WAYS`, and ``lam``, lambda above 0 in the unit of
+        (Phi_L Phi_R)^2, of each plane or channel where these are solved one by one; ``auto`` chooses it from the data.
 
     Raises
     ------
@@ -78,16 +78,15 @@ def reconstruct_mosaic(
         :func:`mitsim.report.quality.reconstruct_colours`.
     """
     started = time.perf_counter()
-    check_way(way)
-    check_joint(lam)
+    way, lam = _checked_options(**options)
     run, calibration = Path(run), Path(calibration)
     shots = load_mosaic(run)
     factors = fitting_factors(shots, calibration)
-    options: dict[str, str | float] = {
+    inputs: dict[str, str | float] = {
         "run": shots.shots.fingerprint, "calibration": "-".join(each.fingerprint for each in factors.values()),
         "mosaic": way, "lambda": lam,
     }  # fmt: skip
-    replaces = _may_replace(Path(output), options, overwrite)
+    replaces = _may_replace(Path(output), inputs, overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         read = time.perf_counter()
         camera = MosaicCamera.of(
@@ -139,8 +138,14 @@ def reconstruct_mosaic(
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
                 with whole_file(place / "image.png") as part:
                     part.write_bytes(png(image))
-        found.write(folder, inputs=options)
+        found.write(folder, inputs=inputs, **(origin or {}))
     return found
+
+
+def _checked_options(way: str = JOINT, lam: Lambda = "auto") -> tuple[str, Lambda]:
+    check_way(way)
+    check_joint(lam)
+    return way, lam
 
 
 def fitting_factors(shots: MosaicCapture, calibration: Path) -> dict[str, Factors]:

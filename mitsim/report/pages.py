@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,6 +23,7 @@ from mitsim.core.files import whole_file
 from mitsim.core.images import data_uri
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.figure import Figure
 
 # -------- Pages
@@ -38,19 +40,26 @@ def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None 
     template
         file of ``mitsim/report/templates``.
     filters
-        of its own, by name, beside ``sci`` of a number, ``typeset`` of a text and ``sentence`` of a warning.
+        of its own, by name, beside ``sci`` and ``seconds`` of a number, ``typeset`` of a text and ``sentence`` of a
+        warning.
     **shown
         what it shows, by the names that it has there; one that is missing is an error.
     """
+    return _environment(tuple((filters or {}).items())).get_template(template).render(**shown)
+
+
+@cache
+def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environment:
+    """Templates with these ``filters``, kept for the next page: to compile them takes longer than to fill them."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("mitsim.report")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    own = {"sci": scientific, "typeset": typeset, "sentence": sentence}
-    environment.filters.update({**own, **(filters or {})})
-    return environment.get_template(template).render(**shown)
+    own = {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
+    environment.filters.update({**own, **dict(filters)})
+    return environment
 
 
 def write_html(path: Path, text: str) -> Path:
@@ -131,6 +140,11 @@ def scientific(value: float | None) -> str:
     if 1e-2 <= abs(value) < 1e4:
         return f"{value:.0f}" if abs(value) >= 99.95 else f"{value:#.3g}"
     return typeset(f"{value:.1e}")
+
+
+def duration(value: float) -> str:
+    """Seconds, a ``value``, in three digits."""
+    return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def round_to_error(value: float, error: float) -> str:

@@ -22,7 +22,7 @@ from mitsim.devices.chart import ChartPlace
 from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import Reconstruction, may_replace, reconstruct_request
+from mitsim.reconstruct.reconstruct import MADE_OF, Reconstruction, may_replace, reconstruct_request
 from mitsim.reconstruct.request import ImageRequest
 
 if TYPE_CHECKING:
@@ -86,8 +86,16 @@ def reconstruct(
             output=str(folder),
         )
         with job.clock.stage("write"):
-            judged.reconstruction.write(folder, judged.summary())
+            judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run, calibration)})
     return judged
+
+
+def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = None) -> dict[str, Any]:
+    """Entries of result.json on where an image comes from: the command of a ``job``, and the folders of its ``run`` and
+    ``calibration``."""
+    folders = {"run": run, "calibration": calibration}
+    made_of = {name: str(Path(folder).absolute()) for name, folder in folders.items() if folder is not None}
+    return {"command": job and job.command, MADE_OF: made_of}
 
 
 def reconstruct_psf(
@@ -125,7 +133,7 @@ def reconstruct_psf(
     replaces = may_replace(Path(output), psf_inputs(shots, light, reduce, request), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
         judged = Judged(reconstruct_psf_request(shots, psf, reduce, request, job), None, str(folder))
-        judged.reconstruction.write(folder, judged.summary())
+        judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run)})
     return judged
 
 
@@ -141,7 +149,7 @@ def reconstruct_colours(
 ) -> JudgedColours:
     """Recover the image of every line of a coloured run, and bring them together.
 
-    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png, report.html and colour.json.
+    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png, colour.json and report.html.
 
     Parameters
     ----------
@@ -158,7 +166,8 @@ def reconstruct_colours(
         its clock.
     **options
         of :func:`reconstruct`, for every line; of a run behind colour filters, ``way`` and
-        ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`.
+        ``lam`` as for :func:`mitsim.report.mosaic_images.reconstruct_mosaic`; ``page=False`` leaves out pictures and
+        report.html, which :func:`mitsim.report_folder` makes later.
 
     Raises
     ------
@@ -166,12 +175,17 @@ def reconstruct_colours(
         for folders of different lines, and as :func:`reconstruct`.
     """
     from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
+    from mitsim.report.folders import report_folder
     from mitsim.report.mosaic_images import reconstruct_mosaic
 
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
+    origin, page = _origin(job, run, calibration), options.pop("page", True)
     if is_mosaic(run):
         with job.clock.stage("images"):
-            return reconstruct_mosaic(run, calibration, output, chart, overwrite, **options)
+            found = reconstruct_mosaic(run, calibration, output, chart, overwrite, origin, **options)
+        if page:
+            report_folder(output)
+        return found
     lines = same_lines(run, calibration)
     held = is_coloured(output)
     earlier = held and read_colours(output, IMAGE).names == lines.names
@@ -210,5 +224,7 @@ def reconstruct_colours(
             output=str(folder),
             of_lines=summaries,
         )
-        found.write(folder)
+        found.write(folder, **origin)
+    if page:
+        report_folder(output)
     return found

@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
+from mitsim.core.images import lightness
 from mitsim.devices.chart import ChartPlace, load_chart
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
@@ -31,9 +32,19 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
 from mitsim.report import label
-from mitsim.report.colour_image import by_patch, halves
 from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import bars, curves, image_grid
+from mitsim.report.plots import (
+    BLUE,
+    FONT,
+    GREEN,
+    VERMILION,
+    WIDTH,
+    bars,
+    curves,
+    figure_of,
+    image_grid,
+    label_axes,
+)
 from mitsim.studies import lit_lines
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
@@ -371,13 +382,30 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     return drawn
 
 
+_TILE = 24
+"""Pixels a side of a patch in the picture of the chart."""
+_BAR = "#c7d2de"
+"""What is below every marker: lighter than these."""
+
+
 def _by_patch(table: Table) -> Figure:
+    """Delta E of each patch by family, above the floor."""
     names = [str(name) for name in table.distinct("patch")]
     found = {
         label(family): [table.mean("delta_e", patch=name, patterns=family).value for name in names]
         for family in FAMILIES
     }
-    return by_patch(names, [table.mean("floor", patch=name).value for name in names], found)
+    figure, axes = figure_of(4.4)
+    place = np.arange(len(names))
+    floor = [table.mean("floor", patch=name).value for name in names]
+    axes.bar(place, floor, 0.8, color=_BAR, label="floor: no camera, these lines alone")
+    for (title, values), colour, marker in zip(found.items(), (VERMILION, BLUE, GREEN), ("s", "o", "^"), strict=False):
+        axes.plot(place, values, marker, ms=5, color=colour, label=title)
+    axes.set_xticks(place, names, rotation=45, ha="right", rotation_mode="anchor", fontsize=FONT - 2)
+    axes.margins(x=0.01)
+    label_axes(axes, "", "Delta E 2000 to the spectrum in D65", grid="y")
+    axes.legend(fontsize=FONT - 1, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0))
+    return figure
 
 
 def _by_way(table: Table) -> Figure:
@@ -395,9 +423,20 @@ def _by_way(table: Table) -> Figure:
 def _patches(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """The chart: left half of a patch its spectrum's colour, right half what the camera found."""
     known, seen = (np.array([[row[f"{which}{axis}"] for axis in "XYZ"] for row in rows]) for which in ("truth_", ""))
-    title = f"Left half: the patch's spectrum in D65. Right half: {label(_SHOWN)}. Number: Delta E 2000"
-    names, values = [str(row["patch"]) for row in rows], [float(row["delta_e"]) for row in rows]
-    return halves(names, values, known, seen, title)
+    truth, found = (lightness(linear_srgb(each)) for each in (known, seen))
+    figure, axes = figure_of(0.62 * WIDTH)
+    axes.set_facecolor("#3a3a3a")
+    for number, row in enumerate(rows):
+        top, left = divmod(number, 6)
+        tile = np.concatenate([np.tile(each[number], (_TILE, _TILE // 2, 1)) for each in (truth, found)], axis=1)
+        axes.imshow(tile, extent=(left + 0.06, left + 0.94, top + 0.78, top + 0.06), interpolation="none")
+        words = f"{row['patch']}  {row['delta_e']:.1f}"
+        axes.text(left + 0.5, top + 0.98, words, ha="center", va="bottom", color="white", fontsize=FONT - 3)
+    axes.set(xlim=(0, 6), ylim=(4.05, 0), xticks=[], yticks=[], aspect="auto")
+    axes.set_title(
+        f"Left half: the patch's spectrum in D65. Right half: {label(_SHOWN)}. Number: Delta E 2000", fontsize=FONT
+    )
+    return figure
 
 
 def _images(results: Results) -> Figure:

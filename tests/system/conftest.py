@@ -48,6 +48,8 @@ MITSIM = Path(sys.executable).with_name("mitsim")
 HANGS_S = 1200
 """Seconds on the clock after which a program counts as hung: ten times 120, which captures in colour passed while a
 dozen other busy processes shared two processors."""
+PICTURED = {"capture", "calibrate", "reconstruct", "render", "sense"}
+"""Verbs whose work has pictures."""
 _commands = cache(typer.main.get_command)
 """Typer builds all commands anew whenever one is called, for longer than most refusals take."""
 
@@ -80,12 +82,19 @@ class Outcome:
         return lines[0].removeprefix("mitsim: ")
 
 
-def call(*arguments: object, cwd: Path | None = None) -> Outcome:
-    """``mitsim ARGUMENTS`` in this process."""
+def _plain(arguments: tuple[object, ...]) -> tuple[object, ...]:
+    """``arguments`` of mitsim without pictures, of which most tests see nothing."""
+    verb = str(arguments[0]) if arguments else ""
+    planned = verb == "calibrate" and "--plan" in map(str, arguments)
+    return (verb, "--no-pictures", *arguments[1:]) if verb in PICTURED and not planned else arguments
+
+
+def call(*arguments: object, cwd: Path | None = None, pictures: bool = False) -> Outcome:
+    """``mitsim ARGUMENTS`` in this process; without pictures, unless these are asked for."""
     from mitsim import cli
 
     before, kept = sys.argv, Path.cwd()
-    sys.argv = ["mitsim", *map(str, arguments)]
+    sys.argv = ["mitsim", *map(str, arguments if pictures else _plain(arguments))]
     os.chdir(cwd or kept)
     try:
         with _captured() as (out, err), pytest.MonkeyPatch.context() as patch:
@@ -119,9 +128,15 @@ def _captured() -> Iterator[tuple[Path, Path]]:
 
 
 def shell(*arguments: object, cwd: Path | None = None, **options: Any) -> Outcome:
-    """The installed program ``mitsim ARGUMENTS``."""
+    """The installed program ``mitsim ARGUMENTS``, without pictures."""
     done = subprocess.run(
-        [MITSIM, *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=HANGS_S, check=False, **options
+        [MITSIM, *map(str, _plain(arguments))],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=HANGS_S,
+        check=False,
+        **options,
     )
     return Outcome(done.returncode, done.stdout, done.stderr)
 

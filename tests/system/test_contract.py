@@ -24,8 +24,8 @@ from mitsim.studies import solver_study
 from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
-    *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
-    *("import", "patterns", "transport", "doctor", "pairs", "train"),
+    *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "characterise", "sense"),
+    *("export", "import", "patterns", "transport", "doctor", "pairs", "train"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
@@ -92,14 +92,14 @@ def test_calibrate(lab: Any) -> None:
 
 def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     options = "--json", "--quiet", "--variant", "llvm_ad_mono", "-o", tmp_path / "image"
-    found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options).payload
-    keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "seconds", "output"}
+    found = call("reconstruct", lab.run, "--calibration", lab.calibration, *options, pictures=True).payload
+    keys = {"psnr", "ssim", "lambda", "rank", "condition", "residual", "status", "warnings", "seconds", "output"}
     assert found.keys() == keys | {
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
         *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm", "depths"),
         *("uncertainty_extrapolated", "regularisation_bias_factor", "focus_range_mm", "focus_alternatives"),
         *("objective", "relative_gap", "iterations", "white"),
-        *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes"),
+        *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes", "report"),
     }
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
     assert number(found["uncertainty"], 1e-6, 0.1) and all(map(number, found["uncertainty_budget"].values()))
@@ -132,11 +132,20 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     assert sorted(path.name for path in (tmp_path / "image").iterdir()) == [
         "image.exr",
         "image.png",
+        "pictures",
+        "report.html",
         "result.json",
         "uncertainty.exr",
     ]
+    made = found.pop("report")
+    assert made.keys() == {"page", "pictures", "seconds"} and number(made["seconds"], 0, 60)
+    assert made["page"] == str(tmp_path / "image" / "report.html") and all(
+        Path(each).is_file() for each in made["pictures"]
+    )
     written = json.loads((tmp_path / "image" / "result.json").read_text())
     assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
+    assert written.pop("made_of") == {"run": str(lab.run), "calibration": str(lab.calibration)}
+    assert written.pop("command").startswith(f"mitsim reconstruct {lab.run} --calibration")
     assert number(found.pop("memory_bytes"), 0)  # of the process, which may do more than this
     assert written == found
 
@@ -170,7 +179,7 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
     *others, note = found["notes"]
     assert note == f"{unused} has no effect on the {estimator}"
     assert len(others) == (estimator == "reference")  # what the reference leaves out
-    assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
+    assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"] and found["picture"] is None
 
 
 @pytest.mark.slow

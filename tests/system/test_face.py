@@ -153,14 +153,15 @@ def test_a_saved_capture_is_that_of_the_command_line(
 
 
 def untimed(folder: Path) -> dict[str, Any]:
-    """The manifest without what the clock says: stages, kernels, and the plan's predictions from measured paces."""
+    """The manifest without its command and what the clock says: stages, kernels, and the plan's predictions from
+    measured paces."""
     manifest = json.loads((folder / "manifest.json").read_text())
     plan = manifest["plan"]
     rows = [{**row, "seconds": 0} for row in plan["effects"]]
     candidates = [{**each, "seconds": 0} for each in plan["colour"]["candidates"]]
     own = {"effects": rows, "colour": {**plan["colour"], "candidates": candidates}}
     untimed_plan = {**plan, **own, "predicted_seconds": 0, "predicted": {}}
-    return {**manifest, "seconds": {}, "kernels": {}, "plan": untimed_plan}
+    return {**manifest, "seconds": {}, "kernels": {}, "plan": untimed_plan, "command": None}
 
 
 def assert_equal_files(one: Path, other: Path) -> None:

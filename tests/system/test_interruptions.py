@@ -87,14 +87,14 @@ def test_a_capture_goes_on_to_the_same_frames(lab: Any, whole: Path, tmp_path: P
 def works(lab: Any, sources: Path, out: Path) -> dict[str, Sequence[object]]:
     """Commands that write, by name; all to ``out``."""
     return {
-        "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration, "-o", out / "image"),
+        "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration, "-o", out / "image", "--no-pictures"),
         "export hdf5": ("export", lab.run, "--format", "hdf5", "-o", out / "run.h5", "--calibration", lab.calibration),
         "export mat": ("export", lab.run, "--format", "mat", "-o", out / "run.mat", "--calibration", lab.calibration),
         "export png": ("export", lab.run, "--format", "png", "--projector", "mp_cl1", "-o", out / "png"),
         "import": ("import", sources / "run.h5", "-o", out / "run", "--calibration-output", out / "cal"),
         "patterns": ("patterns", "dots:16", "--projector-pixels", "16", "-o", out / "patterns"),
         "sense": ("sense", lab.run / "truth.exr", "--channel", "reflectance", "--camera", lab.camera,
-                  "--exposure", "0.1", "-o", out / "frame.png"),
+                  "--exposure", "0.1", "-o", out / "frame.png", "--no-pictures"),
         "characterise": ("characterise", lab.camera, "-o", out / "camera", "--pixels", "32", "--frames", "4"),
     }  # fmt: skip
 
