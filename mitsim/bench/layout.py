@@ -92,8 +92,8 @@ class Layout:
         projector pixels whose light the camera's middle sees at once, of n x n.
     depths
         nearest and farthest depth [mm] that this light is seen at; None where there is none.
-    parallax
-        rows and columns of projector pixels by which the window moves between these depths.
+    moves
+        rows and columns of projector pixels by which a change of 1/z by 1/mm moves the window.
     trouble
         why none of the projector's light is seen; None where some is.
     """
@@ -104,8 +104,18 @@ class Layout:
     lamps: dict[str, FloatArray]
     seen: int
     depths: tuple[float, float] | None
-    parallax: tuple[float, float]
+    moves: tuple[float, float]
     trouble: str | None
+
+    @property
+    def parallax(self) -> tuple[float, float]:
+        """Rows and columns of projector pixels by which the window moves between the nearest and farthest light."""
+        return (0.0, 0.0) if self.depths is None else self.parallax_between(*self.depths)
+
+    def parallax_between(self, near: float, far: float) -> tuple[float, float]:
+        """The same between any two depths [mm], the nearer one and the farther one."""
+        step = 1 / near - 1 / far
+        return self.moves[0] * step, self.moves[1] * step
 
     def window_at(self, depth: float) -> FloatArray:
         """(4, 3) corners of the window on the plane at ``depth`` [mm]."""
@@ -128,17 +138,17 @@ def layout_of(bench: Apparatus) -> Layout:
     depths = (1 / float(light.inverse_depth[lit].max()), 1 / float(light.inverse_depth[lit].min())) if seen else None
     if not seen and not loaded.mirrors:
         trouble = f"no light of the projector reaches the camera: {why_dark(loaded)}"
-    far = 0.0 if depths is None else 1 / depths[0] - 1 / depths[1]
-    row, column = (max(map(abs, pixels_of_parallax(bench.parallax, axis, n)[:2])) * far for axis in (0, 1))
+    row, column = (max(map(abs, pixels_of_parallax(bench.parallax, axis, n)[:2])) for axis in (0, 1))
     lamps = {}
     for emitter, tag in loaded.small_lamps:
-        held = mi.traverse(emitter)
-        if "to_world" in held and emitter.class_name() != "DirectionalEmitter":
-            name = f"{tag.attributes.get('id') or tag.attributes.get('type', 'lamp')}, line {tag.line}"
-            lamps[name] = (turn_and_origin(held["to_world"])[1] - origin) @ turn
-        elif "position" in held:
-            name = f"{tag.attributes.get('id') or tag.attributes.get('type', 'lamp')}, line {tag.line}"
-            lamps[name] = (np.array(held["position"], dtype=np.float64).ravel() - origin) @ turn
+        held, name = mi.traverse(emitter), tag.attributes.get("id") or tag.attributes.get("type", "lamp")
+        if "position" in held:
+            place = np.array(held["position"], dtype=np.float64).ravel()
+        elif "to_world" in held and emitter.class_name() != "DirectionalEmitter":
+            place = turn_and_origin(held["to_world"])[1]
+        else:
+            continue
+        lamps[f"{name}, line {tag.line}"] = (place - origin) @ turn
     return Layout(_surfaces(bench, turn, origin), projector, window, lamps, seen, depths, (row, column), trouble)
 
 

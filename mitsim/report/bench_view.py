@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.layout import Layout, Preview, layout_of, previews
+from mitsim.bench.layout import Layout, Preview, Surface, layout_of, previews
 from mitsim.bench.request import check_view
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
@@ -40,6 +40,10 @@ _FEW = 60_000
 """Triangles up to which a shape is filled in the drawing, in a second; of more its corners are dots."""
 _FLAT = 1e-4
 """Relative difference of depths below which they are one: single precision is 1e-7."""
+_NO_PIXELS = 5e-3
+"""Parallax [projector pixels] that no image shows."""
+_NAMES = 3
+"""Of things outside a plan that its title has room for."""
 _BESIDE, _BEHIND = 0.3, 1.2
 """How far beside the light, of its width, and behind it the drawing shows the scene; chosen: it is of the bench."""
 _LAMP, _DARK = "#f0c419", "#9a6b00"
@@ -90,8 +94,7 @@ class BenchView:
             "projector": _place_words(layout.projector),
             "window": window,
             "light is seen": self._light_words,
-            "parallax": f"between these depths the window moves by {_pixels(layout.parallax[0])} rows and "
-            f"{_pixels(layout.parallax[1])} columns of its pixels",
+            "parallax": self._parallax_words,
             "field stop": stop,
             "sensor": f"{columns} x {rows} pixels of {pitch}: {columns * column:.3g} x {rows * row:.3g} mm",
             "mask": f"{mask}, features of {geometry.build_mask().feature_mm * 1e3:.3g} um",
@@ -153,6 +156,16 @@ class BenchView:
         where = f"at {near:.4g} mm" if far - near < _FLAT * far else f"from {near:.4g} to {far:.4g} mm"
         return f"{where}, of {layout.seen} of {every} projector pixels ({layout.seen / every:.1%})"
 
+    @property
+    def _parallax_words(self) -> str:
+        """Between the depths of the light, or to a depth that is 1 % nearer."""
+        between, where, aligned = self.layout.parallax, "between these depths", self.bench.geometry.scene_distance
+        if max(between) < _NO_PIXELS:
+            between = self.layout.parallax_between(0.99 * aligned, aligned)
+            where = f"none; {0.01 * aligned:.3g} mm nearer"
+        rows, columns = ("0" if value < _NO_PIXELS else f"{value:.3g}" for value in between)
+        return f"{where} the window moves by {rows} rows and {columns} columns of its pixels"
+
     # ---- As a drawing ----
 
     def figure(self) -> Figure:
@@ -209,7 +222,7 @@ class BenchView:
         aligned, tan = self.bench.geometry.scene_distance, self.bench.geometry.tan_half_fov
         start, across = min(0.0, float(layout.projector[2])), high - low
         length = end - start
-        _fill_surfaces(axes, layout, axis)
+        _fill_surfaces(axes, [each for each in layout.surfaces if self._has_room(each.points)], axis)
         light = np.concatenate([layout.projector[None], layout.window_at(end)])[:, [2, axis]]
         axes.add_patch(Polygon(_hull(light), closed=True, facecolor=ORANGE, alpha=0.22, lw=0))
         axes.plot([end, 0, end], [tan * end, 0, -tan * end], color=BLUE, lw=1, ls=(0, (5, 4)))
@@ -220,7 +233,7 @@ class BenchView:
         for place, along, color in ((layout.projector, facing, ORANGE), (np.zeros(3), np.array([0, 0, 1.0]), BLUE)):
             corners = _body(place[[2, axis]], along[[2, axis]], 0.022 * length)
             axes.add_patch(Polygon(corners, closed=True, color=color, zorder=4))
-        for place in layout.lamps.values():
+        for place in (each for each in layout.lamps.values() if self._has_room(each[None])):
             axes.plot(place[2], place[axis], "*", color=_LAMP, mec=BLACK, ms=10, zorder=4)
         self._name_devices(axes, axis, length)
         size = self._window_mm[1 - axis]
@@ -228,10 +241,10 @@ class BenchView:
         axes.text(max(end, aligned) + 0.03 * length, window.mean(), words, color=_DARK, va="center", fontsize=_SMALL)
         axes.text(aligned, high + 0.03 * across, "calibrated plane", ha="center", va="bottom", fontsize=_SMALL)
         _measure(axes, (0, low - 0.07 * across), (aligned, low - 0.07 * across), f"{aligned:.4g} mm")
-        axes.set(xlim=(start - 0.25 * length, end + 0.24 * length), ylim=(low - 0.12 * across, high + 0.16 * across))
+        axes.set(xlim=(start - 0.32 * length, end + 0.24 * length), ylim=(low - 0.12 * across, high + 0.16 * across))
         axes.set_aspect("equal", adjustable="box")
         title = "From above" if axis == 0 else "From the camera's right side"
-        axes.set_title(f"{title}{self._out_of_sight(axes, axis)}", fontsize=_SMALL + 1.5, loc="left")
+        axes.set_title(f"{title}{self._outside}", fontsize=_SMALL + 1.5, loc="left")
         axes.set_xlabel("z, distance from the sensor [mm]", fontsize=_SMALL)
         axes.set_ylabel("x, to the left [mm]" if axis == 0 else "y, up [mm]", fontsize=_SMALL)
         _open(axes)
@@ -250,20 +263,20 @@ class BenchView:
         words = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": _SMALL}
         axes.annotate(f"field stop, {stop.fov:g}°", (at, -stop.tan_half_fov * at), color=BLUE, **words)
 
-    def _out_of_sight(self, axes: Axes, axis: int) -> str:
-        """Lamps and shapes that a plan has no room for, in words."""
-        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-        away = []
-        for surface in self.layout.surfaces:
-            z, s = surface.points[:, 2], surface.points[:, axis]
-            if z.max() < left or z.min() > right or s.max() < low or s.min() > high:
-                away.append(surface.name)
-        away += [
-            name
-            for name, place in self.layout.lamps.items()
-            if not (left <= place[2] <= right and low <= place[axis] <= high)
-        ]
-        return f"  (outside: {', '.join(away[:3])}{' ...' if len(away) > 3 else ''})" if away else ""
+    def _has_room(self, points: FloatArray) -> bool:
+        """Whether some of a box around ``points`` (k, 3) is in the plans: what is not would hide what is."""
+        (low, high), ahead = self._range, _BEHIND * self._end
+        across, z = points[:, :2], points[:, 2]
+        inside = (across.max(axis=0) >= low) & (across.min(axis=0) <= high)
+        return bool(inside.all() and z.min() <= ahead and z.max() >= min(0.0, self.layout.projector[2]))
+
+    @cached_property
+    def _outside(self) -> str:
+        """Shapes and lamps that the plans have no room for, in words."""
+        every = {surface.name: surface.points for surface in self.layout.surfaces}
+        every |= {name: place[None] for name, place in self.layout.lamps.items()}
+        names = [name for name, points in every.items() if not self._has_room(points)]
+        return f"  (outside: {', '.join(names[:_NAMES])}{' ...' if len(names) > _NAMES else ''})" if names else ""
 
     def _camera(self, axes: Axes) -> None:
         """Sensor and mask, in a scale of their own, along columns."""
@@ -318,7 +331,8 @@ class BenchView:
     def _aside(self, axes: Axes) -> None:
         """The preview from a free place, with the light and the camera's field drawn over it."""
         preview, layout, geometry = self.previews[1], self.layout, self.bench.geometry
-        _show(axes, preview, "From beside: the projector's light, the camera's field")
+        _show(axes, preview, "From beside")
+        axes.set_xlabel("orange: the projector's light; blue: the camera's field", fontsize=_SMALL)
         reach = geometry.tan_half_fov * geometry.scene_distance
         stop = np.array([[x, y, geometry.scene_distance] for x, y in _SQUARE * reach])
         for eye, corners, color in ((layout.projector, layout.window, ORANGE), (np.zeros(3), stop, BLUE)):
@@ -445,10 +459,10 @@ _SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 _CONTROLS = {"displayModeBar": False, "responsive": True}
 
 
-def _fill_surfaces(axes: Axes, layout: Layout, axis: int) -> None:
+def _fill_surfaces(axes: Axes, surfaces: Sequence[Surface], axis: int) -> None:
     """The scene as it is seen from above (``axis`` 0) or the right (1): what is nearer covers what is not."""
     corners, heights, colors = [], [], []
-    for surface in layout.surfaces:
+    for surface in surfaces:
         if len(surface.triangles) > _FEW:
             axes.plot(surface.points[:, 2], surface.points[:, axis], ",", color=GREY)
             continue
@@ -564,7 +578,3 @@ def _place_words(place: FloatArray) -> str:
         if abs(value) > _FLAT * float(np.linalg.norm(place)):
             words.append(f"{abs(value):.4g} mm {side}{' of' if plus == 'left' else ''}")
     return f"{', '.join(words)} the camera's sensor" if words else "at the camera's sensor"
-
-
-def _pixels(value: float) -> str:
-    return "0" if abs(value) < 5e-3 else f"{value:.3g}"

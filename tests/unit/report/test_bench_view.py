@@ -40,7 +40,7 @@ def seen(shared_scene: Callable[..., Path], variant: str) -> BenchView:
         lamps={"bulb, line 3": np.array([0.0, 90, 300])},
         seen=250,
         depths=(340.0, 400.0),
-        parallax=(0.0, 1.41),
+        moves=(0.0, 3200.0),
         trouble=None,
     )
     picture = Preview(np.full((8, 8, 1), 0.5), np.eye(4), 0.2)
@@ -56,15 +56,18 @@ def drawn(seen: BenchView, axis: int) -> Figure:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_plans_are_to_scale(seen: BenchView, axis: int) -> None:
     """Both with one scale for z and x or y: the tower and the window are as wide as they are, the lamp is named for it
-    has no room. (Planted: x and y exchanged; the aspect left to the sheet of paper.)"""
+    has no room. (Planted: x and y exchanged; the aspect left to the sheet of
+    paper; the lamp drawn over all from above.)"""
     (axes,) = drawn(seen, axis).axes
     assert axes.get_aspect() == 1.0
     (filled,) = axes.collections
-    tower = np.concatenate([path.vertices for path in filled.get_paths() if path.vertices[:, 0].min() < 385])
+    paths = [path.vertices for path in filled.get_paths()]
+    assert len(paths) == 8 + 2
+    tower = np.concatenate([path for path in paths if path[:, 0].min() < 385])
     assert_allclose(np.ptp(tower, axis=0), [40, (30, 50)[axis]])
     window = [line for line in axes.lines if line.get_linewidth() == 3.5]
     assert_allclose(window[0].get_xydata(), [[400, -60], [400, 60]])
-    assert "lamp" in axes.get_title(loc="left") if axis else "lamp" not in axes.get_title(loc="left")
+    assert axes.get_title(loc="left").endswith("(outside: lamp)")
     texts = {text.get_text() for text in axes.texts}
     assert {"400 mm", "field stop, 20°", "calibrated plane"} <= texts
     assert ("60 mm" in texts) == (axis == 0) and ("camera and\nprojector" in texts) == (axis == 1)
@@ -89,8 +92,15 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     assert words["light is seen"] == "from 340 to 400 mm, of 250 of 256 projector pixels (97.7%)"
     assert words["parallax"].endswith("by 0 rows and 1.41 columns of its pixels")
     said = json.loads(json.dumps(seen.summary()))
-    assert said["depths_mm"] == [340, 400] and said["parallax_pixels"] == [0, 1.41] and said["seen_pixels"] == 250
+    assert (
+        said["depths_mm"] == [340, 400]
+        and said["parallax_pixels"] == pytest.approx([0, 24 / 17])
+        and said["seen_pixels"] == 250
+    )
     assert [each["name"] for each in said["surfaces"]] == ["tower", "sheet", "lamp"]
+    flat = replace(seen, layout=replace(seen.layout, depths=(400.0, 400.0)))
+    assert flat.facts["light is seen"].startswith("at 400 mm, ")
+    assert flat.facts["parallax"].startswith("none; 4 mm nearer the window moves by 0 rows and 0.0808 columns")
     far = replace(seen, layout=replace(seen.layout, projector=np.array([-5.0, 20, -30])))
     assert far.facts["projector"] == "5 mm right of, 20 mm above, 30 mm behind the camera's sensor"
     dark = replace(seen, layout=replace(seen.layout, depths=None, seen=0, trouble="no light"))
