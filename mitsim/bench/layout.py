@@ -323,7 +323,7 @@ def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
     first, second = (
         Preview(
             _picture(bench.loaded.scene, world @ place, angle),
-            np.linalg.inv(place),
+            np.asarray(np.linalg.inv(place), dtype=np.float64),
             float(np.tan(np.radians(angle / 2))),
         )
         for place, angle in ((np.eye(4), bench.geometry.fov), (aside, wide))

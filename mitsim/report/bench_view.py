@@ -34,7 +34,7 @@ _DPI = 110
 """Of the drawing: 1430 pixels wide."""
 _SMALL = 8.5
 """Points of words in a drawing."""
-_PLAN_INCHES, _SQUARE_INCHES = (4.4, 2.9), (3.6, 3.6)
+_PLAN_INCHES, _SQUARE_INCHES = (4.4, 2.4), (3.6, 3.6)
 """Of a page's pictures: narrower than 500 pixels, so that a telephone shows them whole."""
 _FEW = 60_000
 """Triangles up to which a shape is filled in the drawing, in a second; of more its corners are dots."""
@@ -154,7 +154,8 @@ class BenchView:
             return "nowhere" if layout.trouble else "in mirrors alone"
         near, far = layout.depths
         where = f"at {near:.4g} mm" if far - near < _FLAT * far else f"from {near:.4g} to {far:.4g} mm"
-        return f"{where}, of {layout.seen} of {every} projector pixels ({layout.seen / every:.1%})"
+        more = "; mirrors may show more" if self.bench.loaded.mirrors and layout.seen < every else ""
+        return f"{where}, of {layout.seen} of {every} projector pixels ({layout.seen / every:.1%}){more}"
 
     @property
     def _parallax_words(self) -> str:
@@ -259,9 +260,9 @@ class BenchView:
             _measure(axes, (gap, 0), (gap, place[axis]), f"{abs(place[axis]):.4g} mm", upright=True)
         for name, at, color in names:
             axes.text(at[2] - 1.6 * gap, at[axis], name, color=color, ha="right", va="center", fontsize=_SMALL)
-        at = 0.45 * stop.scene_distance
+        z = 0.45 * stop.scene_distance
         words = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": _SMALL}
-        axes.annotate(f"field stop, {stop.fov:g}°", (at, -stop.tan_half_fov * at), color=BLUE, **words)
+        axes.annotate(f"field stop, {stop.fov:g}°", (z, -stop.tan_half_fov * z), color=BLUE, **words)
 
     def _has_room(self, points: FloatArray) -> bool:
         """Whether some of a box around ``points`` (k, 3) is in the plans: what is not would hide what is."""
@@ -386,7 +387,7 @@ class BenchView:
             scene={
                 **{name: {"title": {"text": title}} for name, title in titles.items()},
                 "aspectmode": "data",
-                "camera": {"eye": {"x": -1.7, "y": -1.1, "z": 0.9}},
+                "camera": {"eye": {"x": -1.9, "y": -1.3, "z": 1.0}},
             },
             legend={"orientation": "h", "y": 0, "yanchor": "top"},
             margin={"l": 0, "r": 0, "t": 0, "b": 0},

@@ -65,8 +65,9 @@ def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: p
     """Without its previews, which unit/bench/test_layout.py renders."""
     blank = Preview(np.ones((4, 4, 1)), np.eye(4), 0.2)
     monkeypatch.setattr(bench_view, "previews", lambda *_: (blank, blank))
+    devices = lab.scene, "--camera", lab.camera, "--projector", lab.projector
     options = "--json", "--quiet", "--variant", "llvm_ad_mono"
-    found = call("view", lab.scene, *lab.electronics, "-o", tmp_path / "bench.png", *options).payload
+    found = call("view", *devices, "-o", tmp_path / "bench.png", *options).payload
     assert found.keys() == {
         *(
             "scene",
@@ -85,7 +86,7 @@ def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: p
         *("name", "lamp", "low_mm", "high_mm")
     }
     assert [path.name for path in tmp_path.iterdir()] == ["bench.png"]
-    text = call("view", lab.scene, *lab.electronics, "--quiet", cwd=tmp_path).out
+    text = call("view", *devices, "--quiet", cwd=tmp_path).out
     assert text.endswith("Drawn: view.png\n") and "parallax: " in text and (tmp_path / "view.png").is_file()
 
 
