@@ -38,8 +38,7 @@ def layout(path: Path) -> Layout:
 def test_devices_and_light_stand_where_the_scene_says(small_scene: Callable[..., Path], pose: str) -> None:
     """A projector 60 mm beside the camera lights 120 mm at 400 mm by 16 pixels, in the camera's frame wherever that is;
     a card at 350 mm hides some of the sheet. Between both depths a pixel's light moves by 60 (1/350 - 1/400) in
-    tangents, of which a pixel has 120 / 16 / 400. (Planted: the camera's turn left out; the card's depth for the
-    sheet's; pixels counted by samples that bring nothing.)"""
+    tangents, of which a pixel has 120 / 16 / 400. (Planted: the camera's turn left out.)"""
     found = layout(small_scene(pose=pose, extra=NEAR.format(pose=pose)))
     assert_allclose(found.projector, [60, 0, 0], atol=1e-3)
     assert_allclose(np.ptp(found.window, axis=0), [120, 120, 0], atol=2e-3)
@@ -64,7 +63,7 @@ def test_light_that_is_seen_is_counted(small_scene: Callable[..., Path]) -> None
 
 def test_shapes_without_triangles_have_their_outlines(small_scene: Callable[..., Path]) -> None:
     """By rays from six sides, also of an instance, whose parts Mitsuba tells nobody. (Planted: rays from one side;
-    corners of neighbouring rays joined over the gap between sphere and cube; another shape's points taken.)"""
+    corners of neighbouring rays joined over the gap between sphere and cube.)"""
     surfaces = {surface.name: surface for surface in layout(small_scene(extra=SHAPES)).surfaces}
     assert [*surfaces] == ["rectangle 1", "instance 2", "ball", "disk 4"]
     ball = surfaces["ball"]
@@ -83,7 +82,7 @@ def test_shapes_without_triangles_have_their_outlines(small_scene: Callable[...,
 
 
 def test_a_print_is_seen_on_its_surface(small_scene: Callable[..., Path]) -> None:
-    """A sheet whose upper left quarter is white, for one who looks along +z: +x is left, +y up. (Planted: x for -x.)"""
+    """A sheet whose upper left quarter is white, for one who looks along +z: +x is left, +y up."""
     reflectance = np.full((16, 16), 51)
     reflectance[:8, :8] = 255
     (sheet,) = layout(small_scene(reflectance=reflectance)).surfaces
@@ -97,7 +96,7 @@ def test_a_preview_shows_what_the_camera_sees(
     small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The white quarter at the upper left of what is seen from the sensor's place, and from the free place where its
-    corners are projected to. (Planted: rows upside down; the free place's picture mirrored.)"""
+    corners are projected to."""
     monkeypatch.setattr(module, "_PIXELS", 64)
     reflectance = np.full((16, 16), 51)
     reflectance[:8, :8] = 255
@@ -114,7 +113,7 @@ def test_a_preview_shows_what_the_camera_sees(
 
 @pytest.mark.slow
 def test_a_bench_without_light_can_be_seen(small_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the preview's own lamp. (Planted: the picture divided by a white of 0.)"""
+    """By the preview's own lamp."""
     monkeypatch.setattr(module, "_PIXELS", 64)
     bench = open_bench(small_scene(projector_turn='<rotate y="1" angle="3"/>', sheet_z=300), albedo=0.5)
     picture = previews(bench, layout_of(bench))[0].picture
