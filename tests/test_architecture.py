@@ -35,8 +35,8 @@ FLOORS = (
     "planner",
     "acquire",
     "calibrate",
-    "api",
     "report",
+    "api",
     "learn",
     "studies",
     "exchange",
@@ -333,6 +333,9 @@ WITHOUT_NUMPY = (
     "plan photograph --colour bands:2 --seconds 5",
     "demo -o full",
     "demo -o r --camera endless.toml",
+    "view photograph -o x.jpg",
+    "view photograph -o none/x.png",
+    "view photograph -D nosuch=1",
     "render photograph -o x.exr --estimator fast",
     "render photograph -o x.exr --spp 0",
     "transport photograph -o x.txt",
@@ -553,7 +556,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 264, 50_700
+MOST_FILES, MOST_LINES_OF_CODE = 267, 52_000
 """What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
 so here. A new file or line is one more that the next reader has to know."""
 LONG = 450

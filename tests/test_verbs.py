@@ -27,6 +27,7 @@ from tests.exchanged import made
 
 CALLS = {
     "demo": ["demo"],
+    "view": ["Bench.view"],
     "plan": ["Bench.plan", "Bench.choose_colour", "Plan.save"],
     "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.load", "Light.expose"],
     "calibrate": ["Bench.calibrate", "Bench.calibrate_lines", "Bench.calibrate_mosaic", "Bench.calibrate_depths",
@@ -34,6 +35,7 @@ CALLS = {
     "reconstruct": ["reconstruct", "reconstruct_colours", "reconstruct_psf", "Reconstruction.save"],
     "render": ["Bench.render", "Rendered.save"],
     "study": ["study"],
+    "report": ["report_folder"],
     "pairs": ["make_pairs"],
     "train": ["train"],
     "export": ["export"],

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mitsim.devices.session import BoardShape, SessionRecipe
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
+    from mitsim.report.bench_view import BenchView
 
 
 # ---- Opening a bench ----
@@ -431,7 +432,14 @@ class Bench(Apparatus):
 
         return write_session(self, frames, SessionRequest(seed, accuracy, recipe), Task.of(output, job=job))
 
-    # ---- Renderings, and the same devices before a board ----
+    # ---- The bench to look at, renderings, and the same devices before a board ----
+
+    def view(self) -> BenchView:
+        """A drawing of the bench to scale, with its distances and what the camera sees of it, before any light is
+        simulated: it shows itself in a notebook, and is saved to a picture or to a page on which it can be turned."""
+        from mitsim.report.bench_view import view
+
+        return view(self)
 
     @check_arguments
     def render(

@@ -39,6 +39,8 @@ PSNR_DB = 1.0, 100.0
 """PSNR that may be asked of an image: below, its error is its whole range; above, the truth is not known."""
 REFERENCE, FACTORED = ESTIMATORS = ("reference", "factored")
 """Of the expected irradiance."""
+VIEWS = (".png", ".html")
+"""Endings of files that a bench is drawn in: a picture, and a page."""
 FEWEST_PASSES = 4
 """Passes of the reference are compared to tell the noise; four tell it to 40 %."""
 MOST_SAMPLES = 2**20
@@ -305,6 +307,13 @@ def check_f_number(f_number: float) -> None:
     """ArgumentError for an ``f_number`` that no lens has."""
     if not 0.5 <= f_number < math.inf:
         raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
+
+
+def check_view(path: Path | str) -> Path:
+    """The ``path`` of a bench's drawing; ArgumentError for one that is neither a picture nor a page."""
+    if Path(path).suffix.lower() not in VIEWS:
+        raise ArgumentError("output", f"{path}: give a name that ends in {' or '.join(VIEWS)}")
+    return Path(path)
 
 
 def check_ending(path: Path, sensor: SensorModel) -> None:

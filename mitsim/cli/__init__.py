@@ -59,6 +59,7 @@ from mitsim.cli.options import (
 from mitsim.cli.report_verb import finish_folder, finish_frame, report
 from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
 from mitsim.cli.study_verb import study
+from mitsim.cli.view_verb import view
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
@@ -505,6 +506,6 @@ def doctor(
 
 
 # In the order of the help.
-_SCENE = demo, plan, capture, calibrate, reconstruct, render, study
+_SCENE = demo, view, plan, capture, calibrate, reconstruct, render, study
 for _verb in (*_SCENE, report, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
     app.command(_verb.__name__.rstrip("_"))(_verb)

@@ -55,6 +55,8 @@ def test_a_name_that_no_file_can_have(refused: Refused, to: Callable[[str], tupl
 def test_no_input_is_replaced(refused: Refused, lab: Any, tmp_path: Path) -> None:
     """By verbs that replace files, with --overwrite or without. (Planted: each check left out.)"""
     frame = lab.copy("run", tmp_path / "run") / "frame_00000.exr"
+    picture = lab.scene.with_name(f"{lab.scene.stem}_projector.png")
+    mentions(refused("view", lab.scene, "--camera", lab.camera, "-o", picture), str(picture), "is read")
     mentions(refused("sense", frame, "--camera", lab.camera, "--channel", "DN", "-o", frame), str(frame), "is read")
     link = tmp_path / "link.exr"
     link.symlink_to(frame)

@@ -14,6 +14,7 @@ from tests.system.refusals import NEW, Refused, mentions
 @pytest.mark.parametrize(
     "verb",
     [
+        ("view", "-o", "new.png"),
         ("plan",),
         ("capture", *NEW, "--patterns", "dots:4"),
         ("calibrate", *NEW),

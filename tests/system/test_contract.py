@@ -19,12 +19,26 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.bench.layout import Preview
+from mitsim.report import bench_view
 from mitsim.studies import accuracy_study as accuracy
 from mitsim.studies import solver_study
 from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
-    *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "characterise", "sense"),
+    *(
+        "demo",
+        "view",
+        "plan",
+        "capture",
+        "calibrate",
+        "reconstruct",
+        "render",
+        "study",
+        "report",
+        "characterise",
+        "sense",
+    ),
     *("export", "import", "patterns", "transport", "doctor", "pairs", "train"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
@@ -45,6 +59,35 @@ def assert_seconds(seconds: dict[str, object], *stages: str) -> None:
 
 
 # ---- keys and types --------------------------------------------------------------------------------------------------
+
+
+def test_view(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its previews, which unit/bench/test_layout.py renders."""
+    blank = Preview(np.ones((4, 4, 1)), np.eye(4), 0.2)
+    monkeypatch.setattr(bench_view, "previews", lambda *_: (blank, blank))
+    devices = lab.scene, "--camera", lab.camera, "--projector", lab.projector
+    options = "--json", "--quiet", "--variant", "llvm_ad_mono"
+    found = call("view", *devices, "-o", tmp_path / "bench.png", *options).payload
+    assert found.keys() == {
+        *(
+            "scene",
+            "projector_mm",
+            "scene_distance_mm",
+            "window_mm",
+            "projector_pixels",
+            "keystone_pixels",
+            "depths_mm",
+        ),
+        *("seen_pixels", "parallax_pixels", "field_stop_deg", "field_stop_cuts", "sensor_pixels", "sensor_mm"),
+        *("mask_distance_mm", "surfaces", "warnings", "output"),
+    }
+    assert found["projector_mm"] == pytest.approx([60, 0, 0], abs=1e-3) and found["projector_pixels"] == 16
+    assert found["output"] == str(tmp_path / "bench.png") and found["surfaces"][0].keys() == {
+        *("name", "lamp", "low_mm", "high_mm")
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["bench.png"]
+    text = call("view", *devices, "--quiet", cwd=tmp_path).out
+    assert text.endswith("Drawn: view.png\n") and "parallax: " in text and (tmp_path / "view.png").is_file()
 
 
 def test_plan(call: Callable[..., Any], lab: Any) -> None:

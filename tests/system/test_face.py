@@ -372,6 +372,8 @@ TYPOS = (
     (["calibrate", "nosuchscene", "-o", "cal"], "nosuchscene"),
     (["calibrate", "photograph", "-o", "cal", "--accuracy", "5"], "--accuracy 5"),
     (["calibrate", "photograph", "-o", "cal", "--recipe", "nosuch.toml"], "nosuch.toml"),
+    (["view", "photograph", "-o", "bench.svg"], "ends in .png or .html"),
+    (["view", "photogaph"], "did you mean photograph?"),
     (["render", "photograph", "-o", "frame.png"], "frame.png"),
     (["render", "nosuchscene", "-o", "frame.exr"], "nosuchscene"),
     (["reconstruct", "nosuchrun", "--calibration", "cal", "--lambda", "small"], "--lambda 'small'"),

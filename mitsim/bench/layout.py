@@ -1,0 +1,366 @@
+"""A bench in; where its devices and surfaces stand before the camera, and two pictures of it in its own light, out.
+
+Places are in the camera's frame [mm]: +z to the scene, +y up, +x to the left of who looks along +z.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.board import camera_place
+from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import keep_scenes
+from mitsim.reconstruct.focus import pixels_of_parallax
+from mitsim.scene.darkness import why_dark
+from mitsim.transport.direct import DirectTracer
+from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
+from mitsim.transport.projector import PinholeRays
+
+_TRIANGLES = 24_000
+"""Triangles of all meshes that have fewer: a print on a square sheet then has 110 x 110 samples, and all are drawn in a
+second."""
+_RAYS = 48
+"""Rays a side, from each of six sides, that meet a shape without triangles: its outline is 1/48 of its box fine."""
+_JUMP = 3.0
+"""Cells by which neighbouring rays may end apart on one surface: 1.4 on a sphere, where another side sees it better."""
+_EDGE_ON, _PASSED = 1e-6, 8
+"""Part of a shape's size below which it has no width, and surfaces of others that stand inside its box at most."""
+_FILL = 0.2
+"""Part of a preview's light that is of a lamp at its camera: chosen so that what is beside the window is seen."""
+_PIXELS, _SAMPLES, _TURNS = 320, 32, 4
+"""Pixels a side of a preview, samples a pixel and surfaces of a path: a second or two; noise that eyes do not mind."""
+_WHITE = 99.5
+"""Percentile that a preview shows as white: mirrored light may be a thousand times as bright."""
+_ASIDE = (0.6, 0.55, -0.75)
+"""Direction from the projector's window to the free place: left, above and before it, so that fronts are seen."""
+_MARGIN = 1.5
+"""How much wider than the window the view from there is; chosen: what stands around it is seen too."""
+_EDGES = 2
+"""Rays a side of a pixel that show its surfaces: edges are smooth."""
+_NEAR, _FAR = 1e-3, 1e7
+"""Where the view of a preview begins and ends [mm]: scenes are of millimetres to kilometres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A shape of the scene as triangles.
+
+    Attributes
+    ----------
+    name
+        as the scene calls it, or its kind.
+    points
+        (k, 3) corners [mm].
+    triangles
+        (m, 3) numbers of corners.
+    reflectance
+        (k, channels) diffuse reflectance at the corners, 0 to 1; a half where it is not known.
+    is_lamp
+        whether it shines.
+    """
+
+    name: str
+    points: FloatArray
+    triangles: npt.NDArray[np.int64]
+    reflectance: FloatArray
+    is_lamp: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where all of a bench stands.
+
+    Attributes
+    ----------
+    surfaces
+        shapes of the scene.
+    projector
+        (3,) place of the projector's pinhole.
+    window
+        (4, 3) corners of the projector's window on the aligned plane, one after the other around it.
+    lamps
+        (3,) places of lamps without a surface, by name.
+    seen
+        projector pixels whose light the camera's middle sees at once, of n x n.
+    depths
+        nearest and farthest depth [mm] that this light is seen at; None where there is none.
+    moves
+        rows and columns of projector pixels by which a change of 1/z by 1/mm moves the window.
+    trouble
+        why none of the projector's light is seen; None where some is.
+    """
+
+    surfaces: tuple[Surface, ...]
+    projector: FloatArray
+    window: FloatArray
+    lamps: dict[str, FloatArray]
+    seen: int
+    depths: tuple[float, float] | None
+    moves: tuple[float, float]
+    trouble: str | None
+
+    @property
+    def parallax(self) -> tuple[float, float]:
+        """Rows and columns of projector pixels by which the window moves between the nearest and farthest light."""
+        return (0.0, 0.0) if self.depths is None else self.parallax_between(*self.depths)
+
+    def parallax_between(self, near: float, far: float) -> tuple[float, float]:
+        """The same between any two depths [mm], the nearer one and the farther one."""
+        step = 1 / near - 1 / far
+        return self.moves[0] * step, self.moves[1] * step
+
+    def window_at(self, depth: float) -> FloatArray:
+        """(4, 3) corners of the window on the plane at ``depth`` [mm]."""
+        rays = self.window - self.projector
+        return np.asarray(self.projector + rays * ((depth - self.projector[2]) / rays[:, 2])[:, None])
+
+
+@keep_scenes()
+def layout_of(bench: Apparatus) -> Layout:
+    """Where all of a ``bench`` stands, and where the camera sees the projector's light: one ray a projector pixel."""
+    loaded, geometry, n = bench.loaded, bench.geometry, bench.n
+    turn, origin = camera_place(bench)
+    rays = PinholeRays(bench.projector_optics, [None])
+    projector = (rays.origin - origin) @ turn
+    ends = rays.directions(np.array([[0, 0], [0, n], [n, n], [n, 0]], dtype=np.float64)) @ turn
+    window = projector + ends * ((geometry.scene_distance - projector[2]) / ends[:, 2])[:, None]
+    light = DirectTracer(bench.setup, 1).trace(0, 0, 1)
+    lit = light.value > 0
+    seen, trouble = len(np.unique(light.pixel[lit])), None
+    depths = (1 / float(light.inverse_depth[lit].max()), 1 / float(light.inverse_depth[lit].min())) if seen else None
+    if not seen and not loaded.mirrors:
+        trouble = f"no light of the projector reaches the camera: {why_dark(loaded)}"
+    row, column = (max(map(abs, pixels_of_parallax(bench.parallax, axis, n)[:2])) for axis in (0, 1))
+    lamps = {}
+    for emitter, tag in loaded.small_lamps:
+        held, name = mi.traverse(emitter), tag.attributes.get("id") or tag.attributes.get("type", "lamp")
+        if "position" in held:
+            place = np.array(held["position"], dtype=np.float64).ravel()
+        elif "to_world" in held and emitter.class_name() != "DirectionalEmitter":
+            place = turn_and_origin(held["to_world"])[1]
+        else:
+            continue
+        lamps[f"{name}, line {tag.line}"] = (place - origin) @ turn
+    return Layout(_surfaces(bench, turn, origin), projector, window, lamps, seen, depths, (row, column), trouble)
+
+
+# -------- Surfaces as triangles
+
+
+def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
+    """All shapes of a scene, in the frame of a camera of that ``turn`` and ``origin``."""
+    shapes, tags, found = bench.loaded.scene.shapes(), bench.loaded.shapes, []
+    area = sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in shapes if shape.is_mesh())
+    for number, shape in enumerate(shapes):
+        name = shape.id()
+        if not name or name.startswith("_"):
+            kind = tags[number].attributes.get("type", "shape") if tags else shape.class_name().lower()
+            name = f"{kind} {number + 1}"
+        points, triangles, reflectance = (
+            _of_mesh(shape, area) if shape.is_mesh() else _of_rays(bench.loaded.scene, shape)
+        )
+        if len(triangles):
+            found.append(Surface(name, (points - origin) @ turn, triangles, reflectance, bool(shape.is_emitter())))
+    return tuple(found)
+
+
+_Triangles = tuple[FloatArray, npt.NDArray[np.int64], FloatArray]
+
+
+def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
+    """World points, triangles and reflectances of a mesh, whose triangles are parted where all, of so much ``area``,
+    are few."""
+    count = mesh.face_count()
+    corners = mesh.face_indices(dr.arange(mi.UInt32, count))
+    own = float(np.array(mesh.surface_area()).ravel()[0])
+    parts = int(np.sqrt(_TRIANGLES * own / max(area, 1e-30) / count)) if count else 1
+    places = np.stack([vectors(mesh.vertex_position(corner), count) for corner in corners], axis=1)
+    uv = np.zeros((count, 3, 2))
+    if mesh.has_vertex_texcoords():
+        held = [mesh.vertex_texcoord(corner) for corner in corners]
+        uv = np.stack([np.stack([np.array(each.x), np.array(each.y)], axis=1) for each in held], axis=1)
+    weights, cells = _parted(max(parts, 1))
+    points = np.einsum("wc,tcx->twx", weights, places).reshape(-1, 3)
+    on_print = np.einsum("wc,tcx->twx", weights, uv).reshape(-1, 2)
+    triangles = (np.arange(count)[:, None, None] * len(weights) + cells).reshape(-1, 3)
+    at = dr.zeros(mi.SurfaceInteraction3f, len(points))
+    at.p, at.wi = mi.Point3f(*device_vectors(points)), mi.Vector3f(0, 0, 1)
+    at.uv = mi.Point2f(*(mi.Float(np.ascontiguousarray(axis, dtype=np.float32)) for axis in on_print.T))
+    return points, triangles, _reflectance(mesh.bsdf(), at, len(points))
+
+
+def _parted(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Barycentric weights (k, 3) of a triangle's points where each of its edges has so many ``parts``, and its smaller
+    triangles (parts^2, 3)."""
+    place = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]
+    number = {at: index for index, at in enumerate(place)}
+    weights = np.array([(parts - i - j, i, j) for i, j in place]) / parts
+    up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in place if i + j < parts]
+    down = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in place if i + j + 1 < parts]
+    return weights, np.array(up + down, dtype=np.int64)
+
+
+def _of_rays(scene: mi.Scene, shape: mi.Shape) -> _Triangles:
+    """The same of a ``shape`` of a ``scene`` without triangles, of what parallel rays from six sides meet of it."""
+    box = shape.bbox()
+    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    size, sides = high - low, np.float64(np.linalg.norm(high - low))
+    cells, corner = (np.arange(_RAYS) + 0.5) / _RAYS, (np.arange(_RAYS - 1)[:, None] * _RAYS + np.arange(_RAYS - 1))
+    a = corner.ravel()
+    squares = np.concatenate([np.stack([a, a + 1, a + _RAYS], 1), np.stack([a + 1, a + _RAYS + 1, a + _RAYS], 1)])
+    found: list[_Triangles] = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 1)))]
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
+        across = [other for other in range(3) if other != axis]
+        if size[across].min() < _EDGE_ON * sides:
+            continue
+        start, along = np.empty((_RAYS * _RAYS, 3)), np.zeros((_RAYS * _RAYS, 3))
+        grid = np.meshgrid(*(low[other] + size[other] * cells for other in across), indexing="ij")
+        start[:, across], along[:, axis] = np.stack([each.ravel() for each in grid], axis=1), sign
+        start[:, axis] = (low if sign > 0 else high)[axis] - sign * _EDGE_ON * sides
+        ray = mi.Ray3f(mi.Point3f(*device_vectors(start)), mi.Vector3f(*device_vectors(along)))
+        met = _meet(scene, ray, shape)
+        valid = host_values(met.is_valid(), len(start))
+        places = np.where(valid[:, None], vectors(met.p, len(start)), np.nan)
+        # NaN where a ray met nothing, which compares as false.
+        joined = squares[np.ptp(places[squares][..., axis], axis=1) < _JUMP * size[across].max() / _RAYS]
+        before = sum(len(points) for points, _, _ in found)
+        found.append((np.nan_to_num(places), joined + before, _reflectance(met.bsdf(ray), met, len(start))))
+    points, triangles, reflectance = (np.concatenate(part) for part in zip(*(found[1:] or found), strict=True))
+    used, triangles = np.unique(triangles, return_inverse=True)
+    return points[used], triangles.reshape(-1, 3), reflectance[used]
+
+
+def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteraction3f:
+    """What rays meet of a ``shape``, behind what stands before it."""
+    own = mi.ShapePtr(shape)
+    met = scene.ray_intersect(ray)
+    for _ in range(_PASSED):
+        other = met.is_valid() & (met.shape != own) & (met.instance != own)
+        if not dr.any(other):
+            break
+        ray = mi.Ray3f(dr.select(other, met.spawn_ray(ray.d).o, ray.o), ray.d)
+        met = scene.ray_intersect(ray)
+    return dr.select((met.shape == own) | (met.instance == own), met, dr.zeros(mi.SurfaceInteraction3f))
+
+
+def _reflectance(bsdf: Any, at: mi.SurfaceInteraction3f, count: int) -> FloatArray:
+    """(count, channels) diffuse reflectance of a ``bsdf`` at some points, 0 to 1."""
+    try:
+        values = channels(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(at)), count)
+    except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
+        return np.full((count, 1), 0.5)
+    if values.shape[1] != 3:
+        values = values.mean(axis=1, keepdims=True)
+    return np.clip(np.nan_to_num(values, nan=0.5), 0, 1)
+
+
+# -------- Pictures of the bench in its own light
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """What a pinhole camera sees of a bench.
+
+    Attributes
+    ----------
+    picture
+        (rows, columns, 1 or 3) linear light, 0 black, 1 white, as where there is nothing.
+    place
+        (4, 4) from the bench's frame to this camera's, where it looks along +z, +x to the left.
+    half_tan
+        tangent of half the angle of its view.
+    """
+
+    picture: FloatArray
+    place: FloatArray
+    half_tan: float
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """(k, 2) where ``points`` (k, 3) [mm] of the bench are in the picture: columns, rows; NaN behind the camera."""
+        local = points @ self.place[:3, :3].T + self.place[:3, 3]
+        rows, columns = self.picture.shape[:2]
+        ahead = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
+        part = 0.5 - local[:, :2] / ahead / (2 * self.half_tan)
+        return np.asarray(part * [columns, rows] - 0.5)
+
+
+@keep_scenes()
+def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
+    """What is seen from the sensor's place, through the field stop, and from a free place.
+
+    The projector is lit white, and a weak lamp at the camera's own place shows what that does not light.
+
+    Parameters
+    ----------
+    bench, layout
+        what is seen, and where it stands.
+    """
+    turn, origin = camera_place(bench)
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = turn, origin
+    middle, aside = layout.window.mean(axis=0), np.eye(4)
+    aside[:3, 3] = middle + np.array(_ASIDE) / np.linalg.norm(_ASIDE) * bench.geometry.scene_distance
+    ahead = middle - aside[:3, 3]
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross([0.0, 1.0, 0.0], ahead)
+    left /= np.linalg.norm(left)
+    aside[:3, :3] = np.stack([left, np.cross(ahead, left), ahead], axis=1)
+    lit = (
+        layout.window
+        if layout.depths is None
+        else np.concatenate([layout.window, *map(layout.window_at, layout.depths)])
+    )
+    local = (lit - aside[:3, 3]) @ aside[:3, :3]
+    wide = 2 * float(np.degrees(np.arctan(_MARGIN * np.abs(local[:, :2] / local[:, 2:]).max())))
+    first, second = (
+        Preview(
+            _picture(bench.loaded.scene, world @ place, angle),
+            np.asarray(np.linalg.inv(place), dtype=np.float64),
+            float(np.tan(np.radians(angle / 2))),
+        )
+        for place, angle in ((np.eye(4), bench.geometry.fov), (aside, wide))
+    )
+    return first, second
+
+
+def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
+    """(rows, columns, 1 or 3) picture of a ``scene`` from a ``place`` (4, 4) under a full ``angle`` [degrees]."""
+    kind = "luminance" if mi.is_monochromatic else "rgb"
+    film = {"type": "hdrfilm", "width": _PIXELS, "height": _PIXELS, "pixel_format": kind, "rfilter": {"type": "box"}}
+    pose = mi.ScalarAffineTransform4f(place.tolist())
+    lens = {"type": "perspective", "fov": angle, "near_clip": _NEAR, "far_clip": _FAR, "to_world": pose}
+    sensor = mi.load_dict({**lens, "film": {**film, "sample_border": False}})
+    integrator = mi.load_dict({"type": "path", "max_depth": _TURNS, "hide_emitters": True})
+    light = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=0), dtype=np.float64)
+    light = np.nan_to_num(light.reshape(_PIXELS, _PIXELS, -1))
+    by_lamp, empty = _by_own_lamp(scene, sensor)
+    white = float(np.percentile(light[light > 0], _WHITE)) if light.any() else 1.0
+    shown = np.clip(light / white, 0, 1) * (1 - _FILL) + _FILL * by_lamp if light.any() else by_lamp
+    return np.asarray(shown * (1 - empty) + empty)
+
+
+def _by_own_lamp(scene: mi.Scene, sensor: mi.Sensor) -> tuple[FloatArray, FloatArray]:
+    """Light of surfaces by a lamp at a ``sensor``, reflectance times cosine, and the part of each pixel that shows
+    nothing; (rows, columns, 1 or 3) and (rows, columns, 1)."""
+    side = _PIXELS * _EDGES
+    column, row = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    place = mi.Point2f(*(mi.Float(axis.ravel().astype(np.float32)) for axis in (column, row)))
+    ray, _ = sensor.sample_ray_differential(0.0, 0.5, place, mi.Point2f(0.5))
+    met = scene.ray_intersect(ray)
+    hit = host_values(met.is_valid(), side * side).astype(float)[:, None]
+    cosine = np.abs(host_values(dr.dot(met.sh_frame.n, ray.d), side * side))[:, None]
+    light = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
+
+    def mean(values: FloatArray) -> FloatArray:
+        """Over each pixel's rays."""
+        return np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3)))
+
+    return mean(light), 1 - mean(hit)
