@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mitsim.cli.help_page import DEVICES, QUALITY, WHAT
 from mitsim.cli.options import (
     Common,
     ExposureFraction,
@@ -50,8 +51,10 @@ def method_names() -> str:
 class Solving:
     """How an image is solved for."""
 
+    PANEL = QUALITY
+
     lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
-    method: str = option(TIKHONOV, method_names())
+    method: str = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt")
     focus: str | None = option(
         None,
         "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
@@ -101,6 +104,8 @@ class Solving:
 class ColouredImage:
     """How an image in colour is made."""
 
+    PANEL = WHAT
+
     chart: str | None = option(
         None,
         "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
@@ -118,6 +123,8 @@ class ColouredImage:
 class OfPointSpread(ColouredImage):
     """Cameras that are known by a point spread function, and those in colour."""
 
+    PANEL = WHAT
+
     psf: Path | None = option(
         None,
         "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
@@ -132,17 +139,26 @@ def reconstruct(
     *,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
     calibration: Annotated[
-        Path | None, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL", show_default="required")
+        Path | None,
+        typer.Option(help="folder of `mitsim calibrate`; needed without --psf", metavar="CAL", rich_help_panel=WHAT),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
+        Path | None,
+        typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given", metavar="DIR"),
     ] = None,
     solving: Solving,
     camera: OfPointSpread,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     common: Common,
 ) -> int:
-    """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
+    """Recover the image from frames and a calibration alone.
+
+    Of coloured folders, an image of each line, and one in colour.
+
+    $ mitsim reconstruct run --calibration cal
+    $ mitsim reconstruct run --calibration cal --method markov -o smooth
+    $ mitsim reconstruct run --calibration cal --focus auto -o sharp
+    """
     from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
     from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
@@ -310,6 +326,8 @@ def _two_depths(text: str) -> tuple[float, float]:
 class Procedure:
     """How a camera is characterised."""
 
+    PANEL = WHAT
+
     pixels: int = option(256, "rows and columns of the frames")
     steps: int = option(50, "steps of light, from dark to beyond saturation")
     frames: str = option(
@@ -328,13 +346,19 @@ def characterise(
     camera: Annotated[
         str | None, typer.Argument(help="camera electronics: name or TOML file", metavar="[CAMERA]", show_default=False)
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml")] = Path(
-        "characterise-output"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml", metavar="DIR")
+    ] = Path("characterise-output"),
     asked: Procedure,
     common: Common,
 ) -> int:
-    """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames."""
+    """Measure a camera after EMVA 1288, simulated or real.
+
+    On simulated frames, beside what the camera's file sets, or on real frames (--frames DIR).
+
+    $ mitsim characterise imx249 -o figures
+    $ mitsim characterise --frames flats -o mine
+    """
     from mitsim.studies.framework.run import check_study_folder
 
     if camera is None:
@@ -382,7 +406,9 @@ def _characterise_frames(context: typer.Context, asked: Procedure, output: Path,
 class Exposed:
     """A camera and how long it is exposed."""
 
-    camera: str = option(..., "camera electronics: name or TOML file", metavar="NAME|FILE")
+    PANEL = WHAT
+
+    camera: str = option(..., "camera electronics: name or TOML file", metavar="NAME|FILE", rich_help_panel=DEVICES)
     exposure: str = option("auto", "seconds, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
     seed: Seed = 0
@@ -391,6 +417,8 @@ class Exposed:
 @dataclass(frozen=True)
 class Irradiance:
     """How an image's numbers are light on the sensor."""
+
+    PANEL = WHAT
 
     f_number: float | None = option(
         None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N"
@@ -409,7 +437,13 @@ def sense(
     irradiance: Irradiance,
     common: Common,
 ) -> int:
-    """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
+    """Put an image of any renderer behind a camera's sensor.
+
+    Out come digital numbers, with the sensor's noise.
+
+    $ mitsim sense frame.exr --camera imx249 -o frame.png
+    $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
+    """
     from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
     from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
