@@ -46,6 +46,7 @@ from mitsim.cli.options import (
     Seed,
     by_line,
     check_work,
+    complete_scene,
     given_of,
     in_colour,
     is_given,
@@ -58,6 +59,7 @@ from mitsim.cli.options import (
     verb,
 )
 from mitsim.cli.screen import finish, kernel_lines, payload_of_lines, print_plan, total_of_lines
+from mitsim.cli.shelf_verbs import list_, new
 from mitsim.cli.study_verb import study
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.spectral_manifests import LINES, MONO, RUN
@@ -170,7 +172,10 @@ class DemoRequest:
 def demo(
     *,
     scene: Annotated[
-        str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="[SCENE]")
+        str,
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene", metavar="[SCENE]", autocompletion=complete_scene
+        ),
     ] = "photograph",
     output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo", metavar="DIR")] = Path(
         "demo-output"
@@ -564,7 +569,7 @@ _VERBS = {
     "Studies": (study,),
     "Learning": (pairs, train),
     "Exchange": (export, import_, patterns, transport),
-    "Files and machine": (doctor,),
+    "Files and machine": (list_, new, doctor),
 }
 """Verbs by heading, in the order of the help."""
 for _panel, _verbs in _VERBS.items():

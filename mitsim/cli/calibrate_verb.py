@@ -25,6 +25,7 @@ from mitsim.cli.options import (
     Resume,
     Seed,
     check_work,
+    complete_scene,
     in_colour,
     is_given,
     option,
@@ -129,7 +130,11 @@ def calibrate(
     session: Session,
     scene: Annotated[
         str | None,
-        typer.Argument(help="scene XML, or the name of a shipped scene; none with --frames", metavar="[SCENE]"),
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene; none with --frames",
+            metavar="[SCENE]",
+            autocompletion=complete_scene,
+        ),
     ] = None,
     planned: Planned,
     modelled: Modelled,

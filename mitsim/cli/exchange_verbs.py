@@ -20,6 +20,9 @@ from mitsim.cli.options import (
     Projector,
     Scene,
     Seed,
+    complete_camera,
+    complete_list,
+    complete_projector,
     is_given,
     option,
     pop_patterns,
@@ -81,10 +84,18 @@ class Frames:
     PANEL = WHAT
 
     list: str | None = option(
-        None, "of frames: list of what is known of them; options take its place", metavar="NAME|FILE"
+        None,
+        "of frames: list of what is known of them; options take its place",
+        metavar="NAME|FILE",
+        autocompletion=complete_list,
     )
     patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: str | None = option(None, "of frames: camera electronics, name or TOML file", metavar="NAME|FILE")
+    camera: str | None = option(
+        None,
+        "of frames: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_camera,
+    )
     exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
     calibration: Path | None = option(
         None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
@@ -222,7 +233,12 @@ class Screen:
 
     PANEL = DEVICES
 
-    projector: str = option("mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE")
+    projector: str = option(
+        "mp_cl1",
+        "projector of known rows and columns: name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_projector,
+    )
     projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=4096, metavar="N")
 
 
@@ -232,7 +248,12 @@ class Stripes:
 
     PANEL = DEVICES
 
-    camera: str | None = option(None, "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE")
+    camera: str | None = option(
+        None,
+        "of stripes: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_camera,
+    )
     exposure: float | None = option(None, "of stripes: seconds of each frame", metavar="SECONDS")
     signed_capture: str = option(
         "pair", "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"

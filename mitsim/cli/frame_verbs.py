@@ -14,6 +14,8 @@ from mitsim.cli.options import (
     Common,
     ExposureFraction,
     Seed,
+    complete_camera,
+    completing,
     is_given,
     number_of,
     option,
@@ -54,7 +56,7 @@ class Solving:
     PANEL = QUALITY
 
     lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
-    method: str = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt")
+    method: str = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", autocompletion=completing(lambda: METHODS))
     focus: str | None = option(
         None,
         "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
@@ -344,7 +346,13 @@ def characterise(
     *,
     context: typer.Context,
     camera: Annotated[
-        str | None, typer.Argument(help="camera electronics: name or TOML file", metavar="[CAMERA]", show_default=False)
+        str | None,
+        typer.Argument(
+            help="camera electronics: name or TOML file",
+            metavar="[CAMERA]",
+            show_default=False,
+            autocompletion=complete_camera,
+        ),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml", metavar="DIR")
@@ -408,7 +416,13 @@ class Exposed:
 
     PANEL = WHAT
 
-    camera: str = option(..., "camera electronics: name or TOML file", metavar="NAME|FILE", rich_help_panel=DEVICES)
+    camera: str = option(
+        ...,
+        "camera electronics: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_camera,
+    )
     exposure: str = option("auto", "seconds, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
     seed: Seed = 0

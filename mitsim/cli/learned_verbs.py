@@ -21,6 +21,7 @@ from mitsim.cli.options import (
     Resume,
     Scene,
     Seed,
+    completing,
     number_of,
     option,
     refuse_unused,
@@ -140,7 +141,14 @@ class Schedule:
 @verb
 def train(
     *,
-    method: Annotated[str, typer.Argument(help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", metavar="METHOD")],
+    method: Annotated[
+        str,
+        typer.Argument(
+            help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}",
+            metavar="METHOD",
+            autocompletion=completing(lambda: METHODS),
+        ),
+    ],
     pairs: Annotated[Path, typer.Argument(help="folder of `mitsim pairs`", metavar="PAIRS")],
     output: Annotated[Path, typer.Option("-o", "--output", help="file to make", metavar="MODEL.pt")],
     calibration: Annotated[

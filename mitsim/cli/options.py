@@ -10,7 +10,7 @@ import copy
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, is_dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from typer.models import OptionInfo
 import mitsim
 from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, metavar_of
 from mitsim.cli.screen import showing_progress
+from mitsim.core.configuration import shipped
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Limits, running_seconds
@@ -49,7 +50,28 @@ _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_fi
 NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 """Words of --colour beside `lines` and `bands:K`."""
 
-Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
+CAMERA, PROJECTOR, SESSION, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
+"""Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
+known of frames."""
+
+
+def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """What a shell completes a word by: those of some ``names``, asked for when it does, that begin with it."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return complete
+
+
+complete_scene = completing(lambda: shipped("scenes", "scene.xml"))
+complete_camera, complete_projector, complete_list = (
+    completing(functools.partial(shipped, "calibration", ".toml", field)) for field in (CAMERA, PROJECTOR, LIST)
+)
+Scene = Annotated[
+    str,
+    typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE", autocompletion=complete_scene),
+]
 _SAMPLED: dict[str, Any] = {"rich_help_panel": QUALITY}
 Patterns = Annotated[str, typer.Option(help=pattern_names(), metavar="PATTERNS", rich_help_panel=WHAT)]
 Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames", **_SAMPLED)]
@@ -59,10 +81,21 @@ Effects = Annotated[
 ]
 Camera = Annotated[
     str | None,
-    typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE", rich_help_panel=DEVICES),
+    typer.Option(
+        help="camera electronics: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_camera,
+    ),
 ]
 Projector = Annotated[
-    str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE", rich_help_panel=DEVICES)
+    str | None,
+    typer.Option(
+        help="projector: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_projector,
+    ),
 ]
 ExposureFraction = Annotated[float, typer.Option(help="brightest pixel, as a part of full well", metavar="PART")]
 Resume = Annotated[

@@ -11,9 +11,10 @@ import typer
 
 import mitsim
 from mitsim.cli.help_page import LIMITS, OUTPUT, QUALITY, WHAT
-from mitsim.cli.options import Common, Devices, Patterns, Seed, option, refuse_unused, verb
+from mitsim.cli.options import Common, Devices, Patterns, Seed, complete_scene, completing, option, refuse_unused, verb
 from mitsim.cli.screen import finish
 from mitsim.core.errors import MitsimError
+from mitsim.studies import ALL, EXPERIMENTS, STUDIES
 
 if TYPE_CHECKING:
     from mitsim.devices.session import SessionRecipe
@@ -72,10 +73,21 @@ class Studied:
 def study(
     *,
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="of the study, or merge", metavar="NAME")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="of the study, all or merge; of one of your own its file, or its module with a dot",
+            metavar="NAME",
+            autocompletion=completing(lambda: (*EXPERIMENTS, *STUDIES, ALL, "merge")),
+        ),
+    ],
     scenes: Annotated[
         list[str] | None,
-        typer.Argument(help="scene XML, or the name of a shipped scene; of merge, folders", metavar="[SCENE]"),
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene; of merge, folders",
+            metavar="[SCENE]",
+            autocompletion=complete_scene,
+        ),
     ] = None,
     studied: Studied,
     devices: Devices,

@@ -105,7 +105,7 @@ def _is_number(value: Value) -> bool:
 EXPERIMENT = Experiment(
     "sweep",
     f"Sweep of {KNOBS}",
-    "What does it do to the image?",
+    "What do the swept values do to the image?",
     _points, measure_image, lambda results: (), _figures, _tables,
     about="Rendered frames with the sensor's noise, exposed at equal peak unless the exposure varies (the brightest "
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "

@@ -25,7 +25,7 @@ from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
     *("demo", "plan", "capture", "calibrate", "reconstruct", "render", "study", "characterise", "sense", "export"),
-    *("import", "patterns", "transport", "doctor", "pairs", "train"),
+    *("import", "patterns", "transport", "list", "new", "doctor", "pairs", "train"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 
