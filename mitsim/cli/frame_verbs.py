@@ -40,7 +40,7 @@ from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
 if TYPE_CHECKING:
     from mitsim.report.quality import Judged
 
-# ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
+# ---- images of frames ------------------------------------------------------------------------------------------------
 
 
 def method_names() -> str:

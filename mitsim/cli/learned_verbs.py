@@ -133,7 +133,7 @@ class Schedule:
     batch: int = option(Training.batch, "pairs a step")
     rate: float = option(Training.rate, "largest learning rate of the cycle")
     seed: Seed = 0
-    device: str = option(Training.device, "that torch works on", metavar="cpu|cuda", rich_help_panel=LIMITS)
+    device: str = option(Training.device, "that torch works on", metavar="NAME", rich_help_panel=LIMITS)
     feature_weight: float = option(Training.feature_weight, "of differences of features, beside the squared error")
     adversary_weight: float = option(Training.adversary_weight, "of what an adversary tells from truths, beside it")
 

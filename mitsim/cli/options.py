@@ -22,7 +22,7 @@ from typer.models import OptionInfo
 import mitsim
 from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, metavar_of
 from mitsim.cli.screen import showing_progress
-from mitsim.core.configuration import shipped
+from mitsim.core.configuration import shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Limits, running_seconds
@@ -64,9 +64,9 @@ def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
     return complete
 
 
-complete_scene = completing(lambda: shipped("scenes", "scene.xml"))
+complete_scene = completing(lambda: shipped_files("scenes", "scene.xml"))
 complete_camera, complete_projector, complete_list = (
-    completing(functools.partial(shipped, "calibration", ".toml", field)) for field in (CAMERA, PROJECTOR, LIST)
+    completing(functools.partial(shipped_files, "calibration", ".toml", field)) for field in (CAMERA, PROJECTOR, LIST)
 )
 Scene = Annotated[
     str,

@@ -17,7 +17,7 @@ import typer
 from mitsim.cli.help_page import WHAT
 from mitsim.cli.options import CAMERA, PROJECTOR, SESSION, Common, completing, refuse_unused, verb
 from mitsim.cli.screen import finish
-from mitsim.core.configuration import DEFAULT_CAMERA, load_model, opening_words, read_toml, shipped
+from mitsim.core.configuration import DEFAULT_CAMERA, load_model, opening_words, read_toml, shipped_files
 from mitsim.core.errors import MitsimError, near_name
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Entry:
 
 
 def _scenes() -> Iterator[Entry]:
-    for name, path in shipped("scenes", "scene.xml").items():
+    for name, path in shipped_files("scenes", "scene.xml").items():
         what, serves = opening_words(path)
         yield Entry(name, serves, what)
 
@@ -54,7 +54,7 @@ def _scenes() -> Iterator[Entry]:
 def _cameras() -> Iterator[Entry]:
     from mitsim.devices.sensor import load_sensor
 
-    for name, path in shipped("calibration", ".toml", CAMERA).items():
+    for name, path in shipped_files("calibration", ".toml", CAMERA).items():
         sensor = load_sensor(path)
         verbs = "capture, sense, characterise" if sensor.states_efficiency else "capture in colour, characterise"
         if not sensor.states_efficiency and sensor.mosaic is None:
@@ -63,7 +63,7 @@ def _cameras() -> Iterator[Entry]:
 
 
 def _projectors() -> Iterator[Entry]:
-    for name, path in shipped("calibration", ".toml", PROJECTOR).items():
+    for name, path in shipped_files("calibration", ".toml", PROJECTOR).items():
         yield Entry(name, opening_words(path)[1], read_toml(path)["name"])
 
 
@@ -212,9 +212,9 @@ class _Starter:
     like: str = ""
     field: str = ""
 
-    def shipped(self) -> Mapping[str, Path]:
+    def files(self) -> Mapping[str, Path]:
         """Files that one may be like, by name."""
-        return shipped("calibration", ".toml", self.field) if self.field else shipped("scenes", "scene.xml")
+        return shipped_files("calibration", ".toml", self.field) if self.field else shipped_files("scenes", "scene.xml")
 
 
 def _camera(name: str, like: Path) -> Iterator[str]:
@@ -299,7 +299,9 @@ def new(
             metavar="NAME",
             show_default="imx249, mp_cl1, photograph, session",
             rich_help_panel=WHAT,
-            autocompletion=completing(lambda: (*shipped("scenes", "scene.xml"), *shipped("calibration", ".toml"))),
+            autocompletion=completing(
+                lambda: (*shipped_files("scenes", "scene.xml"), *shipped_files("calibration", ".toml"))
+            ),
         ),
     ] = None,
     common: Common,
@@ -326,7 +328,7 @@ def new(
     output = output or Path(f"{name}{ending}")
     if output.suffix != ending and ending:
         raise MitsimError(f"--output {output}: a {kind} is a file that ends in {ending}; give such a name")
-    known = begin.shipped() if begin.like else {"": Path()}
+    known = begin.files() if begin.like else {"": Path()}
     source = known.get(like or begin.like)
     if source is None:
         raise MitsimError(

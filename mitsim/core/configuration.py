@@ -41,7 +41,7 @@ class Configuration(pydantic.BaseModel):
 
 
 def shipped_path(*parts: str) -> Path:
-    """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
+    """A file or folder that comes with mitsim, for example ``shipped_path("calibration", "imx249.toml")`` of ``parts``.
 
     A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
     """
@@ -199,14 +199,14 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: st
         return known
     if path.exists():
         return path / ending if inside and path.is_dir() else path
-    names = shipped(shelf, ending)
+    names = shipped_files(shelf, ending)
     raise MitsimError(
         f"{name}: no such file, and none of that name is shipped; {near_name(text, names)}"
         f"shipped are {', '.join(names)}"
     )
 
 
-def shipped(shelf: Literal["scenes", "calibration"], ending: str, field: str = "") -> dict[str, Path]:
+def shipped_files(shelf: Literal["scenes", "calibration"], ending: str, field: str = "") -> dict[str, Path]:
     """Paths of shipped files by their names.
 
     Parameters
