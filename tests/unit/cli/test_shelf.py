@@ -213,7 +213,7 @@ def test_a_new_scene_and_camera_capture_their_first_frame(tmp_path: Path) -> Non
     ],
 )
 def test_a_shell_completes_names(line: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    """(Planted: cameras among projectors; names that do not begin with what is typed.)"""
+    """(Planted: cameras among projectors.)"""
     typed = line.split(" ")
     asked = {"_MITSIM_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(typed) - 1)}
     with patch.dict(os.environ, asked), pytest.raises(SystemExit) as ended:
