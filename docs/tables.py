@@ -2,18 +2,19 @@
 
     python docs/tables.py
 
-rewrites what stands between ``<!-- fields: NAME -->`` and ``<!-- end -->``. tests/unit/core/test_formats.py fails when
-the file differs from the models.
+rewrites what stands between ``<!-- fields: NAME -->`` and ``<!-- end -->``, and, as `mitsim list KIND` says it, between
+``<!-- list: KIND -->`` and the same. tests/unit/core/test_formats.py fails when a file differs from models or lists.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel
 
+from mitsim.cli.shelf_verbs import KINDS
+from mitsim.core.field_docs import allowed_text, default_text, meanings
 from mitsim.core.imagelist import Crop, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,
@@ -25,7 +26,6 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
-from mitsim.core.mistakes import meanings
 from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.chart import ChartPlace
@@ -41,7 +41,7 @@ from mitsim.learn.pair_store import PairsManifest, Shard
 from mitsim.learn.training_request import ModelManifest
 from mitsim.light.plan import PlanFile
 
-FORMATS = Path(__file__).with_name("formats.md")
+FORMATS, README = Path(__file__).with_name("formats.md"), Path(__file__).parents[1] / "README.md"
 MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
@@ -55,7 +55,6 @@ MODELS = (
     *(PairsManifest, Shard, Variation),
     ModelManifest,
 )
-_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
 
 
 def table(model: type[BaseModel]) -> str:
@@ -63,55 +62,39 @@ def table(model: type[BaseModel]) -> str:
     schema, known = model.model_json_schema(), meanings(model)
     lines = ["| field | allowed | default | meaning |", "|---|---|---|---|"]
     for name, rules in schema["properties"].items():
-        default = "required" if name in schema.get("required", ()) else _default(model.model_fields[name].default)
-        lines.append(f"| `{name}` | {_allowed(rules)} | {default} | {known[name]} |")
+        default = "required" if name in schema.get("required", ()) else default_text(model.model_fields[name].default)
+        lines.append(f"| `{name}` | {allowed_text(rules)} | {default} | {known[name]} |")
     return "\n".join(lines)
 
 
-def _default(value: Any) -> str:
-    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _allowed(rules: dict[str, Any]) -> str:
-    """What a field takes, from its JSON schema."""
-    if "anyOf" in rules:
-        return ", ".join("null" if choice.get("type") == "null" else _allowed(choice) for choice in rules["anyOf"])
-    if "const" in rules or "enum" in rules:
-        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
-    if "$ref" in rules or rules.get("type") == "object":
-        return "object"
-    if "prefixItems" in rules:
-        return f"list of {len(rules['prefixItems'])}: {_allowed(rules['prefixItems'][0])}"
-    if rules.get("type") == "array":
-        if "prefixItems" in rules:
-            return f"list of {len(rules['prefixItems'])}: {_allowed(rules['prefixItems'][0])}"
-        most = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
-        return f"list: {_allowed(rules['items'])}{most}"
-    if "pattern" in rules:
-        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
-        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
-    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
-    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
-    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
-    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
-    if start and end:
-        return start if start == end else f"{start} to {end}"
-    kind = _PLAIN.get(rules.get("type", ""), "anything")
-    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
+def list_table(kind: str) -> str:
+    """Markdown table of what `mitsim list` says of a ``kind``."""
+    entries = [*KINDS[kind]()]
+    two = any(each.what for each in entries)
+    rows = [f"| `{each.name}` |{f' {each.what} |' if two else ''} {each.serves} |" for each in entries]
+    return "\n".join(["| name | what | for |" if two else "| name | what |", "|---" * (2 + two) + "|", *rows])
 
 
 def rewritten(text: str) -> str:
-    """``text`` with every table between its marks as the models have it."""
+    """``text`` of formats.md with every table between its marks as the models have it, and its lists."""
     for model in MODELS:
-        start, end = f"<!-- fields: {model.__name__} -->\n", "\n<!-- end -->"
-        before, rest = text.split(start)
-        text = f"{before}{start}\n{table(model)}\n{end}{rest.split(end, 1)[1]}"
+        text = _between(f"fields: {model.__name__}", table(model), text)
+    return with_lists(text)
+
+
+def with_lists(text: str) -> str:
+    """The ``text`` of any page with the lists that it has marks for."""
+    for kind in re.findall("<!-- list: (\\w+) -->", text):
+        text = _between(f"list: {kind}", list_table(kind), text)
     return text
+
+
+def _between(mark: str, made: str, text: str) -> str:
+    start, end = f"<!-- {mark} -->\n", "<!-- end -->"
+    before, rest = text.split(start)
+    return f"{before}{start}\n{made}\n\n{end}{rest.split(end, 1)[1]}"
 
 
 if __name__ == "__main__":
     FORMATS.write_text(rewritten(FORMATS.read_text(encoding="utf-8")), encoding="utf-8")
+    README.write_text(with_lists(README.read_text(encoding="utf-8")), encoding="utf-8")

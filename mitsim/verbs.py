@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.api.bench import open_bench
 from mitsim.bench.apparatus import check_devices, check_scene, spelling
 from mitsim.bench.request import Exposure, Request, check_f_number, check_image, check_wavelength
-from mitsim.core.configuration import load_model, locate, shipped_path
+from mitsim.core.configuration import load_model, locate, opening_words, shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
 from mitsim.core.job import Job
@@ -67,11 +67,9 @@ def scenes() -> dict[str, str]:
     >>> ms.scenes()["photograph"]
     'A printed photograph (a portrait), diffuse, 128 mm a side, 400 mm from the camera'
     """
-    found = {}
-    for path in sorted(shipped_path("scenes").glob("*/scene.xml")):
-        comment = path.read_text(encoding="utf-8").partition("<!--")[2].partition("-->")[0]
-        found[path.parent.name] = " ".join(comment.split()).partition(". ")[0].rstrip(".")
-    return found
+    return {
+        name: opening_words(path)[0].removesuffix(".") for name, path in shipped_files("scenes", "scene.xml").items()
+    }
 
 
 # ---- a scene with its devices ----------------------------------------------------------------------------------------

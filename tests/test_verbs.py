@@ -44,6 +44,8 @@ CALLS = {
     "transport": ["Bench.light", "Light.save"],
     "characterise": ["characterise"],
     "sense": ["sense"],
+    "list": ["scenes"],
+    "new": [],
     "doctor": ["doctor"],
 }  # fmt: skip
 """Python calls that do what a verb does, by its name."""

@@ -96,6 +96,8 @@ class Effect:
         in plans, on the command line and in manifests.
     neutral
         its neutral values, by field of :class:`Physics`; ``part.field`` names one of the camera or projector.
+    what
+        it is, for who sees its name.
     absent
         why a plan leaves it off where a bench does not have it.
     note
@@ -120,6 +122,7 @@ class Effect:
 
     name: str
     neutral: Mapping[str, object]
+    what: str = ""
     absent: str = ""
     note: Callable[[Apparatus], str] = field(default=lambda bench: "")
     retraced: Callable[[Physics], frozenset[str]] = field(default=lambda physics: frozenset())
@@ -197,6 +200,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "interreflection",
         {"interreflection": False},
+        what="light that goes over several surfaces",
         # Lamps' light bounces as well, and only paths that were never followed tell how much of it.
         retraced=lambda physics: frozenset({FOLLOWED} if physics.lamps else ()),
         kind="indirect",
@@ -206,6 +210,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "mirrors",
         {"mirrors": False},
+        what="light over mirrors and through glass, in single directions",
         absent="no surface reflects or transmits light in single directions",
         retraced=_always(FOLLOWED),
         first_pilot_run=True,
@@ -215,6 +220,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "ambient",
         {"lamps": ()},
+        what="light of lamps beside the projector",
         absent="the projector is the only emitter",
         note=_lamps,
         kind="ambient",
@@ -224,15 +230,23 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "diffraction",
         {"spectrum": None},
+        what="the mask's shadow by wave optics, where it is geometric without",
         absent="the mask's shadow is geometric, or a picture that has it",
         note=_diffraction,
         first_pilot_run=True,
         in_shadow=True,
     ),
-    Effect("mask-thickness", {"geometry.mask_thickness": 0.0}, absent="the mask is thin", in_reference=True),
+    Effect(
+        "mask-thickness",
+        {"geometry.mask_thickness": 0.0},
+        what="walls of the mask's openings, which take slanting light",
+        absent="the mask is thin",
+        in_reference=True,
+    ),
     Effect(
         "pixel-response",
         {"geometry.pixel_fill_factor": 1.0, "geometry.angular_exponent": 0.0},
+        what="pixels that see less at their edges, and of slanting light",
         absent="pixels are fully sensitive, whatever the angle",
         retraced=_always(DIRECT, FOLLOWED),
         in_reference=True,
@@ -241,6 +255,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "aperture",
         {"projector.aperture": 0.0},
+        what="the projector's lens, which is sharp at one distance alone",
         absent="the projector is a pinhole: sharp at all distances",
         note=_lens,
         retraced=_always(DIRECT, FOLLOWED),
@@ -250,6 +265,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "blur",
         {"projector.blur": 0.0},
+        what="projector pixels that run into their neighbours",
         absent="the projector's pixels are sharp",
         retraced=_always(DIRECT, FOLLOWED),
         first_pilot_run=True,
@@ -258,17 +274,27 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "glare",
         {"projector.share": 1.0},
+        what="light that the projector's lens scatters over its picture",
         absent="the projector file gives no ANSI contrast",
         note=lambda bench: f"the projector's lens scatters {1 - bench.projector_optics.share:.2g} of its light",
         retraced=_always(DIRECT, FOLLOWED),
     ),
-    Effect("black-level", {"black_level": 0.0}, absent="the projector's black is black"),
-    Effect("speckle", {"speckle": 0.0}, absent="the projector file gives no speckle contrast", in_frames=False),
+    Effect("black-level", {"black_level": 0.0}, what="light of black pixels", absent="the projector's black is black"),
+    Effect(
+        "speckle",
+        {"speckle": 0.0},
+        what="the grain of laser light",
+        absent="the projector file gives no speckle contrast",
+        in_frames=False,
+    ),
 )
 """All effects, in the order of a plan's rows."""
 
-DISCRETISED = ("anchors", "layers")
-"""What a plan counts instead of switching it: points of the sensor and depths; off means one."""
+DISCRETISED: Mapping[str, str] = MappingProxyType({
+    "anchors": "points of the sensor that light is traced to, for what changes over it",
+    "layers": "depths, each with a shadow of its own",
+})  # fmt: skip
+"""What a plan counts instead of switching it, and what it is; off means one."""
 SWITCHES = (*DISCRETISED, *EFFECTS)
 """Names that a user may switch on or off."""
 

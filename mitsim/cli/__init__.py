@@ -22,6 +22,7 @@ import mitsim
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.exchange_verbs import export, import_, patterns, transport
 from mitsim.cli.frame_verbs import characterise, reconstruct, sense
+from mitsim.cli.help_page import LIMITS, QUALITY, WHAT, Program, Verb, parts_of
 from mitsim.cli.learned_verbs import pairs, train
 from mitsim.cli.options import (
     AUTO,
@@ -45,6 +46,7 @@ from mitsim.cli.options import (
     Seed,
     by_line,
     check_work,
+    complete_scene,
     given_of,
     in_colour,
     is_given,
@@ -58,6 +60,7 @@ from mitsim.cli.options import (
 )
 from mitsim.cli.report_verb import finish_folder, finish_frame, report
 from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
+from mitsim.cli.shelf_verbs import list_, new
 from mitsim.cli.study_verb import study
 from mitsim.cli.view_verb import view
 from mitsim.core.errors import MitsimError, printable
@@ -76,7 +79,7 @@ app = typer.Typer(
     name="mitsim",
     help="A physically based simulator of coded-illumination lensless imaging.",
     no_args_is_help=True,
-    add_completion=False,
+    cls=Program,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -129,7 +132,7 @@ def _usage(error: Any) -> str:
     """Click's sentence about a command line, with the value that a typer which checks with pydantic leaves out."""
     message: str = error.format_message()
     if message.startswith("Usage:"):  # no command was given, and click's sentence is the whole help
-        print(message, file=sys.stderr)
+        typer.echo(message, err=True)
         return "give one of the commands above"
     checked = getattr(error.__cause__, "errors", None)
     if checked is not None:
@@ -160,6 +163,8 @@ def _root(
 class DemoRequest:
     """What the demo's captures are asked for."""
 
+    PANEL = WHAT
+
     patterns: Patterns = "dots:7"
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
@@ -168,13 +173,26 @@ class DemoRequest:
 @verb
 def demo(
     *,
-    scene: Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene")] = "photograph",
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo")] = Path("demo-output"),
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene", metavar="[SCENE]", autocompletion=complete_scene
+        ),
+    ] = "photograph",
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder of the demo", metavar="DIR")] = Path(
+        "demo-output"
+    ),
     asked: DemoRequest,
     devices: Devices,
     common: Common,
 ) -> int:
-    """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html."""
+    """The whole job, from plan to images of five pattern families.
+
+    Plans, captures, calibrates and reconstructs one scene, and writes report.html.
+
+    $ mitsim demo
+    $ mitsim demo cookie_bag -o bag --accuracy 0.01
+    """
     with common.job() as job:
         result = mitsim.demo(scene, output, job=job, **vars(asked), **devices.arguments, variant=common.variant)
     return finish(common.as_json, result.payload(), result.lines(), result.warnings)
@@ -193,7 +211,14 @@ def plan(
     *,
     common: Common,
 ) -> int:
-    """What will be simulated, why, and what it costs, before any long work."""
+    """What a capture will simulate, why, and what it will cost.
+
+    A short look at the scene finds the cheapest combination of effects whose error is within the accuracy.
+
+    $ mitsim plan cookie_bag
+    $ mitsim plan photograph --accuracy 1e-4 -D sheet_z=380
+    $ mitsim plan cookie_bag -o plan.json
+    """
     from mitsim.core.files import check_apart, output_file
     from mitsim.core.job import compiled_kernels, running_seconds
 
@@ -245,10 +270,14 @@ def _plan_of(bench: Bench, colour: str, request: dict[str, Any]) -> Plan:
 class Capturing(Sampling):
     """What is captured, and how long it is exposed: fields of a request."""
 
-    patterns: str | None = option(None, pattern_names(), show_default="those of --plan")
+    PANEL = WHAT
+
+    patterns: str | None = option(None, pattern_names(), show_default="those of --plan", metavar="PATTERNS")
     exposure: str = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
-    noise_fraction: float | None = option(None, "stop sampling at this part of the sensor's noise", metavar="PART")
+    noise_fraction: float | None = option(
+        None, "stop sampling at this part of the sensor's noise", metavar="PART", rich_help_panel=QUALITY
+    )
     ambient_frame: str = option("auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no")
     ambient_shots: int | None = option(None, "shots of that frame; by the patterns if not given", metavar="N")
 
@@ -256,6 +285,8 @@ class Capturing(Sampling):
 @dataclass(frozen=True)
 class Made(KnownPlan):
     """What is there already."""
+
+    PANEL = WHAT
 
     light: Path | None = option(
         None, "file of `mitsim transport`: nothing is traced again", "--light", metavar="FILE.h5"
@@ -274,7 +305,14 @@ def capture(
     devices: Coloured,
     limited: LimitedPictured,
 ) -> int:
-    """Render, expose and write one frame for each pattern; in colour, for each pattern and line of the projector."""
+    """Simulate the frames of a scene: one for each pattern.
+
+    Renders, exposes and writes them; in colour, one for each pattern and line of the projector.
+
+    $ mitsim capture photograph -o run --patterns dots:7
+    $ mitsim capture cookie_bag -o bag --patterns hadamard:8 --seconds 20
+    $ mitsim capture photograph -o again --plan plan.json
+    """
     from mitsim.bench.request import Task
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.core.manifests import MANIFEST
@@ -440,7 +478,9 @@ def _ambient_lines(payload: Mapping[str, Any]) -> list[str]:
 class Estimating:
     """What estimates the irradiance, and how finely."""
 
-    estimator: str = option("reference", "reference or factored")
+    PANEL = QUALITY
+
+    estimator: str = option("reference", "reference or factored", metavar="NAME")
     spp: int | None = option(None, "samples a pixel of the reference", show_default="the scene's sample_count, or 64")
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
@@ -456,7 +496,13 @@ def render(
     lit: LitScene,
     limited: LimitedPictured,
 ) -> int:
-    """Expected irradiance under the scene's own light, by either estimator."""
+    """Expected irradiance on the sensor, in the scene's own light.
+
+    The reference follows path by path through the mask, without diffraction; factored is what other verbs use.
+
+    $ mitsim render photograph -o frame.exr --spp 16
+    $ mitsim render photograph -o fast.exr --estimator factored
+    """
     from mitsim.bench.request import check_samples
     from mitsim.core.files import check_apart, check_output, output_file
 
@@ -488,10 +534,17 @@ def render(
 def doctor(
     common: Common,
     warm: Annotated[
-        bool, typer.Option("--warm", help="compile the usual kernels into Dr.Jit's cache: half a minute")
+        bool,
+        typer.Option(
+            "--warm", help="compile the usual kernels into Dr.Jit's cache: half a minute", rich_help_panel=LIMITS
+        ),
     ] = False,
 ) -> int:
-    """What works on this machine, and the one command that mends what does not."""
+    """What works on this machine, and what mends the rest.
+
+    $ mitsim doctor
+    $ mitsim doctor --warm
+    """
     checks = mitsim.doctor(warm, common.variant)
     lines = [f"{sum(check.ok for check in checks)} of {len(checks)} checks pass"]
     lines += [
@@ -505,7 +558,17 @@ def doctor(
     return finish(common.as_json, {"checks": [asdict(check) for check in checks], "ok": not bad}, lines, bad)
 
 
-# In the order of the help.
-_SCENE = demo, view, plan, capture, calibrate, reconstruct, render, study
-for _verb in (*_SCENE, report, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
-    app.command(_verb.__name__.rstrip("_"))(_verb)
+_VERBS = {
+    "The main job": (demo, view, plan, capture, calibrate, reconstruct),
+    "The bench": (render, sense, characterise),
+    "Studies": (study,),
+    "Learning": (pairs, train),
+    "Exchange": (export, import_, patterns, transport),
+    "Files and machine": (report, list_, new, doctor),
+}
+"""Verbs by heading, in the order of the help."""
+for _panel, _verbs in _VERBS.items():
+    for _verb in _verbs:
+        app.command(
+            _verb.__name__.rstrip("_"), cls=Verb, short_help=parts_of(_verb.__doc__)[0], rich_help_panel=_panel
+        )(_verb)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mitsim.cli.help_page import OUTPUT, WHAT
 from mitsim.cli.options import (
     MOSAIC,
     NO,
@@ -25,6 +26,7 @@ from mitsim.cli.options import (
     Resume,
     Seed,
     check_work,
+    complete_scene,
     in_colour,
     is_given,
     option,
@@ -52,8 +54,15 @@ _OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose", "no_pictu
 class Session:
     """Frames that factors come from, and where they go."""
 
+    PANEL = WHAT
+
     output: Path | None = option(
-        None, "calibration folder to make; of --plan, recipe to write", "-o", "--output", metavar="CAL"
+        None,
+        "calibration folder to make; of --plan, recipe to write",
+        "-o",
+        "--output",
+        metavar="CAL",
+        rich_help_panel=OUTPUT,
     )
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
     known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
@@ -63,7 +72,9 @@ class Session:
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
     recipe: Path | None = option(None, "session recipe, TOML", metavar="FILE.toml")
-    write_frames: Path | None = option(None, "folder to write the simulated frames to, for --frames", metavar="DIR")
+    write_frames: Path | None = option(
+        None, "folder to write the simulated frames to, for --frames", metavar="DIR", rich_help_panel=OUTPUT
+    )
     resume: Resume = False
 
     @property
@@ -76,9 +87,11 @@ class Session:
 class Planned:
     """What --plan is asked for."""
 
+    PANEL = WHAT
+
     planning: bool = option(False, "find the light that an image of --psnr needs; calibrates nothing", "--plan")
     psnr: float | None = option(None, "wanted of --plan's image [dB]", metavar="DB")
-    patterns: str | None = option(None, "of --plan's capture", show_default="dots:7")
+    patterns: str | None = option(None, "of --plan's capture", show_default="dots:7", metavar="PATTERNS")
 
     def folder(self, output: Path | None) -> Path:
         """The ``output`` of a calibration that is no plan; MitsimError without one, or with options of a plan."""
@@ -93,6 +106,8 @@ class Planned:
 @dataclass(frozen=True)
 class Modelled:
     """What --model is asked for."""
+
+    PANEL = WHAT
 
     model: str | None = option(
         None, "model the factors, its devices fitted to a few frames; of --frames with SCENE", metavar="geometric|wave"
@@ -117,15 +132,26 @@ def calibrate(
     session: Session,
     scene: Annotated[
         str | None,
-        typer.Argument(help="scene XML, or the name of a shipped scene; none with --frames", metavar="[SCENE]"),
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene; none with --frames",
+            metavar="[SCENE]",
+            autocompletion=complete_scene,
+        ),
     ] = None,
     planned: Planned,
     modelled: Modelled,
     devices: Coloured,
     limited: LimitedPictured,
 ) -> int:
-    """Render a Hadamard session on a white board, or read the frames of a real one or of known pictures, and estimate
-    the camera's factors."""
+    """Estimate the camera's two factors, simulated or real.
+
+    Renders a Hadamard session on a white board, or reads the frames of a real one (--frames) or of known pictures
+    (--known).
+
+    $ mitsim calibrate photograph -o cal
+    $ mitsim calibrate photograph -o few --model wave
+    $ mitsim calibrate --frames session -o cal --camera imx249
+    """
     if session.known is not None:
         folder = Planned().folder(session.output)
         _check_alone(context, f"--known {session.known}: runs and their list decide", _OF_KNOWN)

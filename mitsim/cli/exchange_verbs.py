@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 import mitsim
+from mitsim.cli.help_page import DEVICES, OUTPUT, WHAT
 from mitsim.cli.options import (
     Common,
     Devices,
@@ -20,6 +21,9 @@ from mitsim.cli.options import (
     Projector,
     Scene,
     Seed,
+    complete_camera,
+    complete_list,
+    complete_projector,
     given_of,
     option,
     pop_patterns,
@@ -35,9 +39,13 @@ from mitsim.devices.patterns import pattern_names
 class Exported:
     """What a run is written as."""
 
+    PANEL = OUTPUT
+
     format: str = option(..., "hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")
     output: Path = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE")
-    calibration: Path | None = option(None, "folder of `mitsim calibrate` that goes with it", metavar="CAL")
+    calibration: Path | None = option(
+        None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", rich_help_panel=WHAT
+    )
     overwrite: Overwrite = False
     projector: Projector = None
 
@@ -49,7 +57,11 @@ def export(
     exported: Exported,
     common: Common,
 ) -> int:
-    """Write a run in a format that other programs read."""
+    """Write a run in a format that other programs read.
+
+    $ mitsim export run --format hdf5 -o run.h5
+    $ mitsim export run --format mat -o run.mat --calibration cal
+    """
     if exported.format == "png":
         refuse_unused(context, ["overwrite"], "on a folder of pictures, which takes the place of none")
     payload = mitsim.export(run, **vars(exported))
@@ -62,11 +74,21 @@ def export(
 class Frames:
     """What a person knows of a real camera's frames."""
 
+    PANEL = WHAT
+
     list: str | None = option(
-        None, "of frames: list of what is known of them; options take its place", metavar="NAME|FILE"
+        None,
+        "of frames: list of what is known of them; options take its place",
+        metavar="NAME|FILE",
+        autocompletion=complete_list,
     )
     patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: str | None = option(None, "of frames: camera electronics, name or TOML file", metavar="NAME|FILE")
+    camera: str | None = option(
+        None,
+        "of frames: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_camera,
+    )
     exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
     calibration: Path | None = option(
         None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
@@ -79,7 +101,7 @@ class Frames:
     ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
     shape: str | None = option(None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
     bits: int | None = option(None, "of a number in such a file", metavar="N")
-    byte_order: str = option("little", "of such a file: little or big")
+    byte_order: str = option("little", "of such a file: little or big", metavar="ORDER")
     channel: str | None = option(
         None, "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
     )
@@ -109,7 +131,12 @@ def import_(
         Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
     ] = None,
 ) -> int:
-    """Make a run folder of a real camera's frames, or of a file that `mitsim export` wrote."""
+    """Make a run of a real camera's frames, or of an exported file.
+
+    $ mitsim import frames -o run --list mine.toml --calibration cal
+    $ mitsim import hand.png -o hand --list diffusercam
+    $ mitsim import run.h5 -o copy
+    """
     from mitsim.exchange.formats import READERS
 
     if output is None and calibration_output is None:
@@ -139,7 +166,14 @@ def import_(
 class Screen:
     """A projector that patterns are drawn for."""
 
-    projector: str = option("mp_cl1", "projector of known rows and columns: name or TOML file", metavar="NAME|FILE")
+    PANEL = DEVICES
+
+    projector: str = option(
+        "mp_cl1",
+        "projector of known rows and columns: name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_projector,
+    )
     projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=4096, metavar="N")
 
 
@@ -147,7 +181,14 @@ class Screen:
 class Stripes:
     """What a calibration's stripes need beside it."""
 
-    camera: str | None = option(None, "of stripes: camera electronics, name or TOML file", metavar="NAME|FILE")
+    PANEL = DEVICES
+
+    camera: str | None = option(
+        None,
+        "of stripes: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        autocompletion=complete_camera,
+    )
     exposure: float | None = option(None, "of stripes: seconds of each frame", metavar="SECONDS")
     signed_capture: str = option(
         "pair", "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"
@@ -167,7 +208,13 @@ def patterns(
     seed: Seed = 0,
     common: Common,
 ) -> int:
-    """Draw patterns, or a calibration's stripes, as pictures to show on a real projector."""
+    """Draw patterns as pictures for a real projector.
+
+    Or a calibration's stripes, with the list that its frames need.
+
+    $ mitsim patterns dots:7 -o pictures
+    $ mitsim patterns stripes -o stripes --camera imx249 --exposure 0.02
+    """
     asked = given_of(context, {**vars(stripes), "seed": seed})
     payload = mitsim.pattern_pictures(family, output, **vars(screen), **asked)
     if payload["session"]:
@@ -205,7 +252,13 @@ def transport(
     devices: Devices,
     limited: Limited,
 ) -> int:
-    """Trace a scene's light by projector pixel and write it, for frames of any pattern without mitsim."""
+    """Trace a scene's light, for frames of any pattern.
+
+    Written by projector pixel, for capture --light and for programs without mitsim.
+
+    $ mitsim transport photograph -o light.h5
+    $ mitsim capture photograph -o run --light light.h5 --patterns dots:5
+    """
     from mitsim.core.files import check_apart, output_file
 
     request, known = traced.read(context, vars(sampling))

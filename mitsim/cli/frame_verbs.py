@@ -10,11 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import mitsim
+from mitsim.cli.help_page import DEVICES, QUALITY, WHAT
 from mitsim.cli.options import (
     Common,
     ExposureFraction,
     Pictured,
     Seed,
+    complete_camera,
+    completing,
     given_of,
     is_given,
     number_of,
@@ -42,7 +45,7 @@ if TYPE_CHECKING:
     from mitsim.report.colour_image import JudgedColours
     from mitsim.report.quality import Judged
 
-# ---- `mitsim reconstruct` --------------------------------------------------------------------------------------------
+# ---- images of frames ------------------------------------------------------------------------------------------------
 
 
 def method_names() -> str:
@@ -55,8 +58,10 @@ def method_names() -> str:
 class Solving:
     """How an image is solved for."""
 
+    PANEL = QUALITY
+
     lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
-    method: str = option(TIKHONOV, method_names())
+    method: str = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", autocompletion=completing(lambda: METHODS))
     focus: str | None = option(
         None,
         "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
@@ -106,6 +111,8 @@ class Solving:
 class ColouredImage:
     """How an image in colour is made."""
 
+    PANEL = WHAT
+
     chart: str | None = option(
         None,
         "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
@@ -123,6 +130,8 @@ class ColouredImage:
 class OfPointSpread(ColouredImage):
     """Cameras that are known by a point spread function, and those in colour."""
 
+    PANEL = WHAT
+
     psf: Path | None = option(
         None,
         "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
@@ -137,17 +146,26 @@ def reconstruct(
     *,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
     calibration: Annotated[
-        Path | None, typer.Option(help="folder of `mitsim calibrate`", metavar="CAL", show_default="required")
+        Path | None,
+        typer.Option(help="folder of `mitsim calibrate`; needed without --psf", metavar="CAL", rich_help_panel=WHAT),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given")
+        Path | None,
+        typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given", metavar="DIR"),
     ] = None,
     solving: Solving,
     camera: OfPointSpread,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
     common: Pictured,
 ) -> int:
-    """Recover the image from frames and a calibration alone; of coloured folders, one of each line, and in colour."""
+    """Recover the image from frames and a calibration alone.
+
+    Of coloured folders, an image of each line, and one in colour.
+
+    $ mitsim reconstruct run --calibration cal
+    $ mitsim reconstruct run --calibration cal --method markov -o smooth
+    $ mitsim reconstruct run --calibration cal --focus auto -o sharp
+    """
     from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
     from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
@@ -337,6 +355,8 @@ def _two_depths(text: str) -> tuple[float, float]:
 class Procedure:
     """How a camera is characterised."""
 
+    PANEL = WHAT
+
     pixels: int = option(256, "rows and columns of the frames")
     steps: int = option(50, "steps of light, from dark to beyond saturation")
     frames: str = option(
@@ -353,15 +373,27 @@ def characterise(
     *,
     context: typer.Context,
     camera: Annotated[
-        str | None, typer.Argument(help="camera electronics: name or TOML file", metavar="[CAMERA]", show_default=False)
+        str | None,
+        typer.Argument(
+            help="camera electronics: name or TOML file",
+            metavar="[CAMERA]",
+            show_default=False,
+            autocompletion=complete_camera,
+        ),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml")] = Path(
-        "characterise-output"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml", metavar="DIR")
+    ] = Path("characterise-output"),
     asked: Procedure,
     common: Common,
 ) -> int:
-    """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames."""
+    """Measure a camera after EMVA 1288, simulated or real.
+
+    On simulated frames, beside what the camera's file sets, or on real frames (--frames DIR).
+
+    $ mitsim characterise imx249 -o figures
+    $ mitsim characterise --frames flats -o mine
+    """
     if camera is None and not is_given(context, "frames"):
         raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
     frames = int(asked.frames) if asked.frames.isdecimal() and camera is not None else Path(asked.frames)
@@ -375,7 +407,15 @@ def characterise(
 class Exposed:
     """A camera and how long it is exposed."""
 
-    camera: str = option(..., "camera electronics: name or TOML file", metavar="NAME|FILE")
+    PANEL = WHAT
+
+    camera: str = option(
+        ...,
+        "camera electronics: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_camera,
+    )
     exposure: str = option("auto", "seconds, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
     seed: Seed = 0
@@ -384,6 +424,8 @@ class Exposed:
 @dataclass(frozen=True)
 class Irradiance:
     """How an image's numbers are light on the sensor."""
+
+    PANEL = WHAT
 
     f_number: float | None = option(
         None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N"
@@ -402,7 +444,13 @@ def sense(
     irradiance: Irradiance,
     common: Pictured,
 ) -> int:
-    """Put an image of any renderer behind a camera's sensor: digital numbers with its noise."""
+    """Put an image of any renderer behind a camera's sensor.
+
+    Out come digital numbers, with the sensor's noise.
+
+    $ mitsim sense frame.exr --camera imx249 -o frame.png
+    $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
+    """
     from mitsim.bench.request import check_ending, check_image
     from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file

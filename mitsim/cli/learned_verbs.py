@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import mitsim
+from mitsim.cli.help_page import LIMITS, QUALITY, WHAT
 from mitsim.cli.options import (
     Accuracy,
     Devices,
@@ -20,6 +21,7 @@ from mitsim.cli.options import (
     Resume,
     Scene,
     Seed,
+    completing,
     number_of,
     option,
     refuse_unused,
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 class OfPairs:
     """What pairs are asked for."""
 
+    PANEL = WHAT
+
     count: int = option(..., "pairs to make", metavar="N")
     patterns: Patterns = "dots:7"
     idealised: bool = option(False, "frames of the paper's separable model, not rendered", "--idealised")
@@ -51,6 +55,8 @@ class OfPairs:
 @dataclass(frozen=True)
 class PairFrames:
     """How the frames of pairs are made: fields of a request."""
+
+    PANEL = WHAT
 
     accuracy: Accuracy = 1e-3
     seed: Seed = 0
@@ -72,7 +78,13 @@ def pairs(
     devices: Devices,
     limited: Limited,
 ) -> int:
-    """Make pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them."""
+    """Make pairs to learn from: pictures and their frames.
+
+    Pictures stand on a scene's print, and the camera takes frames of them.
+
+    $ mitsim pairs photograph --count 500 -o pairs
+    $ mitsim pairs photograph --count 500 --pictures photos -o mine
+    """
     from mitsim.bench.request import Task
     from mitsim.core.configuration import load_model
     from mitsim.core.files import PAIRS, check_output
@@ -115,11 +127,13 @@ def pairs(
 class Schedule:
     """How a network is trained."""
 
+    PANEL = QUALITY
+
     steps: int = option(Training.steps, "of the optimiser")
     batch: int = option(Training.batch, "pairs a step")
     rate: float = option(Training.rate, "largest learning rate of the cycle")
     seed: Seed = 0
-    device: str = option(Training.device, "that torch works on")
+    device: str = option(Training.device, "that torch works on", metavar="NAME", rich_help_panel=LIMITS)
     feature_weight: float = option(Training.feature_weight, "of differences of features, beside the squared error")
     adversary_weight: float = option(Training.adversary_weight, "of what an adversary tells from truths, beside it")
 
@@ -127,18 +141,36 @@ class Schedule:
 @verb
 def train(
     *,
-    method: Annotated[str, typer.Argument(help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", metavar="METHOD")],
+    method: Annotated[
+        str,
+        typer.Argument(
+            help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}",
+            metavar="METHOD",
+            autocompletion=completing(lambda: METHODS),
+        ),
+    ],
     pairs: Annotated[Path, typer.Argument(help="folder of `mitsim pairs`", metavar="PAIRS")],
     output: Annotated[Path, typer.Option("-o", "--output", help="file to make", metavar="MODEL.pt")],
     calibration: Annotated[
         Path | None,
-        typer.Option(help="folder of `mitsim calibrate`", metavar="CAL", show_default="PAIRS/calibration"),
+        typer.Option(
+            help="folder of `mitsim calibrate`",
+            metavar="CAL",
+            show_default="PAIRS/calibration",
+            rich_help_panel=WHAT,
+        ),
     ] = None,
     schedule: Schedule,
     resume: Resume = False,
     limited: Limited,
 ) -> int:
-    """Train a network that makes images of frames, for reconstruct --method MODEL.pt. Needs torch: mitsim[learn]."""
+    """Train a network that makes images of frames.
+
+    For reconstruct --method MODEL.pt. Needs torch: mitsim[learn].
+
+    $ mitsim train unrolled pairs -o model.pt
+    $ mitsim reconstruct run --calibration cal --method model.pt
+    """
     from mitsim.learn.verbs import train as train_model
 
     if output.suffix != MODEL:

@@ -6,20 +6,24 @@ such groups.
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
+from typer.models import OptionInfo
 
 import mitsim
+from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, metavar_of
+from mitsim.core.configuration import shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.job import Limits, running_seconds
@@ -50,16 +54,59 @@ _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_fi
 NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 """Words of --colour beside `lines` and `bands:K`."""
 
-Scene = Annotated[str, typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE")]
-Patterns = Annotated[str, typer.Option(help=pattern_names())]
-Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames")]
-Seed = Annotated[int, typer.Option(help="root of every random stream")]
-Effects = Annotated[str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME")]
-Camera = Annotated[str | None, typer.Option(help="camera electronics: name or TOML file", metavar="NAME|FILE")]
-Projector = Annotated[str | None, typer.Option(help="projector: name or TOML file", metavar="NAME|FILE")]
-ExposureFraction = Annotated[float, typer.Option(help="brightest pixel, as a part of full well")]
-Resume = Annotated[bool, typer.Option("--resume", help="go on where an interrupted one of the same options stopped")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the file")]
+CAMERA, PROJECTOR, SESSION, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
+"""Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
+known of frames."""
+
+
+def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """What a shell completes a word by: those of some ``names``, asked for when it does, that begin with it."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return complete
+
+
+complete_scene = completing(lambda: shipped_files("scenes", "scene.xml"))
+complete_camera, complete_projector, complete_list = (
+    completing(functools.partial(shipped_files, "calibration", ".toml", field)) for field in (CAMERA, PROJECTOR, LIST)
+)
+Scene = Annotated[
+    str,
+    typer.Argument(help="scene XML, or the name of a shipped scene", metavar="SCENE", autocompletion=complete_scene),
+]
+_SAMPLED: dict[str, Any] = {"rich_help_panel": QUALITY}
+Patterns = Annotated[str, typer.Option(help=pattern_names(), metavar="PATTERNS", rich_help_panel=WHAT)]
+Accuracy = Annotated[float, typer.Option(help="relative rms error of the expected frames", **_SAMPLED)]
+Seed = Annotated[int, typer.Option(help="root of every random stream", **_SAMPLED)]
+Effects = Annotated[
+    str, typer.Option("--effects", help="override the plan: +NAME,-NAME", metavar="+NAME,-NAME", **_SAMPLED)
+]
+Camera = Annotated[
+    str | None,
+    typer.Option(
+        help="camera electronics: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_camera,
+    ),
+]
+Projector = Annotated[
+    str | None,
+    typer.Option(
+        help="projector: name or TOML file",
+        metavar="NAME|FILE",
+        rich_help_panel=DEVICES,
+        autocompletion=complete_projector,
+    ),
+]
+ExposureFraction = Annotated[float, typer.Option(help="brightest pixel, as a part of full well", metavar="PART")]
+Resume = Annotated[
+    bool,
+    typer.Option("--resume", help="go on where an interrupted one of the same options stopped", rich_help_panel=OUTPUT),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace the file", rich_help_panel=OUTPUT)]
 
 
 # ---- groups of options -----------------------------------------------------------------------------------------------
@@ -85,7 +132,7 @@ def option(default: Any, help: str, *names: str, **more: Any) -> Any:
 
 def verb(function: Callable[..., int]) -> Callable[..., int]:
     """The ``function`` of a verb with the fields of its groups of options for parameters, as typer reads them. A
-    group's own fields stand before those that it inherits."""
+    group's own fields stand before those that it inherits, below the heading of the help that its ``PANEL`` names."""
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
     options: list[inspect.Parameter] = []
@@ -105,13 +152,21 @@ def verb(function: Callable[..., int]) -> Callable[..., int]:
 
 def _options_of(group: Any) -> Iterator[inspect.Parameter]:
     hints, fields = get_type_hints(group, include_extras=True), group.__dataclass_fields__
-    for name in (name for base in group.__mro__ for name in inspect.get_annotations(base)):
-        declared = fields[name].metadata.get("option")
-        default = inspect.Parameter.empty if fields[name].default is MISSING else fields[name].default
-        yield _option(name, Annotated[hints[name], declared] if declared else hints[name], default)
+    for base in group.__mro__:
+        for name in inspect.get_annotations(base):
+            declared = fields[name].metadata.get("option")
+            default = inspect.Parameter.empty if fields[name].default is MISSING else fields[name].default
+            hint = Annotated[hints[name], declared] if declared else hints[name]
+            yield _option(name, hint, default, vars(base).get("PANEL"))
 
 
-def _option(name: str, hint: Any, default: Any) -> inspect.Parameter:
+def _option(name: str, hint: Any, default: Any, panel: str | None = None) -> inspect.Parameter:
+    """A parameter, whose option has the ``panel`` where it names none, and a word for its value."""
+    if get_origin(hint) is Annotated and isinstance(hint.__metadata__[0], OptionInfo):
+        shown = copy.copy(hint.__metadata__[0])
+        shown.rich_help_panel = shown.rich_help_panel or panel
+        shown.metavar = shown.metavar or metavar_of((hint.__origin__, *get_args(hint.__origin__)))
+        hint = Annotated[hint.__origin__, shown]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
 
 
@@ -127,10 +182,14 @@ def _variant(name: str) -> str:
 class Common:
     """Options that every verb has."""
 
+    PANEL = OUTPUT
+
     variant: str = option(
         DEFAULT_VARIANT,
         "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
         callback=_variant,
+        metavar="VARIANT",
+        rich_help_panel=LIMITS,
     )
     as_json: bool = option(False, "one JSON object on stdout, nothing else there", "--json")
     quiet: bool = option(False, "no progress", "--quiet")
@@ -156,7 +215,9 @@ class Common:
 class Limited(Common):
     """Options of verbs that may work for long."""
 
-    max_seconds: float = option(Limits().seconds, "refuse work that would take longer")
+    PANEL = LIMITS
+
+    max_seconds: float = option(Limits().seconds, "refuse work that would take longer", metavar="S")
     max_memory: float | None = option(
         None, "refuse work that would take more; nine tenths of what is free if not given", metavar="GIB"
     )
@@ -183,6 +244,8 @@ class LimitedPictured(Limited, Pictured):
 class Sampling:
     """How finely light is sampled."""
 
+    PANEL = QUALITY
+
     accuracy: float | None = option(None, "relative rms error of the expected frames", show_default="0.001")
     seconds: float | None = option(None, "the finest accuracy that a run of so long buys", metavar="S")
     seed: Seed = 0
@@ -199,6 +262,8 @@ class OfPatterns(Sampling):
 @dataclass(frozen=True)
 class KnownPlan:
     """What is planned already."""
+
+    PANEL = WHAT
 
     plan: Path | None = option(None, "file of `mitsim plan -o`: nothing is planned again", "--plan", metavar="FILE")
 
@@ -225,6 +290,8 @@ class KnownPlan:
 @dataclass(frozen=True)
 class LitScene:
     """What opens a scene, under its own light."""
+
+    PANEL = DEVICES
 
     projector: Projector = None
     define: list[str] | None = option(None, "set a <default> of the scene", "-D", metavar="NAME=VALUE")
@@ -315,6 +382,8 @@ def _choice(context: typer.Context, name: str) -> str:
 @dataclass(frozen=True)
 class Coloured(Devices):
     """What opens a bench, and which of its projector's light is told apart."""
+
+    PANEL = WHAT
 
     colour: str = option(
         NO,

@@ -24,7 +24,13 @@ def report(
     folder: Annotated[Path, typer.Argument(help="of capture, calibrate, reconstruct or import", metavar="FOLDER")],
     common: Common,
 ) -> int:
-    """Make the pictures and the page of a folder again, from its files alone."""
+    """Make the pictures and the page of a folder again.
+
+    From its files alone: a run, a calibration or an image.
+
+    $ mitsim report run
+    $ mitsim report cal
+    """
     made = _page_of(folder)
     return finish(common.as_json, {**made, "output": str(folder)}, [_page_line(made)], ())
 

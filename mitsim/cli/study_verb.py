@@ -9,27 +9,37 @@ from typing import Annotated
 import typer
 
 import mitsim
-from mitsim.cli.options import Common, Devices, Patterns, Seed, is_given, option, verb
+from mitsim.cli.help_page import LIMITS, OUTPUT, QUALITY, WHAT
+from mitsim.cli.options import Common, Devices, Patterns, Seed, complete_scene, completing, is_given, option, verb
 from mitsim.cli.screen import finish
+from mitsim.studies import ALL, EXPERIMENTS, STUDIES
 
 
 @dataclass(frozen=True)
 class Points:
     """What a study varies, and who measures which of its points."""
 
-    quick: bool = option(False, "a few points, for a first look", "--quick")
+    PANEL = LIMITS
+
+    quick: bool = option(False, "a few points, for a first look", "--quick", rich_help_panel=QUALITY)
     shard: str = option("1/1", "measure part I of N of the points", metavar="I/N")
     jobs: int | None = option(None, "processes; one a processor if not given")
-    scheduler: str | None = option(None, "Dask scheduler that measures the points")
-    over: list[str] | None = option(None, "what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT")
-    measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...")
+    scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS")
+    over: list[str] | None = option(
+        None, "what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT", rich_help_panel=WHAT
+    )
+    measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...", metavar="NAME,...", rich_help_panel=WHAT)
 
 
 @dataclass(frozen=True)
 class Studied:
     """What frames a study is of, and where it goes."""
 
-    output: Path = option(Path("study-output"), "folder of the study", "-o", "--output")
+    PANEL = WHAT
+
+    output: Path = option(
+        Path("study-output"), "folder of the study", "-o", "--output", metavar="DIR", rich_help_panel=OUTPUT
+    )
     patterns: Patterns = "dots:7"
     seed: Seed = 0
     recipe: Path | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
@@ -41,22 +51,35 @@ class Studied:
 def study(
     *,
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="of the study, or merge", metavar="NAME")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="of the study, all or merge; of one of your own its file, or its module with a dot",
+            metavar="NAME",
+            autocompletion=completing(lambda: (*EXPERIMENTS, *STUDIES, ALL, "merge")),
+        ),
+    ],
     scenes: Annotated[
         list[str] | None,
-        typer.Argument(help="scene XML, or the name of a shipped scene; of merge, folders", metavar="[SCENE]"),
+        typer.Argument(
+            help="scene XML, or the name of a shipped scene; of merge, folders",
+            metavar="[SCENE]",
+            autocompletion=complete_scene,
+        ),
     ] = None,
     studied: Studied,
     devices: Devices,
     points: Points,
     common: Common,
 ) -> int:
-    """An experiment with figures, CSV and JSON: the paper's, on rendered frames (patterns, distance, or all); `colour`
-    of a ColorChecker; what `drift` between calibration and capture costs; what `learned` methods gain and lose (needs
-    torch, takes hours, not in all); `models` of a calibration; `sweep` of any knob; what `accuracy` costs in time, on a
-    scene and, of none, in the `solver`; what `diffraction` at the mask does; how good a `calibration` session is, and
-    why; `twin`: real captures beside their simulation; `transfer`: networks of that simulation on them (needs torch);
-    `merge` joins the parts of --shard.
+    """An experiment with figures, CSV and JSON.
+
+    `mitsim list studies` says what each is for; all is those of the paper on one page, and merge joins the parts of
+    --shard. One of your own is a module, named with a dot.
+
+    $ mitsim study patterns -o patterns --quick
+    $ mitsim study sweep photograph -o sweep --over sheet_z=390:410:5
+    $ mitsim study accuracy cookie_bag -o accuracy
     """
     named = {"parameters": "define", "allow_outside_files": "outside"}
     words = {**vars(studied), **vars(points), **devices.arguments, "variant": common.variant}

@@ -22,7 +22,13 @@ def view(
     devices: Devices,
     common: Common,
 ) -> int:
-    """Draw the bench to scale, with its distances and what the camera sees of it, before any light is simulated."""
+    """Draw the bench to scale, before any light is simulated.
+
+    With its distances, the depths that light is seen at, and what the camera sees. A page (.html) can be turned.
+
+    $ mitsim view cookie_bag
+    $ mitsim view photograph -D sheet_z=420 -o bench.html
+    """
     from mitsim.bench.request import check_view
     from mitsim.core.files import check_apart, check_output, output_file
 

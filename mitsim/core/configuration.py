@@ -1,6 +1,7 @@
 """Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
 
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -22,6 +23,8 @@ _MOST_DOTS = 200
 """The parser takes a tenth of a second for a name of that many parts."""
 DEFAULT_CAMERA = "imx249"
 """Of a bench where none is named: the paper's."""
+_SERVES = "Serves: "
+"""Begin of the sentence of a file's first comment that says what the file is for."""
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 LARGEST = 1e12
 """Largest number of a device, and one over the smallest: far from any device, and products of a few stay finite."""
@@ -36,7 +39,7 @@ class Configuration(pydantic.BaseModel):
 
 
 def shipped_path(*parts: str) -> Path:
-    """A file or folder that comes with mitsim, for example ``shipped("calibration", "imx249.toml")`` of ``parts``.
+    """A file or folder that comes with mitsim, for example ``shipped_path("calibration", "imx249.toml")`` of ``parts``.
 
     A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
     """
@@ -131,9 +134,41 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: st
         return known
     if path.exists():
         return path / ending if inside and path.is_dir() else path
-    names = [place.parent.name for place in folder.glob(f"*/{ending}")] if inside else []
-    names = names or [place.stem for place in folder.glob(f"*{ending}")]
+    names = shipped_files(shelf, ending)
     raise MitsimError(
         f"{name}: no such file, and none of that name is shipped; {near_name(text, names)}"
-        f"shipped are {', '.join(sorted(names))}"
+        f"shipped are {', '.join(names)}"
     )
+
+
+def shipped_files(shelf: Literal["scenes", "calibration"], ending: str, field: str = "") -> dict[str, Path]:
+    """Paths of shipped files by their names.
+
+    Parameters
+    ----------
+    shelf, ending
+        as :func:`locate` takes them.
+    field
+        which each of the files has, where they are TOML: cameras, projectors and lists lie on one shelf.
+    """
+    if not ending.startswith("."):
+        return {path.parent.name: path for path in sorted(shipped_path(shelf).glob(f"*/{ending}"))}
+    files = sorted(shipped_path(shelf).glob(f"*{ending}"))
+    return {path.stem: path for path in files if not field or field in read_toml(path)}
+
+
+_OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)-->|((?:#[^\n]*\n)+)", re.DOTALL)
+"""Comment that opens a scene, or a TOML file."""
+
+
+def opening_words(path: Path) -> tuple[str, str]:
+    """What the comment that opens the scene or TOML file ``path`` says: its first sentence, and what follows "Serves:"
+    in it; empty where it does not."""
+    opening = _OPENING.match(path.read_text(encoding="utf-8"))
+    if opening is None:
+        return "", ""
+    text = " ".join((opening[1] or re.sub("(?m)^#", "", opening[2] or "")).split())
+    # A full stop that ends a sentence stands before a capital; "0.90" and "e.g. a sheet" do not.
+    sentences = re.split(r"(?<=\.) (?=[A-Z])", text)
+    serves = next((each for each in sentences if each.startswith(_SERVES)), "")
+    return sentences[0], serves.removeprefix(_SERVES).removesuffix(".")

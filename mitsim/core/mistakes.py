@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import functools
-import inspect
-import itertools
 import math
 import reprlib
 import sys
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 import pydantic
 
 from mitsim.core.errors import MitsimError, cut
+from mitsim.core.field_docs import meanings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -251,25 +248,6 @@ def _about(model: type[pydantic.BaseModel], place: Place, names: Sequence[str | 
 
 
 @functools.cache
-def meanings(model: type[pydantic.BaseModel]) -> dict[str, str]:
-    """What each field of a ``model`` is: the first paragraph of the docstring below it, as tables and refusals have it;
-    nothing where the source is not there."""
-    found: dict[str, str] = {}
-    for base in reversed([one for one in model.__mro__ if issubclass(one, pydantic.BaseModel) and one.model_fields]):
-        try:
-            (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
-        body = getattr(written, "body", [])
-        for field, below in itertools.pairwise(body):
-            text = getattr(getattr(below, "value", None), "value", None)
-            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(text, str):
-                text = " ".join(text.split("\n\n")[0].split()).removesuffix(".")
-                plain = len(text) > 1 and (text[1].islower() or text[1] == " ")
-                found[ast.unparse(field.target)] = text[0].lower() + text[1:] if plain else text
-    return found
-
-
 def _near_field(model: type[pydantic.BaseModel], place: Place) -> str:
     """The field that the unknown name at the end of a ``place`` may mean; empty without one."""
     fields = getattr(_holder(model, place[:-1]), "model_fields", ())

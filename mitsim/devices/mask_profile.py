@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, cast, get_args
 
 import numpy as np
@@ -19,6 +21,16 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
 from mitsim.devices.plate import LARGEST, Plate, make_square, read_drawing
 
+KINDS: Mapping[str, str] = MappingProxyType({
+    "separable": "a maximum length sequence times itself, a quarter of it open",
+    "flatcam": "the same in two terms, as a FlatCam has it, half of it open",
+    "open": "an aperture of the same size, all of it open",
+    "mura": "one period of a modified uniformly redundant array (Gottesman and Fenimore, Appl. Opt. 28, 4344, 1989)",
+    "random": "every feature open or closed by a draw of its own",
+    "drawing": "a picture or array of transmissions, a feature each",
+    "psf": "a phase mask by its point spread function, measured or rendered",
+})  # fmt: skip
+"""What each kind of mask is."""
 _OWN = {
     **dict.fromkeys(get_args(MaskKind), ("order",)),
     "mura": ("features",),
@@ -53,7 +65,7 @@ class MaskProfile(Configuration):
     """What a mask is made of; the scene states where it stands."""
 
     kind: Literal["separable", "flatcam", "open", "mura", "random", "drawing", "psf"]
-    """Which kind of mask it is."""
+    """What it is made as; `mitsim list masks` says what each is."""
     feature_mm: float = Field(ge=1e-6, le=1e3)
     """Side of a feature, or of a picture's pixel [mm].
 

@@ -333,7 +333,9 @@ def pattern_family(
 
 @pattern_family("uniform")
 def uniform(axis: PatternAxis) -> PatternFactor:
-    """All pixels of an ``axis``, in one shot."""
+    """All pixels lit, in one frame.
+
+    On one ``axis`` a single pattern."""
     import numpy as np
 
     return np.ones((axis.n, 1), dtype=np.int8)
@@ -341,7 +343,9 @@ def uniform(axis: PatternAxis) -> PatternFactor:
 
 @pattern_family("dots:K", "dots:RxC")
 def shifting_dots(axis: PatternAxis) -> PatternFactor:
-    """Column i lights every K-th pixel of an ``axis`` from i on; their number need not be a multiple of K."""
+    """Every K-th pixel lit, in each frame others.
+
+    Column i lights every K-th pixel of an ``axis`` from i on; their number need not be a multiple of K."""
     import numpy as np
 
     return np.asarray(np.arange(axis.n)[:, None] % axis.k == np.arange(axis.k)[None, :], dtype=np.int8)
@@ -349,7 +353,9 @@ def shifting_dots(axis: PatternAxis) -> PatternFactor:
 
 @pattern_family("hadamard:K", label="Hadamard", signed=lambda k: k > 1, check=way_to)
 def repeated_hadamard(axis: PatternAxis) -> PatternFactor:
-    """The rows of the Hadamard matrix of order K, repeated down the pixels of an ``axis``; +-1."""
+    """Half of all pixels lit, by a Hadamard matrix.
+
+    The rows of the matrix of order K, repeated down the pixels of an ``axis``; +-1."""
     import numpy as np
 
     return np.asarray(hadamard_matrix(axis.k)[np.arange(axis.n) % axis.k])
@@ -357,7 +363,9 @@ def repeated_hadamard(axis: PatternAxis) -> PatternFactor:
 
 @pattern_family("random:K", random=True)
 def random_binary(axis: PatternAxis) -> PatternFactor:
-    """Fair coin flips, each pixel of an ``axis`` lit by at least one column: the union must cover the scene."""
+    """Pixels lit by the fall of a coin.
+
+    Each pixel of an ``axis`` is lit by at least one column: the union must cover the scene."""
     import numpy as np
 
     rng = stream(axis.seed, "patterns", "random", axis.name)

@@ -447,7 +447,8 @@ class Tikhonov(Solver):
 
 
 class Markov(Tikhonov):
-    """The same where neighbouring pixels are alike: lambda times X in the metric of their inverse covariance."""
+    """Least squares where neighbouring pixels are alike, for noisy frames: lambda times X in the metric of their
+    inverse covariance."""
 
     name, whole = MARKOV, True
 
@@ -457,7 +458,7 @@ class Markov(Tikhonov):
 
 
 class Nonnegative(Tikhonov):
-    """Tikhonov's least squares among images within bounds, by iterations."""
+    """Least squares among images within bounds, by iterations."""
 
     name, linear = NONNEGATIVE, False
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validate
 from mitsim.core.errors import MitsimError
+from mitsim.core.field_docs import toml_value
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.emva import LEAST_DARK
 from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform
@@ -87,20 +88,9 @@ class FoundCamera:
         lines += [f"# {note}" for note in self.notes]
         lines.append("")
         for name, value in self.sensor.model_dump(exclude_defaults=True).items():
-            text = (
-                f'"{_quote(value)}"'
-                if isinstance(value, str)
-                else str([*value])
-                if isinstance(value, tuple)
-                else repr(value)
-            )
             error = self.errors.get(name)
-            lines.append(f"{name} = {text}" + (f"  # +- {error:.2g}" if error else ""))
+            lines.append(f"{name} = {toml_value(value)}" + (f"  # +- {error:.2g}" if error else ""))
         return "\n".join(lines) + "\n"
-
-
-def _quote(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
 def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> FoundCamera:

@@ -1,4 +1,4 @@
-"""A calibration session in; how far its factors are off, by entry, by singular value and by cause, and its cost, out.
+"""`mitsim study calibration`: how far a session's factors are off, by entry, singular value and cause; what it costs.
 
 Factors of noisy frames are compared with those of the expected frames of the same light, whose difference is noise
 alone; how large it may be is predicted from the sensor's closed form, before any frame is drawn. What no separable

@@ -7,7 +7,6 @@ families and exposure conventions uses the same light, which is traced once.
 from __future__ import annotations
 
 import math
-import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +20,7 @@ from mitsim.acquire.capture import expose, trace_request
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Exposure, Request
 from mitsim.calibrate.board_session import Session
+from mitsim.core.configuration import opening_words
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
@@ -40,9 +40,6 @@ from mitsim.studies.framework.run import DEMO_FOLDERS, DEMO_PAGE, study_folder
 
 _BEFORE, _AFTER = ("uniform", "dots:4", "dots:5"), ("hadamard:8",)
 """Families that the main one stands between in the report: the paper's, from the fewest frames to the most."""
-
-
-_OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)-->", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -244,13 +241,7 @@ def scene_line(path: Path) -> str:
 
     A comment further down speaks of its own element and is left alone.
     """
-    name = path.resolve().parent.name
-    opening = _OPENING.match(path.read_text(encoding="utf-8"))
-    if opening is None:
-        return name
-    text = " ".join(opening[1].split())
-    # A full stop that ends a sentence stands before a capital; "0.90" and "e.g. a sheet" do not.
-    sentence = re.split(r"(?<=\.) (?=[A-Z])", text)[0]
+    name, (sentence, _) = path.resolve().parent.name, opening_words(path)
     return f"{name}: {sentence}" if sentence else name
 
 

@@ -39,7 +39,7 @@ VERBS = (
         "characterise",
         "sense",
     ),
-    *("export", "import", "patterns", "transport", "doctor", "pairs", "train"),
+    *("export", "import", "patterns", "transport", "list", "new", "doctor", "pairs", "train"),
 )
 CONSTANT = '<emitter type="constant"><spectrum name="radiance" value="0.01"/></emitter>'
 

@@ -7,13 +7,16 @@ licences.
 from __future__ import annotations
 
 import hashlib
-import importlib
+import importlib.util
 import json
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from itertools import product
 from math import prod
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request
@@ -118,6 +121,8 @@ class Point:
 
 # -------- What a study declares
 
+_PYTHON = ".py"
+"""End of the name of a study in a file."""
 IMAGE = "image"
 """The (n, n) reflectance that a point came to, where it is kept."""
 TRUTH = "truth"
@@ -298,7 +303,7 @@ def group_by_setup(points: Sequence[Point]) -> list[Point]:
 
 
 def find_experiment(name: str) -> Experiment:
-    """The experiment ``name``, a shipped one or a module of the user's with a dot in its name.
+    """The experiment ``name``: a shipped one, or one of the user's, a file or a module with a dot in its name.
 
     MitsimError for another name, with those that there are, and for a module without an ``EXPERIMENT``.
     """
@@ -306,13 +311,25 @@ def find_experiment(name: str) -> Experiment:
         raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
-        loaded = importlib.import_module(module)
+        loaded = _load_file(module) if module.endswith(_PYTHON) else importlib.import_module(module)
         found: Experiment = loaded.EXPERIMENTS[name] if name in SHARED else loaded.EXPERIMENT
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise MitsimError(
-            f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT"
+            f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT, as "
+            "`mitsim new study NAME` writes one"
         ) from error
     return found
+
+
+@cache
+def _load_file(path: str) -> Any:
+    """The module in a file, which is run once."""
+    found = importlib.util.spec_from_file_location(f"mitsim_study_{Path(path).stem}", path)
+    assert found is not None and found.loader is not None, "a file of Python has a loader"
+    module = importlib.util.module_from_spec(found)
+    sys.modules[found.name] = module  # dataclasses of the file look for it there
+    found.loader.exec_module(module)
+    return module
 
 
 def is_experiment(name: str) -> bool:

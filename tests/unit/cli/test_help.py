@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
+import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from unittest.mock import patch
 
 import pytest
 import typer
@@ -14,6 +18,7 @@ from typer.testing import CliRunner
 
 from mitsim.cli import app
 from mitsim.cli.frame_verbs import method_names
+from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, parts_of
 from mitsim.cli.options import Seed, option, verb
 from mitsim.devices.patterns import pattern_names
 
@@ -35,14 +40,25 @@ def described(command: Any) -> dict[str, Any]:
             "default": default if isinstance(default, str | int | float | None) else str(default),
             "shown": parameter.show_default,
             "required": parameter.required,
+            "panel": parameter.rich_help_panel,
             "several": getattr(parameter, "multiple", False) or parameter.nargs != 1,
         }
     return {"help": command.help, "options": options}
 
 
+PROGRAM: Any = typer.main.get_command(app)
+
+
 def found() -> dict[str, Any]:
-    verbs = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    return {name: described(command) for name, command in verbs.items()}
+    return {name: described(command) for name, command in PROGRAM.commands.items()}
+
+
+def page(*verb: str, columns: int = 80) -> str:
+    context = typer.Context(PROGRAM, info_name="mitsim")
+    for name in verb:
+        context = typer.Context(PROGRAM.commands[name], info_name=name, parent=context)
+    with patch.dict(os.environ, COLUMNS=str(columns)):
+        return re.sub(r"\x1b\[\d+m", "", context.command.get_help(context))
 
 
 def test_the_verbs_have_the_options_of_the_list() -> None:
@@ -52,14 +68,68 @@ def test_the_verbs_have_the_options_of_the_list() -> None:
         assert now == listed[name], name
 
 
+# ---- pages -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_program_says_in_a_line_what_each_verb_is_for() -> None:
+    """Whole sentences, each on one line of 80 columns, every verb below one heading. (Planted: a first line of two
+    lines' length; a verb of another heading between two of one.)"""
+    lines = page().splitlines()
+    for name, command in PROGRAM.commands.items():
+        summary, *_ = parts_of(command.help)
+        assert summary.endswith(".") and sum(summary in line for line in lines) == 1, name
+        assert f"  {name} " in next(line for line in lines if summary in line)
+    headings = [line for line in lines if line.endswith(":")]
+    assert len(headings) == len({*headings}) == len({each.rich_help_panel for each in PROGRAM.commands.values()}) + 1
+
+
+@pytest.mark.parametrize("verb", PROGRAM.commands)
+def test_a_page_can_be_read(verb: str) -> None:
+    """Options below their headings, in one order, defaults without brackets, no line cut or longer than the terminal,
+    wide or narrow. (Planted: a default in brackets; widths that are not narrowed; a panel that is not shown.)"""
+    command = PROGRAM.commands[verb]
+    for columns in (80, 44):
+        lines = page(verb, columns=columns).splitlines()
+        told = lines[: lines.index("Examples:")]
+        assert max(map(len, told)) <= columns, (columns, max(told, key=len))
+        headings = [line[:-1] for line in told if line.endswith(":") and not line.startswith(" ")]
+        assert headings == [each for each in ("Arguments", WHAT, QUALITY, DEVICES, OUTPUT, LIMITS) if each in headings]
+        text = " ".join(" ".join(told).split())
+        assert "default" not in text or "; default " in text
+        assert "[default" not in text and "default (" not in text and "default None" not in text
+        for each in command.params:
+            names = re.escape(", ".join(sorted(each.opts, key=len)))
+            named = [line for line in told if re.match(rf"  {names}( |$)", line)]
+            assert each.param_type_name == "argument" or len(named) == 1, each.opts
+    assert max(map(len, page(verb).splitlines())) <= 80
+
+
+@pytest.mark.parametrize("verb", PROGRAM.commands)
+def test_examples_of_a_page_are_command_lines(verb: str) -> None:
+    """Of the verb, one at least, and as the program takes them. (Planted: `--pattern` for `--patterns`.)"""
+    *_, examples = parts_of(PROGRAM.commands[verb].help)
+    assert any(line.startswith(f"mitsim {verb}") for line in examples)
+    for line in examples:
+        program, name, *words = shlex.split(line)
+        assert program == "mitsim" and f"  {line}" in page(verb).splitlines()
+        PROGRAM.commands[name].make_context(name, words)
+
+
+# ---- groups of options -----------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Base:
+    PANEL = OUTPUT
+
     seed: Seed = 0
     quick: bool = option(False, "a few", "--quick")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Group(Base):
+    PANEL = WHAT
+
     name: str = option(..., "of it", metavar="NAME")
     sizes: list[int] | None = option(None, "of it")
 
@@ -83,6 +153,13 @@ def test_the_fields_of_a_group_are_options() -> None:
     words = "there --seed 3 --sizes 1 --sizes 2 --quick --last 5 --name y"
     assert call(*words.split()) == ("COMMANDLINE", "there", Group(seed=3, quick=True, name="y", sizes=[1, 2]), 5)
     assert [*inspect.signature(verb(of_a_group)).parameters] == ["name", "sizes", "seed", "quick"]
+
+
+def test_a_group_names_the_heading_of_its_own_options() -> None:
+    """Not of those that it inherits, nor of one that names another. (Planted: the last group's for all.)"""
+    options = inspect.signature(verb(of_a_group)).parameters.values()
+    panels = {each.name: each.annotation.__metadata__[0].rich_help_panel for each in options}
+    assert panels == {"name": WHAT, "sizes": WHAT, "seed": QUALITY, "quick": OUTPUT}
 
 
 def of_a_group(group: Group) -> int:

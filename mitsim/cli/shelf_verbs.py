@@ -1,0 +1,347 @@
+"""`mitsim list` and `mitsim new`: the name of a kind in; what there is of it, or a file to begin with, out."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsim.cli.help_page import WHAT
+from mitsim.cli.options import CAMERA, PROJECTOR, SESSION, Common, completing, refuse_unused, verb
+from mitsim.cli.screen import finish
+from mitsim.core.configuration import DEFAULT_CAMERA, load_model, opening_words, read_toml, shipped_files
+from mitsim.core.errors import MitsimError, near_name
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+# ---- `mitsim list` ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing that a command line may name.
+
+    Attributes
+    ----------
+    name
+        as it is typed.
+    serves
+        what it is for, in a line.
+    what
+        it is, where that is another line.
+    """
+
+    name: str
+    serves: str
+    what: str = ""
+
+
+def _scenes() -> Iterator[Entry]:
+    for name, path in shipped_files("scenes", "scene.xml").items():
+        what, serves = opening_words(path)
+        yield Entry(name, serves, what)
+
+
+def _cameras() -> Iterator[Entry]:
+    from mitsim.devices.sensor import load_sensor
+
+    for name, path in shipped_files("calibration", ".toml", CAMERA).items():
+        sensor = load_sensor(path)
+        verbs = "capture, sense, characterise" if sensor.states_efficiency else "capture in colour, characterise"
+        if sensor.sensor_only:
+            verbs = "sensor only, to characterise; its quantum efficiency is not known"
+        yield Entry(name, verbs, f"{sensor.name}, pixels of {sensor.superpixel_pitch_um:g} um")
+
+
+def _projectors() -> Iterator[Entry]:
+    for name, path in shipped_files("calibration", ".toml", PROJECTOR).items():
+        yield Entry(name, opening_words(path)[1], read_toml(path)["name"])
+
+
+def _masks() -> Iterator[Entry]:
+    from mitsim.devices.mask_profile import KINDS as MASKS
+
+    yield from (Entry(name, what) for name, what in MASKS.items())
+
+
+def _studies() -> Iterator[Entry]:
+    """Read from the source, for to import all studies takes three seconds."""
+    from mitsim.studies import EXPERIMENTS, SHARED, STUDIES
+
+    for name in EXPERIMENTS:
+        tree = _source(f"mitsim.studies.{SHARED.get(name, f'{name}_study')}")
+        calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > 2)
+        named = next(call for call in calls if isinstance(call.args[0], ast.Constant) and call.args[0].value == name)
+        yield Entry(name, ast.literal_eval(named.args[2]))
+    for name in STUDIES:
+        yield Entry(name, _first_line(_source(f"mitsim.studies.{name}_study")).partition("`: ")[2].removesuffix("."))
+
+
+def _effects() -> Iterator[Entry]:
+    from mitsim.bench.effects import DISCRETISED, EFFECTS
+
+    yield from (Entry(name, what) for name, what in DISCRETISED.items())
+    yield from (Entry(name, effect.what) for name, effect in EFFECTS.items())
+
+
+def _methods() -> Iterator[Entry]:
+    """Those of the solver, and those that are learned, read from the source, for torch may be missing."""
+    from mitsim.learn.training_request import METHODS
+    from mitsim.reconstruct.solvers import SOLVERS
+
+    for name, solver in SOLVERS.items():
+        yield Entry(name, _clause(str(type(solver).__doc__)))
+    classes = {node.name: node for node in _source("mitsim.learn.methods").body if isinstance(node, ast.ClassDef)}
+    words = {name.lower(): _clause(_first_line(node)) for name, node in classes.items()}
+    for name in METHODS:
+        yield Entry(name, f"{words[name.replace('-', '')]}; to be trained")
+
+
+def _patterns() -> Iterator[Entry]:
+    from mitsim.devices.patterns import FAMILIES
+
+    for family in FAMILIES.values():
+        yield Entry(", ".join(family.forms), _clause(str(family.factor.__doc__)))
+
+
+KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
+    "scenes": _scenes,
+    "cameras": _cameras,
+    "projectors": _projectors,
+    "masks": _masks,
+    "studies": _studies,
+    "effects": _effects,
+    "methods": _methods,
+    "patterns": _patterns,
+}
+"""What `mitsim list` knows: of each kind all that there is, as the files and modules say that have it."""
+
+
+def _source(module: str) -> ast.Module:
+    """The text of a ``module``, which is not run."""
+    found = importlib.util.find_spec(module)
+    assert found is not None and found.origin is not None, module
+    return ast.parse(Path(found.origin).read_text(encoding="utf-8"))
+
+
+def _first_line(node: ast.Module | ast.ClassDef) -> str:
+    return " ".join((ast.get_docstring(node) or "").partition("\n\n")[0].split())
+
+
+def _clause(text: str) -> str:
+    """What a docstring says before its first colon or full stop, as a part of a sentence."""
+    first = " ".join(text.split("\n\n")[0].split()).split(": ")[0].split(". ")[0].removesuffix(".")
+    return first[0].lower() + first[1:] if first[1:2].islower() or first[1:2] == " " else first
+
+
+@verb
+def list_(
+    *,
+    kind: Annotated[
+        str | None,
+        typer.Argument(
+            help=f"{', '.join(KINDS)}; all if not given", metavar="[KIND]", autocompletion=completing(lambda: KINDS)
+        ),
+    ] = None,
+    common: Common,
+) -> int:
+    """Scenes, devices, studies, effects, methods: what each is for.
+
+    $ mitsim list scenes
+    $ mitsim list cameras --json
+    """
+    if kind is not None and kind not in KINDS:
+        raise MitsimError(f"list {kind}: no such kind; {near_name(kind, KINDS)}use {', '.join(KINDS)}")
+    found = {name: [*entries()] for name, entries in KINDS.items() if kind in (None, name)}
+    lines: list[str] = []
+    for name, entries in found.items():
+        lines += [] if kind else [*([""] if lines else []), f"{name}:"]
+        lines += _rows(entries, 0 if kind else 2)
+    return finish(
+        common.as_json, {name: [asdict(each) for each in entries] for name, entries in found.items()}, lines, ()
+    )
+
+
+def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
+    """Names, and what each is and serves for beside them, as wide as the terminal."""
+    first = max(len(each.name) for each in entries) + indent + 2
+    width = max(shutil.get_terminal_size().columns, first + 20)
+    for each in entries:
+        text = each.serves if not each.what or each.what.endswith(".") else f"{each.what}: {each.serves}"
+        name = f"{'':{indent}}{each.name}".ljust(first)
+        yield from textwrap.wrap(name + text, width, subsequent_indent=" " * first, break_on_hyphens=False)
+
+
+# ---- `mitsim new` ----------------------------------------------------------------------------------------------------
+
+_NAME = re.compile(r"[A-Za-z][\w-]*")
+_MASK = {"kind": "separable", "feature_mm": 0.06, "order": 9}
+"""The mask of the shipped scenes."""
+_HEAD = "# To set a field after a #, take the # away, and that of its table; what it says is its default.", ""
+_LIST = {"patterns": "dots:7", "n": 128}
+"""What `mitsim import` needs beside a camera and an exposure."""
+
+
+@dataclass(frozen=True)
+class _Starter:
+    """What a kind begins with.
+
+    Attributes
+    ----------
+    use
+        command that takes the file {}.
+    lines
+        of the file, from its name and the path of the shipped one that it is like; None: a folder, a copy.
+    like
+        name of that one, unless another is asked for; empty: there is none.
+    field
+        by which shipped files of the kind are known, on the shelf that they share.
+    """
+
+    use: str
+    lines: Callable[[str, Path], Iterator[str]] | None
+    like: str = ""
+    field: str = ""
+
+    def files(self) -> Mapping[str, Path]:
+        """Files that one may be like, by name."""
+        return shipped_files("calibration", ".toml", self.field) if self.field else shipped_files("scenes", "scene.xml")
+
+
+def _camera(name: str, like: Path) -> Iterator[str]:
+    from mitsim.core.field_docs import starter
+    from mitsim.devices.sensor import SensorModel, load_sensor
+
+    return starter(SensorModel, _begun_as(like, load_sensor(like), name=name))
+
+
+def _mask(name: str, like: Path) -> Iterator[str]:
+    from mitsim.core.field_docs import starter
+    from mitsim.devices.mask_profile import MaskProfile
+
+    yield from _camera(name, like)
+    yield ""
+    yield from starter(MaskProfile, _MASK, "mask")
+
+
+def _projector(name: str, like: Path) -> Iterator[str]:
+    from mitsim.core.field_docs import starter
+    from mitsim.devices.projector import ProjectorModel
+
+    return starter(ProjectorModel, _begun_as(like, load_model(like, ProjectorModel), name=name))
+
+
+def _session(_: str, like: Path) -> Iterator[str]:
+    from mitsim.core.field_docs import starter
+    from mitsim.devices.session import SessionRecipe, load_recipe
+
+    return starter(SessionRecipe, _begun_as(like, load_recipe(like)))
+
+
+def _list(_: str, __: Path) -> Iterator[str]:
+    from mitsim.core.field_docs import starter
+    from mitsim.exchange.capture_list import CaptureList
+
+    return starter(CaptureList, _LIST)
+
+
+def _study(name: str, _: Path) -> Iterator[str]:
+    found = importlib.util.find_spec("mitsim.studies.starter_study")
+    assert found is not None and found.origin is not None
+    yield Path(found.origin).read_text(encoding="utf-8").replace('"starter"', f'"{name}"').rstrip()
+
+
+def _begun_as(like: Path, model: BaseModel, **more: str) -> dict[str, Any]:
+    """Fields of a file: those that the file ``like`` sets, of the ``model`` in it, and ``more``."""
+    return {**model.model_dump(exclude_unset=True), **more, "source": f"as the shipped {like.stem}, to be replaced"}
+
+
+_CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
+_STARTERS = {
+    "camera": _Starter(_CAPTURE, _camera, DEFAULT_CAMERA, CAMERA),
+    "projector": _Starter("mitsim plan photograph --projector {}", _projector, "mp_cl1", PROJECTOR),
+    "scene": _Starter("mitsim plan {}/scene.xml", None, "photograph"),
+    "mask": _Starter(_CAPTURE, _mask, DEFAULT_CAMERA, CAMERA),
+    "session": _Starter("mitsim calibrate photograph -o cal --recipe {}", _session, "session", SESSION),
+    "study": _Starter("mitsim study {} -o study --quick", _study),
+    "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS", _list),
+}
+
+
+@verb
+def new(
+    *,
+    context: typer.Context,
+    kind: Annotated[
+        str,
+        typer.Argument(help=", ".join(_STARTERS), metavar="KIND", autocompletion=completing(lambda: _STARTERS)),
+    ],
+    name: Annotated[str, typer.Argument(help="letters, digits, - and _, a letter first", metavar="NAME")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="file to make, of a scene a folder; named after NAME if not given", metavar="PATH"
+        ),
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option(
+            help="shipped one that it begins as",
+            metavar="NAME",
+            show_default="imx249, mp_cl1, photograph, session",
+            rich_help_panel=WHAT,
+            autocompletion=completing(
+                lambda: (*shipped_files("scenes", "scene.xml"), *shipped_files("calibration", ".toml"))
+            ),
+        ),
+    ] = None,
+    common: Common,
+) -> int:
+    """A file to begin with: commented, whole, valid as it is.
+
+    Each field says what it is and what it may be. A mask is a camera file with a table [mask], a session is a recipe
+    of calibrate --recipe, a list is of import --list.
+
+    $ mitsim new camera mine
+    $ mitsim new scene bench --like cookie_bag
+    $ mitsim new study tilt -o studies/tilt.py
+    """
+    from mitsim.core.files import output_file, whole_folder, write_text
+
+    if kind not in _STARTERS:
+        raise MitsimError(f"new {kind}: no such kind; {near_name(kind, _STARTERS)}use {', '.join(_STARTERS)}")
+    if not _NAME.fullmatch(name):
+        raise MitsimError(f"new {kind} {name!r}: give a name of letters, digits, - and _ that begins with a letter")
+    begin = _STARTERS[kind]
+    if not begin.like:
+        refuse_unused(context, ["like"], f"on a {kind}, of which there is one to begin with")
+    ending = ".py" if kind == "study" else "" if begin.lines is None else ".toml"
+    output = output or Path(f"{name}{ending}")
+    if output.suffix != ending and ending:
+        raise MitsimError(f"--output {output}: a {kind} is a file that ends in {ending}; give such a name")
+    known = begin.files() if begin.like else {"": Path()}
+    source = known.get(like or begin.like)
+    if source is None:
+        raise MitsimError(
+            f"--like {like}: is no shipped {kind}; {near_name(str(like), known)}shipped are {', '.join(known)}"
+        )
+    use = begin.use.format(output)
+    if begin.lines is None:
+        with whole_folder(output) as folder:
+            shutil.copytree(source.parent, folder, dirs_exist_ok=True)
+    else:
+        head = [f"# {kind.capitalize()} {name}, for: {use}", *_HEAD] if ending == ".toml" else []
+        text = "\n".join([*head, *begin.lines(name, source)]) + "\n"
+        with output_file(output) as place:
+            write_text(place, text)
+    payload = {"kind": kind, "name": name, "output": str(output), "use": use}
+    return finish(common.as_json, payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"], ())

@@ -1,0 +1,221 @@
+"""`mitsim list` and `mitsim new`: what there is, said from where it stands; files to begin with, which load at once."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import typer
+
+from mitsim.bench.effects import SWITCHES
+from mitsim.cli import app
+from mitsim.cli.shelf_verbs import KINDS
+from mitsim.core.configuration import load_model, shipped_path
+from mitsim.devices.mask_profile import load_mask
+from mitsim.devices.patterns import read_name
+from mitsim.devices.projector import ProjectorModel
+from mitsim.devices.sensor import load_sensor
+from mitsim.devices.session import load_recipe
+from mitsim.exchange.capture_list import load_capture_list
+from mitsim.learn.training_request import METHODS as LEARNED
+from mitsim.reconstruct.request import METHODS
+from mitsim.studies import EXPERIMENTS, STUDIES
+from mitsim.studies.framework.experiment import Scope, Setup, find_experiment
+
+PROGRAM: Any = typer.main.get_command(app)
+
+
+def test_a_list_has_all_that_there_is() -> None:
+    """And says of each what it is for, on one line. (Planted: studies' titles in place of their questions; an effect
+    without a word.)"""
+    listed = {kind: [*entries()] for kind, entries in KINDS.items()}
+    names = {kind: [each.name for each in entries] for kind, entries in listed.items()}
+    assert {*names["scenes"]} == {path.parent.name for path in shipped_path("scenes").glob("*/scene.xml")}
+    shelf = {path.stem for path in shipped_path("calibration").glob("*.toml")}
+    assert shelf - {"session", "drift", "flatcam", "diffusercam"} == {*names["cameras"], *names["projectors"]}
+    assert names["effects"] == [*SWITCHES] and names["methods"] == [*METHODS, *LEARNED]
+    assert {*names["studies"]} == {*EXPERIMENTS, *STUDIES}
+    assert all(each.serves.endswith("?") == (each.name in EXPERIMENTS) for each in listed["studies"])
+    for entry in (entry for entries in listed.values() for entry in entries):
+        assert len(entry.serves) > 12 and "\n" not in entry.serves + entry.what, entry
+        assert not entry.serves.endswith(".") and "`" not in entry.serves, entry
+
+
+@pytest.mark.slow
+def test_a_study_is_listed_by_the_question_that_it_asks() -> None:
+    """Read from its text, as Python has it."""
+    listed = {entry.name: entry.serves for entry in KINDS["studies"]()}
+    assert {name: find_experiment(name).question for name in EXPERIMENTS} == {
+        name: listed[name] for name in EXPERIMENTS
+    }
+
+
+def test_a_camera_without_efficiency_says_that_it_is_a_sensor_only() -> None:
+    """By its file. (Planted: every camera captures.)"""
+    for entry in KINDS["cameras"]():
+        sensor = load_sensor(shipped_path("calibration", f"{entry.name}.toml"))
+        assert entry.serves.startswith("sensor only") == (sensor.mosaic is None and not sensor.states_efficiency)
+        assert entry.what.startswith(sensor.name)
+
+
+def test_lists_fit_the_terminal(shell_of: Callable[..., Any]) -> None:
+    """Names first, what follows them below what they say. (Planted: no hanging indent.)"""
+    with patch.dict(os.environ, COLUMNS="60"):
+        lines = shell_of("list", "studies").splitlines()
+    assert max(map(len, lines)) <= 60
+    first = lines[0].index("What do")
+    assert all(line[:first].split() in ([name] if (name := line[:first].strip()) else [[]], []) for line in lines)
+    every = json.loads(shell_of("list", "--json"))
+    assert [*every] == [*KINDS] and every["scenes"][0]["name"] == "cards"
+    assert every["scenes"][0]["what"].startswith("Two printed diffuse cards")
+
+
+@pytest.fixture
+def shell_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a command line prints, which ends well."""
+
+    def call(*words: object) -> str:
+        assert PROGRAM.main([*map(str, words)], standalone_mode=False) == 0
+        return capsys.readouterr().out
+
+    return call
+
+
+# ---- files to begin with ---------------------------------------------------------------------------------------------
+
+
+def begun(shell_of: Callable[..., str], kind: str, path: Path, *words: str) -> Path:
+    found = json.loads(shell_of("new", kind, "mine", "-o", path, *words, "--json"))
+    assert found["output"] == str(path) and str(path) in found["use"] and found["use"].startswith("mitsim ")
+    return path
+
+
+@pytest.mark.parametrize("like", ["imx249", "imx477", "ov5647"])
+def test_a_new_camera_loads(shell_of: Callable[..., str], tmp_path: Path, like: str) -> None:
+    """With the numbers of the one that it is like, and every field named once. (Planted: fields that have a value and
+    are left out of the file; a field without a default that is no comment.)"""
+    path = begun(shell_of, "camera", tmp_path / "x.toml", "--like", like)
+    made, other = load_sensor(path), load_sensor(shipped_path("calibration", f"{like}.toml"))
+    assert made.model_copy(update={"name": other.name, "source": other.source}) == other and made.name == "mine"
+    text = path.read_text(encoding="utf-8")
+    for name in type(made).model_fields:
+        assert sum(line.lstrip("#[").startswith((f"{name} =", f"{name}]")) for line in text.splitlines()) == 1, name
+    assert "Distance between centres of pixels in a row, um. Allowed: 0.001 to 10000." in text
+    assert "PydanticUndefined" not in text
+    assert all(len(line) <= 100 for line in text.splitlines()[1:] if line.startswith("#"))
+
+
+def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_path: Path) -> None:
+    projector = load_model(begun(shell_of, "projector", tmp_path / "p.toml"), ProjectorModel)
+    assert (projector.name, projector.columns) == ("mine", 1920)
+    mask = begun(shell_of, "mask", tmp_path / "m.toml")
+    found = load_mask(mask)
+    assert load_sensor(mask).name == "mine" and found is not None and found.kind == "separable"
+    assert load_recipe(begun(shell_of, "session", tmp_path / "s.toml")).signed_capture == "pair"
+    assert load_recipe(begun(shell_of, "session", tmp_path / "d.toml", "--like", "drift")).drift is not None
+    listed = load_capture_list(begun(shell_of, "list", tmp_path / "l.toml"))
+    read_name(str(listed.patterns), listed.n)
+
+
+def test_a_field_that_is_uncommented_takes_its_default(shell_of: Callable[..., str], tmp_path: Path) -> None:
+    """Every commented line of plain fields is one that the model takes. (Planted: defaults written as Python has
+    them.)"""
+    path = begun(shell_of, "camera", tmp_path / "x.toml")
+    made, plain = load_sensor(path), path.read_text(encoding="utf-8").split("\n#[")[0]
+    lines = [line[1:] if line.startswith("#") and line[1:2] != " " else line for line in plain.splitlines()]
+    path.write_text("\n".join(line for line in lines if not line.endswith("...")), encoding="utf-8")
+    assert load_sensor(path) == made
+
+
+def test_a_new_study_is_one(shell_of: Callable[..., str], tmp_path: Path) -> None:
+    """(Planted: the name of the one that it was copied from.)"""
+    study = find_experiment(str(begun(shell_of, "study", tmp_path / "tilt.py")))
+    points = study.points(Scope(Setup(), (None,), quick=True))
+    assert study.name == "mine" and len(points) == 4
+    assert {dict(point.setup.parameters)["sheet_z"] for point in points} == {"390", "400"}
+
+
+@pytest.mark.parametrize("like", ["photograph", "colour_checker"])
+def test_a_new_scene_is_a_folder_of_its_own(shell_of: Callable[..., str], tmp_path: Path, like: str) -> None:
+    folder = begun(shell_of, "scene", tmp_path / "bench", "--like", like)
+    shipped = shipped_path("scenes", like)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        path.name: path.read_bytes() for path in shipped.iterdir()
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "fragments"),
+    [
+        ("list camera", ["did you mean cameras?", "patterns"]),
+        ("new camra mine", ["did you mean camera?", "session"]),
+        ("new camera 2x", ["a name of letters"]),
+        ("new camera mine --like mp_cl1", ["no shipped camera", "imx249, imx249_rggb"]),
+        ("new scene mine --like photo", ["did you mean photograph?"]),
+        ("new study mine --like depth", ["--like", "leave it out"]),
+        ("new camera mine -o mine.txt", ["mine.txt", ".toml"]),
+        ("new camera mine -o there.toml", ["exists already"]),
+        ("new scene mine -o full", ["holds files already"]),
+    ],
+)
+def test_what_cannot_be_begun_is_refused(
+    words: str, fragments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one line, with nothing written. (Planted: files replaced.)"""
+    from mitsim.core.errors import MitsimError
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.toml").write_text("mine")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(MitsimError) as caught:
+        PROGRAM.main(words.split(), standalone_mode=False)
+    from mitsim.cli.options import message_of
+
+    message = message_of(caught.value)
+    assert all(fragment in message for fragment in fragments) and "\n" not in message, message
+    assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "there.toml").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_new_scene_and_camera_capture_their_first_frame(tmp_path: Path) -> None:
+    from tests.system.conftest import shell
+
+    for words in (["new", "scene", "bench"], ["new", "camera", "mine"], ["new", "projector", "lamp"]):
+        assert shell(*words, cwd=tmp_path).code == 0
+    devices = "--camera", "mine.toml", "--projector", "lamp.toml"
+    done = shell("capture", "bench", *devices, "-o", "run", "--patterns", "uniform", "--accuracy", "0.1", cwd=tmp_path)
+    assert done.code in (0, 1) and (tmp_path / "run" / "manifest.json").is_file(), done.err
+
+
+# ---- completion ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("mitsim cap", ["capture"]),
+        ("mitsim capture cookie", ["cookie_bag"]),
+        ("mitsim capture photograph --camera imx249", ["imx249", "imx249_rggb"]),
+        ("mitsim plan photograph --projector m", ["mp_cl1"]),
+        ("mitsim study dr", ["drift"]),
+        ("mitsim reconstruct run --method t", ["tikhonov", "tv"]),
+        ("mitsim train un", ["unrolled"]),
+        ("mitsim import frames --list f", ["flatcam"]),
+        ("mitsim list st", ["studies"]),
+        ("mitsim new camera mine --like imx25", ["imx250", "imx255"]),
+    ],
+)
+def test_a_shell_completes_names(line: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """(Planted: cameras among projectors.)"""
+    typed = line.split(" ")
+    asked = {"_MITSIM_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(typed) - 1)}
+    with patch.dict(os.environ, asked), pytest.raises(SystemExit) as ended:
+        PROGRAM.main([], prog_name="mitsim", standalone_mode=False)
+    assert ended.value.code == 0 and capsys.readouterr().out.split() == words
