@@ -41,7 +41,7 @@ def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.
     MitsimError
         for a picture that cannot be read or whose numbers are no reflectances, and as :func:`mitsim.open_bench`.
     """
-    path = picture if isinstance(picture, str | Path) else _kept(picture)
+    path = picture if isinstance(picture, str | Path) else _write_array(picture)
     return open_bench("photograph", picture=path, sheet_mm=size_mm, sheet_z=distance_mm, **options)
 
 
@@ -76,7 +76,7 @@ def shelf_scene(
 _ALLOWED = "give a file, or an array of real numbers 0 to 1 or of unsigned ones, (rows, columns) or (rows, columns, 3)"
 
 
-def _kept(picture: object) -> Path:
+def _write_array(picture: object) -> Path:
     """A file that holds an array, by its content: who opens the same scene again, in another process, finds it."""
     import numpy as np
 

@@ -113,7 +113,7 @@ class Layout:
         return (0.0, 0.0) if self.depths is None else self.parallax_between(*self.depths)
 
     def parallax_between(self, near: float, far: float) -> tuple[float, float]:
-        """The same between any two depths [mm], the nearer one and the farther one."""
+        """The same between the depths ``near`` and ``far`` [mm]."""
         step = 1 / near - 1 / far
         return self.moves[0] * step, self.moves[1] * step
 
@@ -187,7 +187,7 @@ def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
     if mesh.has_vertex_texcoords():
         held = [mesh.vertex_texcoord(corner) for corner in corners]
         uv = np.stack([np.stack([np.array(each.x), np.array(each.y)], axis=1) for each in held], axis=1)
-    weights, cells = _parted(max(parts, 1))
+    weights, cells = _split_ranges(max(parts, 1))
     points = np.einsum("wc,tcx->twx", weights, places).reshape(-1, 3)
     on_print = np.einsum("wc,tcx->twx", weights, uv).reshape(-1, 2)
     triangles = (np.arange(count)[:, None, None] * len(weights) + cells).reshape(-1, 3)
@@ -197,7 +197,7 @@ def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
     return points, triangles, _reflectance(mesh.bsdf(), at, len(points))
 
 
-def _parted(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _split_ranges(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Barycentric weights (k, 3) of a triangle's points where each of its edges has so many ``parts``, and its smaller
     triangles (parts^2, 3)."""
     place = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]

@@ -174,7 +174,7 @@ class BenchView:
         figure = Figure(figsize=(13, 8.6), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(3, 2, width_ratios=(2.3, 1))
-        draws = (self._plan_from_above, self._camera), (self._plan_from_side, self._seen), (self._words, self._aside)
+        draws = (self._plan_from_above, self._camera), (self._plan_from_side, self._preview), (self._words, self._aside)
         for row, both in enumerate(draws):
             for column, draw in enumerate(both):
                 draw(figure.add_subplot(grid[row, column]))
@@ -325,7 +325,7 @@ class BenchView:
         axes.set_ylabel("x [mm]", fontsize=_SMALL)
         _open(axes)
 
-    def _seen(self, axes: Axes) -> None:
+    def _preview(self, axes: Axes) -> None:
         """The preview from the sensor's place."""
         _show(axes, self.previews[0], "From the camera, without its mask")
 
@@ -423,7 +423,7 @@ class BenchView:
             "From above": self._alone(_PLAN_INCHES, self._plan_from_above),
             "From the camera's right side": self._alone(_PLAN_INCHES, self._plan_from_side),
             "The camera enlarged": self._alone(_PLAN_INCHES, self._camera),
-            "From the camera, without its mask": self._alone(_SQUARE_INCHES, self._seen),
+            "From the camera, without its mask": self._alone(_SQUARE_INCHES, self._preview),
             "From beside": self._alone(_SQUARE_INCHES, self._aside),
         }
         return render_page(

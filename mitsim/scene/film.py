@@ -50,10 +50,10 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
         if not films:
             tag = checked.outline.tag(mi.parser.SceneNode(node))
             raise tag.refusal("film", "none", "the camera file's rows and columns are its size; give it a <film>")
-        before = _stated(node.props, films[0])
+        before = _sensor_words(node.props, films[0])
         _set_pitch(node.props, sensor)
         _set_size(films[0], sensor)
-        after = _stated(node.props, films[0])
+        after = _sensor_words(node.props, films[0])
         if after != before:
             words = (
                 f"sensor {sensor.name!r}: {after}, as its camera file says; the scene's own, {before}, stand where no "
@@ -65,7 +65,7 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
 _FILMS = PLUGINS["film"].split()
 
 
-def _stated(camera: mi.Properties, film: mi.Properties) -> str:
+def _sensor_words(camera: mi.Properties, film: mi.Properties) -> str:
     """Pixels and pitch of a film in words."""
     column = float(camera.get("pixel_pitch", _PITCH))
     row = float(camera.get("row_pitch", column))

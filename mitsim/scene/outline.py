@@ -216,7 +216,7 @@ class Outline:
         """Where the file is that a user gave for the parameter that a ``tag`` is, if it is one."""
         value = tag.attributes.get("value", "")
         if value.startswith("$") and value[1:] in self._given:
-            path = str(self._files.named(value[1:], self._given[value[1:]]))
+            path = str(self._files.find_named(value[1:], self._given[value[1:]]))
             self.defines[value[1:]] = self._values[value[1:]] = path
 
     def _with_parameters(self, tag: Tag, text: str) -> str:
@@ -368,7 +368,7 @@ class SceneFiles:
         file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
         return self._find(tag, self.folder, name)
 
-    def named(self, parameter: str, name: str) -> Path:
+    def find_named(self, parameter: str, name: str) -> Path:
         """The whole path of the file that a user names in place of a scene's own, which may lie anywhere.
 
         Parameters
