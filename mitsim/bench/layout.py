@@ -187,7 +187,7 @@ def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
     if mesh.has_vertex_texcoords():
         held = [mesh.vertex_texcoord(corner) for corner in corners]
         uv = np.stack([np.stack([np.array(each.x), np.array(each.y)], axis=1) for each in held], axis=1)
-    weights, cells = _split_ranges(max(parts, 1))
+    weights, cells = _triangle_parts(max(parts, 1))
     points = np.einsum("wc,tcx->twx", weights, places).reshape(-1, 3)
     on_print = np.einsum("wc,tcx->twx", weights, uv).reshape(-1, 2)
     triangles = (np.arange(count)[:, None, None] * len(weights) + cells).reshape(-1, 3)
@@ -197,7 +197,7 @@ def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
     return points, triangles, _reflectance(mesh.bsdf(), at, len(points))
 
 
-def _split_ranges(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def _triangle_parts(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Barycentric weights (k, 3) of a triangle's points where each of its edges has so many ``parts``, and its smaller
     triangles (parts^2, 3)."""
     place = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]

@@ -1,7 +1,7 @@
 """A checked scene and a user's picture or mesh in; the same tree, with files that Mitsuba reads, out.
 
-A picture becomes the reflectances of a sheet, as :func:`mitsim.core.reflectance.read_reflectance` reads it, in the middle of
-a square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
+A picture becomes the reflectances of a sheet (:func:`mitsim.core.reflectance.read_reflectance`), in the middle of a
+square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
 plane y = 0, and the middle of its box is over the origin.
 """
 
