@@ -97,7 +97,7 @@ def _page_of(folder: Path) -> dict[str, Any]:
 
 
 def _page_line(made: dict[str, Any]) -> str:
-    return f"pictures in {made['seconds']:.1f} s: {made['page']}"
+    return f"Page: {made['page']} (pictures in {made['seconds']:.1f} s)"
 
 
 def _attempt(
