@@ -161,8 +161,8 @@ def test_resolution_is_no_gain_of_noise() -> None:
 
 
 def test_flags_are_counted_on_images_that_fail() -> None:
-    """Also where the classical image fails with them. (Planted: failures and others changed for one another; images held
-    against the classical one of their own frames alone.)"""
+    """Also where the classical image fails with them. (Planted: failures and others changed for one another; images
+    held against the classical one of their own frames alone.)"""
 
     def gain(kind: Kind, condition: str) -> float:
         return -8.0 if condition == DRIFT else 0.0
