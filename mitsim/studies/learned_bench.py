@@ -38,6 +38,8 @@ SHEET_MM = 64.0
 DEPTH, DRIFT, DIM, GLOSS, AMBIENT = "depth", "drift", "dim", "gloss", "ambient"
 CONDITIONS = (IDEALISED, RENDERED, DEPTH, DRIFT, DIM, GLOSS, AMBIENT)
 """What networks are tested on."""
+MISMATCHES = (DEPTH, DRIFT, GLOSS, AMBIENT)
+"""Those that a calibration does not know; what is dim has noise that a capture states."""
 PLACES = {
     RENDERED: (IDEALISED, RENDERED, DRIFT, DIM),
     DEPTH: (DEPTH,),

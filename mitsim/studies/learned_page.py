@@ -79,7 +79,8 @@ def _flag_table(matrix: Matrix) -> PageTable:
         rows.append((f"{kind}, {in_text(kind.patterns)}", *shares, f"{bad} of {of_bad}", f"{false} of {of_good}"))
     title = (
         "Images that are flagged [%]: for misfit / for noise, a camera or a calibration that the network does not "
-        "know; and of images 3 dB below the best classical one, and of others, how many misfit flags"
+        "know; and of images 3 dB below the best classical one of a calibrated bench, and of others, how many misfit "
+        "flags"
     )
     return PageTable(title, ("network", *matrix.conditions, "failed", "others"), tuple(rows))
 

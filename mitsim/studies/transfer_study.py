@@ -270,13 +270,13 @@ class TransferFindings(Findings):
         columns = (AUTHORS, *METHODS)
         height = len(self.held_out) * (plots.WIDTH / len(columns) + 0.1) + 0.2
         figure, places = plots.panels_of(len(self.held_out), len(columns), height, layout="compressed")
-        for line, each in zip(places, self.held_out, strict=True):
+        for number, (line, each) in enumerate(zip(places, self.held_out, strict=True)):
             for axes, column in zip(line, columns, strict=True):
                 shown, theirs = each.images[column], each.images[AUTHORS]
                 scale = float(np.vdot(shown, theirs) / np.vdot(shown, shown))
                 axes.imshow(np.clip(scale * shown, 0, 1), interpolation="none")
                 axes.set(xticks=[], yticks=[])
-                axes.set_title(column if line is places[0] else "", fontsize=plots.FONT - 1)
+                axes.set_title("" if number else column, fontsize=plots.FONT - 1)
             line[0].set_ylabel(each.capture, fontsize=plots.FONT - 1)
         return {"flatcam.png": figure}
 

@@ -68,6 +68,8 @@ def test_a_capture_is_seen_by_what_the_other_taught(
     assert min(rows[f"fc_7 {plane}", "tikhonov"]["correlation"] for plane in ("gb", "gr")) > 0.89
     for row in rows.values():
         assert 0.3 < row["correlation"] < 1 and row["beyond"] >= 0
+    titles = [axes.get_title() for axes in found.figures()["flatcam.png"].axes]
+    assert titles == [AUTHORS, *METHODS, *[""] * (1 + len(METHODS))]  # (Planted: rows compared by identity.)
     run_study("transfer", lambda *_: found, None, tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"transfer.json", "transfer.html", "flatcam.png"}
 
