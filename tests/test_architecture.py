@@ -41,6 +41,7 @@ FLOORS = (
     "studies",
     "exchange",
     "verbs",
+    "sessions",
     # The command line stands on the face, as a user's own program does.
     "mitsim",
     "cli",

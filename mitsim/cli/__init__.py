@@ -57,6 +57,7 @@ from mitsim.cli.options import (
     verb,
 )
 from mitsim.cli.report_verb import finish_folder, finish_frame, report
+from mitsim.cli.run_verb import run_
 from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
 from mitsim.cli.study_verb import study
 from mitsim.cli.view_verb import view
@@ -506,6 +507,6 @@ def doctor(
 
 
 # In the order of the help.
-_SCENE = demo, view, plan, capture, calibrate, reconstruct, render, study
+_SCENE = demo, run_, view, plan, capture, calibrate, reconstruct, render, study
 for _verb in (*_SCENE, report, pairs, train, export, import_, patterns, transport, characterise, sense, doctor):
     app.command(_verb.__name__.rstrip("_"))(_verb)
