@@ -94,7 +94,7 @@ class Apparatus:
     counted_lamps: CountedLamps | None = None
     filters: SensorModel | None = None
     board: Mapping[str, Any] | None = None
-    opened: Mapping[str, Any] | None = None
+    opened: dict[str, Any] | None = None
 
     @property
     def geometry(self) -> CameraGeometry:

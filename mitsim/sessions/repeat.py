@@ -85,11 +85,13 @@ def session_of(folder: Path | str) -> Repeat:
 
 @dataclass
 class _Found:
-    """Tables of a session, found in a ``folder``, and what is not as it was."""
+    """Tables of a session, found in a ``folder``; ``warnings`` on what is not as it was; and the folders that the
+    tables of capture and calibration were ``taken`` from."""
 
     folder: Path
     tables: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    taken: dict[str, str] = field(default_factory=dict)
 
     def run_or_calibration(self) -> None:
         """Of the folder's manifest."""
@@ -113,7 +115,7 @@ class _Found:
         data = read_json(folder / COLOUR) if is_coloured(folder) else {}
         if not data or data.get("kind") == MOSAIC:
             return folder
-        return folder / checked_colours(data, data.get("kind"), folder).names[0]
+        return folder / checked_colours(data, str(data.get("kind")), folder).names[0]
 
     def _scene(self, conf: Mapping[str, Any], opened: Mapping[str, Any] | None, folder: Path, coloured: bool) -> None:
         """Take over what opened the bench of a ``folder``; MitsimError where another is taken already."""
@@ -134,9 +136,7 @@ class _Found:
             **{name: _value(text) for name, text in conf["defines"].items()},
         }
         if self.tables.setdefault("scene", table) != table:
-            raise MitsimError(
-                f"{folder}: is of another scene or of other devices than its frames; it has a file of its own"
-            )
+            raise MitsimError(f"{folder}: is of another scene or of other devices than its frames")
         self._compare(conf, devices, coloured)
 
     def _compare(self, conf: Mapping[str, Any], devices: Mapping[str, str | None], coloured: bool) -> None:
@@ -186,6 +186,7 @@ class _Found:
         if {"light", "plan_seed"} & conf.keys():
             asked = {name: value for name, value in asked.items() if name not in ("accuracy", "effects")}
         self.tables["capture"] = {**asked, **self._colour(folder)}
+        self.taken["capture"] = str(folder)
 
     def _colour(self, folder: Path) -> dict[str, str]:
         """The word for the colours of a ``folder``; none of one that tells none apart."""
@@ -217,6 +218,7 @@ class _Found:
         if colour and (capture := self.tables.get("capture")):
             colour = {"colour": capture["colour"]}
         self.tables["calibrate"] = {"seed": conf["seed"], "accuracy": conf["accuracy"], **recipe, **colour}
+        self.taken["calibrate"] = str(folder)
 
     def image(self, folder: Path) -> None:
         """Take over how the image in a ``folder`` was solved for, of which frames and calibration."""
@@ -234,25 +236,18 @@ class _Found:
             low, high = inputs["bounds"]
             inputs["bounds"] = [-math.inf if low is None else low, math.inf if high is None else high]
         for name, verb, take in (("run", "capture", self.run), ("calibration", "calibrate", self.calibration)):
-            if verb in self.tables and self._made.get(verb) == made_of[name]:
+            if self.taken.get(verb) == made_of[name]:
                 continue
             try:
-                if verb in self.tables:
+                if verb in self.taken:
                     raise MitsimError(f"{made_of[name]}: is another than that of the first image")
                 take(Path(made_of[name]))
-                self._made[verb] = made_of[name]
             except MitsimError as error:
                 self._warn(f"{error}; it is read where it is")
                 inputs[name] = made_of[name]
-        named = (
-            folder.name if folder.name not in (each["output"] for each in self.tables.get("reconstruct", ())) else None
-        )
-        self.tables.setdefault("reconstruct", []).append({**inputs, "output": named})
-
-    @property
-    def _made(self) -> dict[str, str]:
-        """Folders that the tables of capture and calibration are of."""
-        return self.__dict__.setdefault("_of", {"capture": str(self.folder)} if "capture" in self.tables else {})
+        images = self.tables.setdefault("reconstruct", [])
+        named = {} if folder.name in (each.get("output") for each in images) else {"output": folder.name}
+        images.append({**inputs, **named})
 
     def demo(self) -> None:
         """Take over what the demo was asked for, by its capture."""

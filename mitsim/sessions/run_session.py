@@ -171,15 +171,21 @@ def run(
         prepared = [(step, steps.prepare(step)) for step in read.steps if steps.makes(step)]
         if any(step.verb in OF_A_BENCH for step, _ in prepared):
             steps.bench  # noqa: B018 - opened before anything is written, for it may be refused
-        write_text(folder / SESSION_FILE, read.text)
+        told = {name: (folder / name).read_text(encoding="utf-8") for name in (SESSION_FILE, SUMMARY) if again}
         head = {"kind": KIND, "session": read.tables, "versions": deciding_versions()}
-        write_json(folder / SUMMARY, {**head, "status": "incomplete", "steps": [*earlier.values()]})
-        remove_page(folder)
         results: list[StepResult] = []
-        for step, task in prepared:
-            results.append(_take(step, task, folder, earlier.get(step.output), asked.pictures))
-            kept = {**earlier, **{each.output: asdict(each) for each in results}}
-            write_json(folder / SUMMARY, {**head, "status": "incomplete", "steps": [*kept.values()]})
+        try:
+            write_text(folder / SESSION_FILE, read.text)
+            for step, task in prepared:
+                kept = {**earlier, **{each.output: asdict(each) for each in results}}
+                write_json(folder / SUMMARY, {**head, "status": "incomplete", "steps": [*kept.values()]})
+                results.append(_take(step, task, folder, earlier.get(step.output), asked.pictures))
+        except MitsimError:
+            if all(each.left_alone for each in results):  # nothing was made: it is the session that it was
+                for name, text in told.items():
+                    write_text(folder / name, text)
+            raise
+        remove_page(folder)
         page = _write_page(folder, read, results, job) if asked.pictures else None
         done = SessionResult(tuple(results), str(folder), page)
         write_json(folder / SUMMARY, {**head, **done.payload(), "status": "complete", "command": job and job.command})

@@ -36,7 +36,27 @@ else:
 
 # ---- Tables, from the calls that take their fields -------------------------------------------------------------------
 
-_Value = str | int | float | bool
+
+def _one_value(value: Any) -> Any:
+    """A ``value`` of a parameter; ValueError for another."""
+    if not isinstance(value, (str, int, float)):
+        raise ValueError(f"got {cut(repr(value))}; give a number, text in quotes, or true or false")
+    return value
+
+
+def _several_values(values: Any) -> Any:
+    """A list of ``values``, or the ends and the count of a range; ValueError for anything else."""
+    if isinstance(values, Mapping):
+        numbers = [isinstance(values.get(name), (int, float)) for name in ("from", "to", "count")]
+        if values.keys() == {"from", "to", "count"} and all(numbers):
+            return values
+    elif isinstance(values, (list, tuple)) and values:
+        return [_one_value(value) for value in values]
+    raise ValueError(f"got {cut(repr(values))}; give a list of values, or {{ from = A, to = B, count = N }}")
+
+
+_Value = Annotated[Any, pydantic.AfterValidator(_one_value)]
+_Values = Annotated[Any, pydantic.AfterValidator(_several_values)]
 _Number = Annotated[float, pydantic.Field(allow_inf_nan=True)]
 _Two = Annotated[tuple[_Number, _Number], pydantic.Field(strict=False)] | None
 _OWN = {"self", "output", "resume", "job", "overwrite", "for_render"}
@@ -91,17 +111,6 @@ class _SceneTable(Configuration):
     __pydantic_extra__: dict[str, _Value] = pydantic.Field(init=False)
 
 
-class _Range(Configuration):
-    """Values from one end to the other, evenly spaced."""
-
-    first: float = pydantic.Field(alias="from")
-    last: float = pydantic.Field(alias="to")
-    count: int
-
-
-_Values = Annotated[tuple[_Value, ...], pydantic.Field(strict=False, min_length=1)] | _Range
-
-
 class _SweptScene(Configuration):
     model_config = pydantic.ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _Values] = pydantic.Field(init=False)
@@ -111,7 +120,7 @@ def _table(name: str, fields: Mapping[str, Any], base: type[Configuration] = Con
     return pydantic.create_model(name, __base__=base, **fields)
 
 
-_SWEPT = _table("capture", {name: (_Values | None, None) for name in ("patterns", "seed", "accuracy")})
+_SWEPT = _table("capture", {name: (_Values, None) for name in ("patterns", "seed", "accuracy")})
 _IMAGE = _fields(
     ImageRequest, "lam", method=(str, "tikhonov"), depth_range=(_Two, None), bounds=(_Two, None)
 )  # fmt: skip
@@ -146,15 +155,16 @@ TABLES: dict[str, Any] = {
 """Model of each table, in the order in which the steps are taken."""
 SEVERAL = "reconstruct", "study", "export"
 """Tables that may stand there more than once, as ``[[reconstruct]]``."""
-_SESSION = _table(
-    "session",
-    {
-        name: (Annotated[tuple[model, ...], pydantic.Field(strict=False)], ())
-        if name in SEVERAL
-        else (model | None, None)
-        for name, model in TABLES.items()
-    },
-)
+
+
+def _held(name: str, model: Any) -> Any:
+    """Kind and default of the table of a ``name``."""
+    if name in SEVERAL:
+        return Annotated[tuple[model, ...], pydantic.Field(strict=False)], ()
+    return model | None, None
+
+
+_SESSION = _table("session", {name: _held(name, model) for name, model in TABLES.items()})
 FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
 """Where the results of some steps go, which others are called like their table."""
 
@@ -416,7 +426,8 @@ def _mistakes_of_values(session: Session, data: _Lined) -> Iterator[Mistake]:
     for step in session.steps:
         number = numbers[step.verb] = numbers.get(step.verb, -1) + 1
         place: Place = (step.verb, number) if step.verb in SEVERAL else (step.verb,)
-        _CHECKS.get(step.verb, lambda *_: None)(session, step, place, found)
+        if step.verb in _CHECKS:
+            _CHECKS[step.verb](session, step, place, found)
         if Path(step.output).name != step.output or step.output in (".", ".."):
             found.say((*place, "output"), f"{cut(repr(step.output))}: give a name without folders")
         elif [other.output for other in session.steps].count(step.output) > 1:
@@ -480,7 +491,7 @@ def recipe_of(values: Mapping[str, Any]) -> SessionRecipe:
     """The recipe of a calibration with these ``values``: in a file, in the session's, or the shipped one; MitsimError
     for one that breaks a rule."""
     recipe = values.get("recipe")
-    return validate(SessionRecipe, recipe, "recipe") if isinstance(recipe, Mapping) else load_recipe(recipe)
+    return validate(SessionRecipe, dict(recipe), "recipe") if isinstance(recipe, Mapping) else load_recipe(recipe)
 
 
 def image_request(step: Step) -> dict[str, Any]:
@@ -556,15 +567,15 @@ def sweep_options(session: Session, step: Step) -> dict[str, Any]:
     if "accuracy" in fixed:
         over.setdefault("accuracy", [fixed["accuracy"]])
     check_sweep([(name, [str(value) for value in values]) for name, values in over.items()], 1)
-    options = {name: fixed[name] for name in ("patterns", "seed") if name in fixed and name not in over}
+    options: dict[str, Any] = {name: fixed[name] for name in ("patterns", "seed") if name in fixed and name not in over}
     return {**options, "over": over, **{name: step.values[name] for name in ("measure", "jobs") if name in step.values}}
 
 
-def listed(swept: Mapping[str, Any]) -> dict[str, list[_Value]]:
+def listed(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What is ``swept``, values or a range of them by name, as values; MitsimError for a range of too many."""
     from mitsim.studies.framework.experiment import values_of
 
-    def values(name: str, each: Any) -> list[_Value]:
+    def values(name: str, each: Any) -> list[Any]:
         if not isinstance(each, Mapping):
             return list(each)
         return list(values_of(f"{name}={each['from']!r}:{each['to']!r}:{each['count']}")[1])
