@@ -521,7 +521,7 @@ def _check_export(session: Session, step: Step, place: Place, found: _Found) -> 
 
 
 def calibration_for(session: Session, step: Step) -> str | None:
-    """The calibration that an export ``step`` takes of its own session: that which its format can hold."""
+    """The calibration that an export ``step`` takes of its own ``session``: that which its format can hold."""
     from mitsim.exchange.formats import FORMATS
 
     chosen = FORMATS.get(step.values["format"])
