@@ -61,19 +61,10 @@ FURTHER: dict[str, list[Any]] = {
     "export": [],
 }
 """Classes whose fields a verb's call takes by name, of verbs that are one call with the same options."""
-ALIKE = {
-    "define": "parameters",
-    "outside": "allow_outside_files",
-    "scenes": "scene",
-    "family": "patterns",
-    "no_pictures": "pictures",
-    "max_seconds": "job",
-    "max_memory": "job",
-    "verbose": "job",
-}
+ALIKE = {"define": "parameters", "outside": "allow_outside_files", "scenes": "scene", "family": "patterns"}
 """Arguments that the command line calls otherwise."""
-OF_THE_COMMAND_LINE = {"as_json", "quiet", "help", "variant"}
-"""Options that say how it is reported; the variant is a bench's."""
+OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
+"""Options that say how it is reported and bounded, as a job does; the variant is a bench's."""
 ANYWAY = {("sense", "output")}
 """Of the verb and option, what a method of the result is for."""
 

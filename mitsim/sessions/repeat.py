@@ -126,10 +126,10 @@ class _Found:
         if opened is None:
             self._warn(f"{folder} does not tell its devices' files: the usual ones are taken")
             opened = {}
-        devices = {name: _shipped(opened.get(name), "calibration") for name in ("camera", "projector")}
+        devices = {name: _short_name(opened.get(name), "calibration") for name in ("camera", "projector")}
         usual = spectral_of(DEFAULT_VARIANT) if coloured else DEFAULT_VARIANT
         table = {
-            "scene": _shipped(conf["scene"], "scenes"),
+            "scene": _short_name(conf["scene"], "scenes"),
             **{name: value for name, value in devices.items() if value is not None},
             **({} if conf["variant"] == usual else {"variant": conf["variant"]}),
             **({"allow_outside_files": True} if opened.get("allow_outside_files") else {}),
@@ -261,7 +261,7 @@ class _Found:
         name, scope = read_scope(self.folder)
         setup = scope.setup
         given = {
-            "scene": None if any(scope.pictures) else _shipped(setup.scene, "scenes"),
+            "scene": None if any(scope.pictures) else _short_name(setup.scene, "scenes"),
             "patterns": scope.patterns if name in ("sweep", "drift") else None,
             "seed": scope.seeds[0],
             "quick": scope.quick or None,
@@ -287,7 +287,7 @@ def _made_of(folder: Path) -> dict[str, str]:
     return {}
 
 
-def _shipped(path: str | None, shelf: str) -> str | None:
+def _short_name(path: str | None, shelf: str) -> str | None:
     """The name of a shipped file at a ``path`` on its ``shelf``; else the path."""
     if path is None:
         return None

@@ -31,11 +31,11 @@ from mitsim.sessions.session_file import (
     Step,
     calibration_for,
     image_request,
-    listed,
     read_session,
     recipe_of,
     request_of,
     sweep_options,
+    swept_values,
 )
 from mitsim.studies.framework.experiment import is_experiment
 from mitsim.verbs import WHOLE, Opening, demo, prepare_study
@@ -530,7 +530,7 @@ class _Steps:
     def _study(self, step: Step) -> _Task:
         values = {name: value for name, value in step.values.items() if name not in ("name", "scene")}
         if "over" in values:
-            values["over"] = listed(values["over"])
+            values["over"] = swept_values(values["over"])
         return self._study_of(step.values["name"], step.values.get("scene"), step, values)
 
     def _study_of(self, name: str, scene: str | None, step: Step, options: Mapping[str, Any]) -> _Task:

@@ -157,14 +157,14 @@ SEVERAL = "reconstruct", "study", "export"
 """Tables that may stand there more than once, as ``[[reconstruct]]``."""
 
 
-def _held(name: str, model: Any) -> Any:
+def _kind_of(name: str, model: Any) -> Any:
     """Kind and default of the table of a ``name``."""
     if name in SEVERAL:
         return Annotated[tuple[model, ...], pydantic.Field(strict=False)], ()
     return model | None, None
 
 
-_SESSION = _table("session", {name: _held(name, model) for name, model in TABLES.items()})
+_SESSION = _table("session", {name: _kind_of(name, model) for name, model in TABLES.items()})
 FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
 """Where the results of some steps go, which others are called like their table."""
 
@@ -556,7 +556,7 @@ def sweep_options(session: Session, step: Step) -> dict[str, Any]:
     """
     from mitsim.studies.framework.experiment import NO_SCENE, check_sweep
 
-    over = listed({**(step.values.get("scene") or {}), **(step.values.get("capture") or {})})
+    over = swept_values({**(step.values.get("scene") or {}), **(step.values.get("capture") or {})})
     if outside := [
         name for name in step.values.get("scene") or {} if name in (*NO_SCENE, *TABLES["scene"].model_fields)
     ]:
@@ -571,7 +571,7 @@ def sweep_options(session: Session, step: Step) -> dict[str, Any]:
     return {**options, "over": over, **{name: step.values[name] for name in ("measure", "jobs") if name in step.values}}
 
 
-def listed(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
+def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What is ``swept``, values or a range of them by name, as values; MitsimError for a range of too many."""
     from mitsim.studies.framework.experiment import values_of
 

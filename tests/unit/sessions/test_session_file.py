@@ -70,6 +70,8 @@ def test_tables_become_steps_in_order_with_folders_of_their_own(write: Callable[
     }
     assert found.step("calibrate").values == {"recipe": str(tmp_path / "recipe.toml")}  # type: ignore[union-attr]
     assert found.steps[3].values == {"method": "tv", "bounds": (0.0, float("inf"))}
+    several = read_session(write(f"{SCENE}[capture]\n[calibrate]\n[[reconstruct]]\n[[reconstruct]]\n"))
+    assert [step.output for step in several.steps] == ["run", "calibration", "image", "image-2"]
 
 
 def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
@@ -92,7 +94,7 @@ def test_fields_are_those_of_the_calls() -> None:
 
 
 def test_all_mistakes_are_told_at_once_each_with_its_line(write: Callable[[str], Path]) -> None:
-    """(Planted: a table without a check; lines that count from the table.)"""
+    """(Planted: a table without a check.)"""
     text = (
         '[scene]\nscene = "photograph"\n[capture]\npatterns = "dotz:4"\nseed = -1\ncolour = "red"\n[calibrate]\n'
         'accuracy = 7.0\n[reconstruct]\nmethod = "wiener"\n[[export]]\nformat = "hdf6"\noutput = "a/b.h5"\n'
