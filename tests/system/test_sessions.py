@@ -33,8 +33,7 @@ def numbers_in(folder: Path) -> dict[str, np.ndarray]:
 
 
 def test_an_image_tells_the_session_that_repeats_it(call: Callable[..., Any], lab: Any, imaged: Path) -> None:
-    """Frames, calibration, and how it was solved for. (Planted: a camera that is not told; a lambda that is auto; an
-    accuracy of the calibration that is the default.)"""
+    """Frames, calibration, and how it was solved for."""
     told = call("run", "--from", imaged, "--json")
     assert told.code == 0 and told.payload["warnings"] == [] and told.payload["output"] is None
     tables = told.payload["session"].split("\n\n")
@@ -49,7 +48,7 @@ def test_an_image_tells_the_session_that_repeats_it(call: Callable[..., Any], la
 
 
 def test_what_was_changed_since_is_told(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
-    """A flagged session file, by exit status 1. (Planted: files that are not compared.)"""
+    """A flagged session file, by exit status 1."""
     run = lab.copy("run", tmp_path / "run")
     manifest = json.loads((run / "manifest.json").read_text())
     manifest["configuration"]["scene_sha256"] = "0"
@@ -76,8 +75,7 @@ def test_a_session_file_repeats_a_figure_bit_by_bit(
     call: Callable[..., Any], lab: Any, imaged: Path, tmp_path: Path
 ) -> None:
     """Frames, truth, factors and image of three commands, by one file; and what is finished is left alone: by the same
-    file nothing is written, and of another request nothing is lost. (Planted: another seed; a calibration by the
-    default accuracy; frames that are written again.)"""
+    file nothing is written, and of another request nothing is lost."""
     ms.session_of(imaged).save(tmp_path / "again.toml")
     done = call("run", tmp_path / "again.toml", "-o", tmp_path / "out", "--json", "--no-pictures")
     assert done.code == 0, done.err
@@ -104,7 +102,7 @@ def test_a_session_file_repeats_a_figure_bit_by_bit(
 
 @pytest.mark.slow
 def test_the_shipped_session_of_the_demo_repeats_the_demo(lab: Any, tmp_path: Path) -> None:
-    """Its frames and factors, on a small scene. (Planted: light that is traced for another family.)"""
+    """Its frames and factors, on a small scene."""
     devices = {"camera": str(lab.camera), "projector": str(lab.projector)}
     ms.demo(lab.scene, tmp_path / "demo", patterns="dots:4", accuracy=0.01, **devices)
     values = {"scene.scene": str(lab.scene), **{f"scene.{name}": each for name, each in devices.items()}}
