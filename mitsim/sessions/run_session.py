@@ -290,8 +290,7 @@ class _Steps:
         for name, value in (("shard", self.asked.shard != WHOLE), ("scheduler", self.asked.scheduler is not None)):
             if value and not shared:
                 raise ArgumentError(name, f"has no effect on [{step.verb}], which has no points to share; leave it out")
-        task: _Task = getattr(self, f"_{step.verb}")(step)
-        return task
+        return _TASKS[step.verb](self, step)
 
     # ---- the bench ----
 
@@ -564,6 +563,17 @@ class _Steps:
         return _Task(work, lambda: (self.folder / step.output).is_dir())
 
 
+_TASKS: Mapping[str, Callable[[_Steps, Step], _Task]] = {
+    "plan": _Steps._plan,
+    "transport": _Steps._transport,
+    "capture": _Steps._capture,
+    "calibrate": _Steps._calibrate,
+    "reconstruct": _Steps._reconstruct,
+    "demo": _Steps._demo,
+    "sweep": _Steps._sweep,
+    "study": _Steps._study,
+    "export": _Steps._export,
+}
 _OPENING = "variant", "camera", "projector", "allow_outside_files"
 """Arguments that open a bench, beside the scene and its parameters."""
 
