@@ -54,6 +54,7 @@ docs/glossary
 docs/formats
 docs/exchange
 docs/bench
+docs/sessions
 docs/studies
 docs/learned
 docs/extending

@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
     from mitsim.report.folders import report_folder as report_folder
     from mitsim.report.quality import reconstruct_colours as reconstruct_colours
+    from mitsim.sessions.repeat import session_of as session_of
+    from mitsim.sessions.run_session import run as run
     from mitsim.verbs import characterise as characterise
     from mitsim.verbs import demo as demo
     from mitsim.verbs import doctor as doctor
@@ -96,6 +98,8 @@ _HOMES = {
         "reconstruct.reconstruct": "Reconstruction reconstruct",
         "report.folders": "report_folder",
         "report.quality": "reconstruct_colours",
+        "sessions.repeat": "session_of",
+        "sessions.run_session": "run",
         "verbs": "characterise demo doctor scenes sense study",
     }.items()
     for name in names.split()

@@ -6,8 +6,9 @@ Each is a verb of the command line, which calls it: what is asked is checked her
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -287,6 +288,28 @@ def study(
     >>> found = ms.study("sweep", "photograph", "sweep", over={"sheet_z": [390, 400, 410]})  # doctest: +SKIP
     >>> [(row["sheet_z"], row["psnr_db"]) for row in found.rows]  # doctest: +SKIP
     """
+    return prepare_study(name, scene, output, patterns, job, **options)()
+
+
+Study = Callable[[], "StudyResult | CampaignResult"]
+"""One that only has to be measured: what it is asked for was checked."""
+
+
+def prepare_study(
+    name: str,
+    scene: Path | str | Sequence[Path | str] | None,
+    output: Path | str,
+    patterns: str | None,
+    job: Job | None,
+    **options: Any,
+) -> Study:
+    """What :func:`study` does once it is called; before that it refuses what that refuses before work.
+
+    Parameters
+    ----------
+    name, scene, output, patterns, job, options
+        as there.
+    """
     from mitsim.studies.framework.experiment import is_experiment
 
     asked = StudyOptions(**options_of(StudyOptions, options, "study"))
@@ -296,7 +319,7 @@ def study(
                 "on parts, which say themselves what they are of")  # fmt: skip
         from mitsim.studies.framework.campaign import merge
 
-        return merge([Path(part) for part in _scenes_of(scene)], output, asked.experiment)
+        return partial(merge, [Path(part) for part in _scenes_of(scene)], output, asked.experiment)
     _refuse(given, ["experiment"], "but with merge; give the module as the study's name")
     if name not in OF_CAPTURES:
         _refuse(given, ["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
@@ -307,8 +330,8 @@ def study(
     if len(named) > 1:
         raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
     place = str(named[0]) if named else None
-    run = _run_points if is_experiment(name) else _run_whole
-    return run(name, place, Path(output), request, job or Job(), asked, given)
+    prepare = _study_of_points if is_experiment(name) else _study_of_a_bench
+    return prepare(name, place, Path(output), request, job or Job(), asked, given)
 
 
 def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
@@ -326,9 +349,9 @@ def _refuse(given: set[str], names: Sequence[str], where: str) -> None:
             raise ArgumentError(name, f"has no effect {where}; leave it out")
 
 
-def _run_points(
+def _study_of_points(
     name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions, given: set[str]
-) -> CampaignResult:
+) -> Study:
     """A study of many points: eight test images on the photograph's sheet (two, where it is quick), or one scene."""
     from mitsim.studies.framework.campaign import Where, run_experiment
     from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
@@ -350,7 +373,7 @@ def _run_points(
         _refuse(given, ["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(Shard.of(asked.shard), asked.jobs, asked.scheduler)
     _check_setup(scope, scene)
-    return run_experiment(name, scope, output, job, where)
+    return partial(run_experiment, name, scope, output, job, where)
 
 
 def scope_of(
@@ -405,9 +428,9 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     load_model(projector, ProjectorModel)
 
 
-def _run_whole(
+def _study_of_a_bench(
     name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions, given: set[str]
-) -> StudyResult:
+) -> Study:
     """A study of one bench, or of none."""
     from mitsim.studies.framework.run import check_study_folder, find_study
 
@@ -426,11 +449,11 @@ def _run_whole(
             raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
         _refuse(given, _OF_SCENES, f"on the study {name}, which is of no scene")
         check_study_folder(output, name)
-        return run_study(None, output, request, job)
+        return partial(run_study, None, output, request, job)
     check_study_folder(output, name)
-    scene = scene or "photograph"
-    asked.check(scene, request.patterns, request.timing if name in EXPOSED else None)
-    return run_study(asked.open(scene, job), output, request, job)
+    place = scene or "photograph"
+    asked.check(place, request.patterns, request.timing if name in EXPOSED else None)
+    return lambda: run_study(asked.open(place, job), output, request, job)
 
 
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------

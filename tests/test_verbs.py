@@ -22,11 +22,13 @@ from mitsim.cli.options import message_of
 from mitsim.core.errors import ArgumentError
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import SessionFacts
+from mitsim.sessions.run_session import RunOptions
 from mitsim.verbs import Opening, StudyOptions, _Irradiance, _Simulated
 from tests.exchanged import made
 
 CALLS = {
     "demo": ["demo"],
+    "run": ["run", "session_of"],
     "view": ["Bench.view"],
     "plan": ["Bench.plan", "Bench.choose_colour", "Plan.save"],
     "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.load", "Light.expose"],
@@ -51,6 +53,7 @@ CALLS = {
 """Python calls that do what a verb does, by its name."""
 FURTHER: dict[str, list[Any]] = {
     "demo": [Opening],
+    "run": [RunOptions],
     "study": [StudyOptions],
     "import": [FrameFacts],
     "patterns": [SessionFacts],
@@ -62,8 +65,8 @@ FURTHER: dict[str, list[Any]] = {
 """Classes whose fields a verb's call takes by name, of verbs that are one call with the same options."""
 ALIKE = {"define": "parameters", "outside": "allow_outside_files", "scenes": "scene", "family": "patterns"}
 """Arguments that the command line calls otherwise."""
-OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "no_pictures", "help", "variant"}
-"""Options that say how it is reported; the variant is a bench's."""
+OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
+"""Options that say how it is reported and bounded, as a job does; the variant is a bench's."""
 ANYWAY = {("sense", "output")}
 """Of the verb and option, what a method of the result is for."""
 
@@ -140,7 +143,7 @@ WRONG: list[Any] = [
 """Values that are wrong for most arguments; a folder where a file belongs is the last path."""
 OF_A_BENCH = [object(), b"x", 1j, np.array([]), np.array([1j]), np.array([None])]
 """Values that no argument of a bench may be."""
-RENDERS = {"open_bench", "make_pairs", "calibrate_model", "plan_calibration", "demo", "study", "doctor", "train"}
+RENDERS = {"open_bench", "make_pairs", "calibrate_model", "plan_calibration", "demo", "run", "study", "doctor", "train"}
 """What may begin long work by an argument of the right kind: it gets those of no kind alone."""
 CLASSES = ["Clock", "Job", "Limits", "Modelling", "Request"]
 """Classes that users make things of."""
@@ -265,7 +268,7 @@ def test_a_misspelt_option_is_refused_with_what_was_meant() -> None:
 
 def test_groups_of_options_are_checked() -> None:
     """All of them, whatever is added. (Planted: a group that checks nothing.)"""
-    for group in (Opening, StudyOptions, FrameFacts, SessionFacts, _Simulated, _Irradiance):
+    for group in (Opening, StudyOptions, RunOptions, FrameFacts, SessionFacts, _Simulated, _Irradiance):
         assert is_dataclass(group)
         for each in fields(group):
             with pytest.raises(ms.ArgumentError, match=f"^{each.name} "):

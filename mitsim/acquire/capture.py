@@ -163,7 +163,12 @@ def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: in
 
 
 def expose(
-    light: SampledLight, patterns: str, output: Path | str | None = None, job: Job | None = None, **request: Any
+    light: SampledLight,
+    patterns: str,
+    output: Path | str | None = None,
+    job: Job | None = None,
+    resume: bool = False,
+    **request: Any,
 ) -> Capture:
     """One noisy frame for each shot of a family in given light.
 
@@ -173,12 +178,14 @@ def expose(
         that the family is shown in.
     patterns, output, job, request
         as for :meth:`Light.expose`, which has the errors raised as well.
+    resume
+        go on with an interrupted capture of the same light in ``output``.
     """
     if request.get("noise_fraction") is not None:
         raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
     own = replace(light.plan, request=light.plan.known_request.with_values(patterns=patterns, seed=light.seed))
     bench = SpectralBench(light.bench)
-    return capture(bench, request_of(own, request), Task.of(output, job=job), lights=[light]).runs[0]
+    return capture(bench, request_of(own, request), Task.of(output, resume, job), lights=[light]).runs[0]
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
@@ -359,6 +366,7 @@ def _run(
         warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
         versions=versions(),
         command=job.command,
+        opened=bench.opened,
     )
     foreign = _foreign(light, totals, request)
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run

@@ -81,6 +81,9 @@ class Apparatus:
         makes one electron of a photon. None: frames are as the sensor has them.
     board
         reflectance, depth and shape of the board that stands in the scene's place; None: the scene itself.
+    opened
+        ``camera``, ``projector`` (whole paths; None: the usual one) and ``allow_outside_files``, as it was opened by;
+        of no influence on what it does. None: not known.
     """
 
     loaded: LoadedScene
@@ -91,6 +94,7 @@ class Apparatus:
     counted_lamps: CountedLamps | None = None
     filters: SensorModel | None = None
     board: Mapping[str, Any] | None = None
+    opened: dict[str, Any] | None = None
 
     @property
     def geometry(self) -> CameraGeometry:
@@ -481,7 +485,13 @@ def open_apparatus(
     _tune(loaded, light)
     devices = Devices(loaded.camera.geometry, sensor, light, str(sensor_path))
     # By their whole paths: who repeats this from another folder finds them.
-    return Apparatus(loaded, devices, variant, {**defines, **{name: path for path, name in loaded.own.items()}})
+    whole = {**defines, **{name: path for path, name in loaded.own.items()}}
+    named = {
+        "camera": camera and str(sensor_path.absolute()),
+        "projector": projector and str(projector_path.absolute()),
+    }
+    opened = {**named, "allow_outside_files": allow_outside_files}
+    return Apparatus(loaded, devices, variant, whole, opened=opened)
 
 
 def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:

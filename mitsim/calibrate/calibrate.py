@@ -281,6 +281,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         warnings=warnings,
         versions=versions(),
         command=job.command,
+        opened=bench.opened,
     )
     much = lacks is not None and lacks.residual > SEPARABLE_RESIDUAL
     factors = Factors.of(noisy, manifest, lacks.terms if lacks and much else ())

@@ -59,6 +59,7 @@ from mitsim.cli.options import (
     verb,
 )
 from mitsim.cli.report_verb import finish_folder, finish_frame, report
+from mitsim.cli.run_verb import run_
 from mitsim.cli.screen import finish, kernel_lines, memory_line, payload_of_lines, plan_lines, total_of_lines
 from mitsim.cli.shelf_verbs import list_, new
 from mitsim.cli.study_verb import study
@@ -559,7 +560,7 @@ def doctor(
 
 
 _VERBS = {
-    "The main job": (demo, view, plan, capture, calibrate, reconstruct),
+    "The main job": (demo, run_, view, plan, capture, calibrate, reconstruct),
     "The bench": (render, sense, characterise),
     "Studies": (study,),
     "Learning": (pairs, train),

@@ -47,6 +47,8 @@ _SPELLED = {
     "aged": "--from",
     "lam": "--lambda",
     "parameters": "-D",
+    "values": "-D",
+    "folder": "--from",
 }
 """Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")

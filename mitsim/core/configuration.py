@@ -107,7 +107,7 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
         raise refusal(model, error, where, data) from error
 
 
-def locate(name: Path | str, shelf: Literal["scenes", "calibration"], ending: str) -> Path:
+def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str) -> Path:
     """The path of a file: that of a shipped one by its bare name, else ``name`` itself.
 
     Parameters

@@ -263,6 +263,9 @@ class _Head(_Part):
     """Of mitsim, Python and packages."""
     command: str | None = None
     """Command line that finished it; none: Python, or not stated."""
+    opened: Plain | None = None
+    """Files of `camera` and `projector` as they were named (none: the usual ones), and `allow_outside_files`; by these
+    `mitsim run --from` repeats it. None: not stated."""
 
 
 class AmbientFile(_Part):

@@ -123,20 +123,8 @@ def export(
         called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
         format cannot hold.
     """
-    if format not in FORMATS:
-        raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
-    chosen = FORMATS[format]
-    if projector is not None and format != "png":
-        raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
-    if calibration is None and chosen.calibration == "needed":
-        raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
-    if calibration is not None and chosen.calibration == "none":
-        raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
+    chosen = check_format(format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    if format not in _ENDINGS.get(ending := place.suffix.lower(), (format,)):
-        raise MitsimError(
-            f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
-        )
     lines = _lines(folder, factors)
     if is_mosaic(folder) and not chosen.filters:
         able = ", ".join(name for name, other in FORMATS.items() if other.filters)
@@ -159,6 +147,32 @@ def export(
         "notes": list(notes),
         "output": str(place),
     }
+
+
+def check_format(
+    format: str, output: Path | str, calibration: Path | str | None = None, projector: str | None = None
+) -> Format:
+    """The format of a name; what :func:`export` refuses before it looks into a folder is refused here.
+
+    Parameters
+    ----------
+    format, output, calibration, projector
+        as there.
+    """
+    if format not in FORMATS:
+        raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
+    chosen, place = FORMATS[format], Path(output)
+    if projector is not None and format != "png":
+        raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
+    if calibration is None and chosen.calibration == "needed":
+        raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
+    if calibration is not None and chosen.calibration == "none":
+        raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
+    if format not in _ENDINGS.get(ending := place.suffix.lower(), (format,)):
+        raise MitsimError(
+            f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
+        )
+    return chosen
 
 
 def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:

@@ -40,6 +40,7 @@ from mitsim.report.parts import PlanChart, lines_of, plan_rows, stages_of, total
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
+    "opened",
 }
 """Keys of a manifest that are no lines of the table of numbers: they stand elsewhere on the page, or for programs."""
 

@@ -28,6 +28,7 @@ from mitsim.studies.solver_study import make_problem, time_solver
 VERBS = (
     *(
         "demo",
+        "run",
         "view",
         "plan",
         "capture",

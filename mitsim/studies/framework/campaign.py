@@ -310,6 +310,18 @@ def _head(folder: Path) -> dict[str, Any]:
     raise MitsimError(f"study merge: {folder} holds no part of a study; give folders that `mitsim study` wrote")
 
 
+def read_scope(folder: Path) -> tuple[str, Scope]:
+    """Name and scope of the study of many points in a ``folder``; MitsimError for one that holds none."""
+    for file in sorted(folder.glob("*.json")) if folder.is_dir() else ():
+        head = read_json(file)
+        if isinstance(head, dict) and isinstance(head.get("study"), str) and "scope" in head:
+            return head["study"], _scope(head["scope"], folder)
+    raise MitsimError(
+        f"{folder}: holds nothing that a session file repeats; give a folder of mitsim run, capture, calibrate, "
+        "reconstruct or demo, or of a study of many points"
+    )
+
+
 def _known_study(study: Any, part: Path | str, experiment: str | None) -> str:
     """The name of a ``study`` as the file of a ``part`` has it, where it ships or was named as ``experiment`` too."""
     known = (*PAPER, *EXPERIMENTS, ALL) if experiment is None else (experiment, ALL)

@@ -1,0 +1,235 @@
+"""Session files: what is read of them, and all mistakes at once, before anything heavy is imported. Nothing is
+rendered."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mitsim as ms
+from mitsim.api.bench import open_bench
+from mitsim.bench.request import Request
+from mitsim.core.configuration import shipped_path
+from mitsim.sessions import run_session
+from mitsim.sessions.session_file import TABLES, read_session, session_text, sweep_options, value_of
+
+WHOLE = """
+[scene]
+scene = "bench/scene.xml"
+camera = "camera.toml"
+projector = "mp_cl1"
+sheet_z = 402
+
+[capture]
+patterns = "dots:4"
+effects = "-diffraction"
+
+[calibrate]
+recipe = "recipe.toml"
+
+[[reconstruct]]
+[[reconstruct]]
+method = "tv"
+bounds = [0, inf]
+output = "smooth"
+
+[[export]]
+format = "hdf5"
+output = "all.h5"
+"""
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str) -> Path:
+        path = tmp_path / "session.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_tables_become_steps_in_order_with_folders_of_their_own(write: Callable[[str], Path], tmp_path: Path) -> None:
+    """Relative paths count from the file; names of shipped files stay. (Planted: paths from the working folder; a
+    shipped name that becomes a path; two images in one folder.)"""
+    found = read_session(write(WHOLE))
+    names = [(step.verb, step.output) for step in found.steps]
+    assert names == [
+        *(("capture", "run"), ("calibrate", "calibration"), ("reconstruct", "image"), ("reconstruct", "smooth")),
+        ("export", "all.h5"),
+    ]
+    assert found.scene == {
+        "scene": str(tmp_path / "bench/scene.xml"),
+        "camera": str(tmp_path / "camera.toml"),
+        "projector": "mp_cl1",
+        "sheet_z": 402,
+    }
+    assert found.step("calibrate").values == {"recipe": str(tmp_path / "recipe.toml")}  # type: ignore[union-attr]
+    assert found.steps[3].values == {"method": "tv", "bounds": (0.0, float("inf"))}
+    several = read_session(write(f"{SCENE}[capture]\n[calibrate]\n[[reconstruct]]\n[[reconstruct]]\n"))
+    assert [step.output for step in several.steps] == ["run", "calibration", "image", "image-2"]
+
+
+def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
+    """(Planted: a text with a quote in it that is not escaped.)"""
+    found = read_session(write(WHOLE), {"scene.camera": 'a "b"\\c.toml', "capture.effects": {"diffraction": False}})
+    again = read_session(write(found.text))
+    assert (again.scene, again.steps) == (found.scene, found.steps)
+    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, "a note") == (
+        '# a note\n\n[scene]\nscene = "x"\n"odd name" = 0.001\n'
+    )
+
+
+def test_fields_are_those_of_the_calls() -> None:
+    """A field that a call gains is one of the table's, with its default. (Planted: a field that a table leaves out.)"""
+    assert {
+        name: each.default for name, each in TABLES["capture"].model_fields.items() if name in Request.model_fields
+    } == {name: each.default for name, each in Request.model_fields.items()}
+    named = [name for name, each in inspect.signature(open_bench).parameters.items() if each.kind < each.VAR_KEYWORD]
+    assert [*TABLES["scene"].model_fields] == [name for name in named if name != "for_render"]
+
+
+def test_all_mistakes_are_told_at_once_each_with_its_line(write: Callable[[str], Path]) -> None:
+    """(Planted: a table without a check.)"""
+    text = (
+        '[scene]\nscene = "photograph"\n[capture]\npatterns = "dotz:4"\nseed = -1\ncolour = "red"\n[calibrate]\n'
+        'accuracy = 7.0\n[reconstruct]\nmethod = "wiener"\n[[export]]\nformat = "hdf6"\noutput = "a/b.h5"\n'
+    )
+    with pytest.raises(ms.MitsimError) as refused:
+        read_session(write(text))
+    head, *lines = str(refused.value).split("\n")
+    assert head.endswith("session.toml: has 8 mistakes:")
+    starts = [line.strip().split(": ")[:2] for line in lines]
+    assert starts == [
+        *(["line 4", "capture.patterns"], ["line 5", "capture.seed"], ["line 6", "capture.colour"]),
+        *(["line 7", "calibrate.colour"], ["line 8", "calibrate.accuracy"], ["line 10", "reconstruct.0.method"]),
+        *(["line 12", "export.0.format"], ["line 13", "export.0.output"]),
+    ]
+
+
+SCENE = '[scene]\nscene = "photograph"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[captur]\n", "captur: got {}, no such field; did you mean capture?"),
+        ('[capture]\npatern = "dots:4"\n', "capture.patern: got 'dots:4', no such field; did you mean patterns?"),
+        ("[capture]\nseed = 1.5\n", "session.toml:2: capture.seed: got 1.5; give a whole number"),
+        ("[capture]\n", "capture: is of a scene, and there is none; add a table [scene]"),
+        (SCENE, "asks for nothing; add a table, such as [capture]"),
+        (SCENE + "[reconstruct]\n", "reconstruct.0.run: is missing, and there is no [capture]"),
+        (SCENE + "[plan]\n[capture]\naccuracy = 0.1\n", "capture.accuracy: is the plan's; give it in [plan]"),
+        (SCENE + "[plan]\n[transport]\n[capture]\n", "plan: stands beside [transport]"),
+        (SCENE + '[transport]\n[capture]\ncolour = "lines"\n', "capture.colour: stands beside [transport]"),
+        (SCENE + "[capture]\nseconds = 5\naccuracy = 0.1\n", "capture.seconds: 5: the accuracy is what they buy"),
+        (SCENE + '[capture]\n[calibrate]\noutput = "run"\n', "calibrate.output: 'run' is another step's too"),
+        (SCENE + "[calibrate]\nrecipe = {exposure_fracton = 0.5}\n", "exposure_fracton: got 0.5, no such field"),
+        (SCENE + "sheet_z = [1]\n[plan]\n", "scene.sheet_z: got [1]"),
+        (SCENE + "[sweep]\n", "sweep: study sweep: nothing is varied"),
+        (SCENE + "[sweep]\nscene.camera = ['a', 'b']\n", "sweep.scene: camera: is no parameter of the scene"),
+        (SCENE + "[sweep]\nscene.x = [1]\n[capture]\nexposure = 1.0\n", "capture.exposure: is not in a sweep's points"),
+        (SCENE + "[sweep]\nscene.x = {from = 1, to = 2}\n", "scene.x: got {'from': 1, 'to': 2}; give a list of"),
+        (SCENE + "[demo]\nquick = true\n", "demo.quick: got True, no such field"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(write: Callable[[str], Path], text: str, words: str) -> None:
+    with pytest.raises(ms.MitsimError) as refused:
+        read_session(write(text))
+    assert words in str(refused.value)
+
+
+def test_changes_take_the_place_of_fields(write: Callable[[str], Path]) -> None:
+    """Of several tables the one that is counted. (Planted: a change that is passed over.)"""
+    path = write(WHOLE)
+    found = read_session(path,
+                         {"capture.patterns": "dots:2", "reconstruct.0.method": "markov"})  # fmt: skip
+    assert found.step("capture").values["patterns"] == "dots:2"  # type: ignore[union-attr]
+    assert found.steps[2].values == {"method": "markov"}
+    for name, words in (
+        ("reconstruct.method", "has several [[reconstruct]]; say which, as reconstruct.0.method"),
+        ("reconstruct.7.method", "has no 7 there"),
+        ("captur.patterns", "did you mean capture? give TABLE.FIELD=VALUE"),
+        ("capture", "give TABLE.FIELD=VALUE"),
+    ):
+        with pytest.raises(ms.MitsimError) as refused:
+            read_session(path, {name: "x"})
+        assert words in str(refused.value)
+    assert [value_of(text) for text in ("3", "0.5", "dots:4", "true", '"3"', "[1, 2]", "")] == [
+        *(3, 0.5, "dots:4", True, "3", [1, 2], ""),
+    ]
+
+
+def test_a_sweep_is_the_study_of_that_name(write: Callable[[str], Path]) -> None:
+    """(Planted: a range without its end; a fixed accuracy that is lost.)"""
+    text = (
+        f'{SCENE}[capture]\npatterns = "dots:7"\naccuracy = 0.01\nseed = 5\n[sweep]\n'
+        'scene.sheet_z = {from = 390, to = 410, count = 3}\ncapture.patterns = ["dots:4", "dots:7"]\nmeasure = "ssim"\n'
+    )
+    session = read_session(write(text))
+    options = sweep_options(session, session.step("sweep"))  # type: ignore[arg-type]
+    assert options == {
+        "seed": 5,
+        "over": {"sheet_z": ["390", "400", "410"], "patterns": ["dots:4", "dots:7"], "accuracy": [0.01]},
+        "measure": "ssim",
+    }
+
+
+def test_a_sweep_goes_to_the_workers_of_studies(
+    write: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its devices, part and scheduler. (Planted: a camera that is not handed on.)"""
+    asked: list[tuple[tuple[Any, ...], Mapping[str, Any]]] = []
+
+    class Found:
+        warnings = ()
+
+        def lines(self) -> list[str]:
+            return ["2 points"]
+
+    def prepare(*arguments: Any, **options: Any) -> Callable[[], Found]:
+        asked.append((arguments, options))
+        return Found
+
+    monkeypatch.setattr(run_session, "prepare_study", prepare)
+    path = write(f"{SCENE}camera = 'imx477'\nalbedo = 0.4\n[sweep]\nscene.sheet_z = [390, 400]\n")
+    done = ms.run(path, tmp_path / "out", shard="1/2", scheduler="tcp://a:1")
+    ((name, scene, place, patterns, _), options) = asked[0]
+    assert (name, scene, place, patterns) == ("sweep", "photograph", tmp_path / "out" / "sweep", None)
+    assert options == {
+        "over": {"sheet_z": [390, 400]},
+        "camera": "imx477",
+        "parameters": {"albedo": 0.4},
+        "shard": "1/2",
+        "scheduler": "tcp://a:1",
+    }
+    assert [step.says for step in done.steps] == ["2 points"] and (tmp_path / "out" / "report.html").is_file()
+
+
+def test_nothing_is_written_where_a_step_would_be_refused(write: Callable[[str], Path], tmp_path: Path) -> None:
+    """The last step too, whatever comes before it. (Planted: steps that are checked as they come.)"""
+    for text, words in (
+        ("[capture]\n[study]\nname = 'wether'\n", "there is no such study"),
+        ("[capture]\n[reconstruct]\ncalibration = 'none'\n", "no such folder"),
+        ("[capture]\n[calibrate]\nrecipe = 'none.toml'\n", "none.toml: cannot be read"),
+        ("[capture]\n[calibrate]\n[reconstruct]\nchart = 'nosuch'\n", "the frames are not coloured"),
+        ("[capture]\npatterns = 'dots:200'\n", "dots:200"),
+        ("[capture]\ncolour = 'mosaic'\n", "has no colour filters"),
+    ):
+        with pytest.raises(ms.MitsimError) as refused:
+            ms.run(write(SCENE + text), tmp_path / "out")
+        assert words in str(refused.value) and not (tmp_path / "out").exists()
+    with pytest.raises(ms.MitsimError, match="has no effect on"):
+        ms.run(write(f"{SCENE}[capture]\n"), tmp_path / "out", shard="1/2")
+
+
+def test_shipped_sessions_are_read() -> None:
+    """All that come with mitsim, by their names."""
+    names = [path.stem for path in shipped_path("sessions").glob("*.toml")]
+    assert "demo" in names
+    for name in names:
+        assert read_session(name).steps
