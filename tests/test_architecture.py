@@ -267,6 +267,7 @@ def test_a_capture_imports_nothing_slow(small_scene: Callable[..., Path], tmp_pa
         "-o",
         tmp_path / "run",
         "--effects=+diffraction",
+        "--no-pictures",
     )
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "mitsim", *map(str, command)], capture_output=True, text=True
