@@ -3,9 +3,9 @@
     python docs/figures.py [closed] [plan] [tour] [walks] [pictures]    all, unless some are named; `make figures`
 
 *closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: a plan and README's commands, a
-minute, and their outputs. *walks*: the commands of docs/bench.md through captures, half a minute, their outputs and pictures.
-*pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory on a page stay: they are an idle
-machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
+minute, and their outputs. *walks*: the commands of docs/bench.md through captures, half a minute, their outputs and
+pictures. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory on a page stay: they are an
+idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
 """
 
 from __future__ import annotations
@@ -199,8 +199,8 @@ def outputs(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def differences(reported: str, now: str) -> list[str]:
-    """Figures of an output ``now`` that differ from those ``reported`` by more than one of the last digit printed, or the
-    sentences, where those differ."""
+    """Figures of an output ``now`` that differ from those ``reported`` by more than one of the last digit printed, or
+    the sentences, where those differ."""
     texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (reported, now)]
     sentences = [_NUMBER.sub("#", text) for text in texts]
     if sentences[0] != sentences[1]:
