@@ -50,7 +50,7 @@ CONTENTS = """
 :hidden:
 :caption: Learn
 
-/README
+Five minutes </README>
 tour
 notebooks/index
 ```
