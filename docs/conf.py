@@ -1,7 +1,7 @@
 """The site that `make docs` builds: pages in Markdown, the API from docstrings, notebooks as they are stored.
 
 The repository's root is the source folder, so that links lead to the same places here as on disk. Nothing is fetched
-and no notebook is run: a test does that. A browser fetches MathJax to show the formulas.
+and no notebook is run: a test does that. Formulas become MathML, which browsers show by themselves.
 """
 
 import ast
@@ -10,7 +10,10 @@ import inspect
 import json
 from pathlib import Path
 
+from docutils import nodes
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.writers.html5 import HTML5Translator
 
 import mitsim
 
@@ -22,54 +25,74 @@ author = "the mitsim authors"
 copyright = f"2026, {author}"
 version = release = mitsim.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinxcontrib.mermaid"]
-root_doc = "README"
+extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc"]
+root_doc = "docs/index"
 include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
 exclude_patterns = [".*", "mitsim", "tests", "scenes", "docs/_build", "docs/conf.py", "docs/images", "**/.*"]
 
 nb_execution_mode = "off"
 myst_enable_extensions = ["dollarmath", "substitution"]
 myst_heading_anchors = 4
-myst_fence_as_directive = ["math", "mermaid"]
+myst_fence_as_directive = ["math"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 numpydoc_show_class_members = False
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"mitsim {version}"
+html_static_path = ["site.css"]
+html_css_files = ["site.css"]
 
 CONTENTS = """
 ```{toctree}
 :hidden:
-:caption: Guide
+:caption: Learn
 
-docs/notebooks/index
-docs/architecture
-docs/physics
-docs/rare_light
-docs/reconstruction
-docs/learned
-docs/glossary
-docs/formats
-docs/exchange
-docs/bench
-docs/sessions
-docs/studies
-docs/learned
-docs/extending
-docs/robustness
-docs/growth
+Five minutes </README>
+tour
+notebooks/index
 ```
 
 ```{toctree}
 :hidden:
-:caption: Reference
+:caption: Do
 
-docs/api
-docs/decisions/index
-CHANGELOG
-CONTRIBUTING
+howto
+shipped
+command_line
+bench
+sessions
+exchange
+studies
+learned
+extending
+```
+
+```{toctree}
+:hidden:
+:caption: Understand
+
+scope
+physics
+rare_light
+reconstruction
+architecture
+robustness
+growth
+```
+
+```{toctree}
+:hidden:
+:caption: Look up
+
+formats
+api
+glossary
+decisions/index
+/CHANGELOG
+/CONTRIBUTING
 ```
 """
 
@@ -115,17 +138,26 @@ myst_substitutions = {"face": face(), "gallery": gallery(), "plugins": plugins()
 
 
 def add_contents(_: Sphinx, page: str, source: list[str]) -> None:
-    """README opens the site; what lists the other pages belongs to the site alone."""
+    """What lists the other pages at a page's side belongs to the site alone."""
     if page == root_doc:
         source[0] += CONTENTS
 
 
-def open_with_readme(app: Sphinx, _: Exception | None) -> None:
-    """An index.html that leads to README, for browsers that are given the folder."""
-    page = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url=README.html">'
+def add_formula(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
+    """A formula as MathML: no script is needed to show it."""
+    alone = isinstance(node, nodes.math_block)
+    formula = convert(node.astext(), display="block" if alone else "inline")
+    writer.body.append(f'<div class="formula">{formula}</div>' if alone else formula)
+    raise nodes.SkipNode
+
+
+def add_front(app: Sphinx, _: Exception | None) -> None:
+    """An index.html that leads to the first page, for browsers that are given the folder."""
+    page = f'<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={root_doc}.html">'
     Path(app.outdir, "index.html").write_text(page, encoding="utf-8")
 
 
 def setup(app: Sphinx) -> None:
+    app.add_html_math_renderer("mathml", (add_formula, None), (add_formula, None))
     app.connect("source-read", add_contents)
-    app.connect("build-finished", open_with_readme)
+    app.connect("build-finished", add_front)

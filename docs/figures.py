@@ -2,10 +2,10 @@
 
     python docs/figures.py [closed] [plan] [tour] [walks] [pictures]    all, unless some are named; `make figures`
 
-*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: README's commands, a minute, and
-their outputs. *walks*: the commands of docs/bench.md through captures, half a minute, their outputs and pictures.
-*pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory on a page stay: they are an idle
-machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
+*closed*: closed forms, a second. *plan*: two plans of the photograph, seconds. *tour*: a plan and README's commands, a
+minute, and their outputs. *walks*: the commands of docs/bench.md through captures, half a minute, their outputs and
+pictures. *pictures*: docs/images/make.py and drawings.py, three minutes. Seconds and memory on a page stay: they are an
+idle machine's. tests/test_docs.py compares pages with the file, closed forms with the file and, slow, commands.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-README = ROOT / "README.md"
 FIGURES = ROOT / "docs" / "figures.json"
 IMAGES = ROOT / "docs" / "images"
 
@@ -167,10 +166,13 @@ def closed() -> dict[str, float]:
     }
 
 
-# ---- README's tour of the command line -------------------------------------------------------------------------------
+# ---- the tour of the command line ------------------------------------------------------------------------------------
 
-VERBS = ("plan", "capture", "calibrate", "reconstruct")
-"""A plan of cookie_bag; of photograph, from a scene to an image with every figure at its default."""
+_README = ROOT / "README.md"
+TOUR = {"plan": ROOT / "docs" / "tour.md", "capture": _README, "calibrate": _README, "reconstruct": _README}
+"""Pages that print a plan of cookie_bag, and of photograph all from scene to image with every figure at its default."""
+STATUSES = ROOT / "docs" / "command_line.md"
+"""The page that has the table of exit statuses."""
 _BLOCK = r"^    \$ mitsim ({verb} .*)\n((?:    (?!\$ ).*\n)*)"
 _MACHINE = re.compile(
     r"\b(?:in |0\.001: )[\d.]+ s\b|(?<=e[+-]\d\d) +\d+\.\d\d(?= )|(?<= [-0]) +\d+\.\d\d(?= )|"
@@ -181,25 +183,25 @@ _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def printed(verb: str) -> tuple[str, str]:
-    """The command line of a ``verb`` in README, and the output under it."""
-    found = re.search(_BLOCK.format(verb=verb), README.read_text(encoding="utf-8"), flags=re.M)
-    assert found, f"README has no command of {verb}"
+    """The command line of a ``verb`` of the tour, and the output under it."""
+    found = re.search(_BLOCK.format(verb=verb), TOUR[verb].read_text(encoding="utf-8"), flags=re.M)
+    assert found, f"{TOUR[verb]} has no command of {verb}"
     return found[1], found[2]
 
 
 def outputs(folder: Path) -> Iterator[tuple[str, str]]:
     """Each verb of the tour, and what its command prints in ``folder``."""
-    for verb in VERBS:
+    for verb in TOUR:
         command = [sys.executable, "-m", "mitsim", *shlex.split(printed(verb)[0]), "--quiet"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{shlex.join(command)}: {done.returncode}\n{done.stderr}"
         yield verb, done.stdout
 
 
-def differences(readme: str, now: str) -> list[str]:
-    """Figures of an output ``now`` that differ from ``readme``'s by more than one of the last digit printed, or the
-    sentences, where those differ."""
-    texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (readme, now)]
+def differences(reported: str, now: str) -> list[str]:
+    """Figures of an output ``now`` that differ from those ``reported`` by more than one of the last digit printed, or
+    the sentences, where those differ."""
+    texts = [" ".join(_MACHINE.sub("", " ".join(text.split())).split()) for text in (reported, now)]
     sentences = [_NUMBER.sub("#", text) for text in texts]
     if sentences[0] != sentences[1]:
         return [f"{sentences[0]}\n{sentences[1]}"]
@@ -214,9 +216,9 @@ def last_digit(number: str) -> float:
 
 
 def statuses(folder: Path) -> dict[str, str]:
-    """Sentences in README's table of exit statuses whose figures differ, and what their commands say now."""
-    found = {}
-    rows = re.findall(r'^\| \d \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', README.read_text(encoding="utf-8"), flags=re.M)
+    """Sentences in the table of exit statuses whose figures differ, and what their commands say now."""
+    found, page = {}, STATUSES.read_text(encoding="utf-8")
+    rows = re.findall(r'^\| \d \|.*\| `mitsim ([^`]+)`: "([^"]+)" \|$', page, flags=re.M)
     for command, sentence in rows:
         program = [sys.executable, "-m", "mitsim", *shlex.split(command)]
         done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
@@ -227,8 +229,8 @@ def statuses(folder: Path) -> dict[str, str]:
 
 
 def tour_figures() -> dict[str, float]:
-    """What README prints under the tour's commands, as numbers."""
-    text = " ".join(" ".join(printed(verb)[1] for verb in VERBS).split())
+    """What stands under the tour's commands, as numbers."""
+    text = " ".join(" ".join(printed(verb)[1] for verb in TOUR).split())
     patterns = {
         "psnr_db": r"PSNR ([\d.]+) dB",
         "ssim": r"SSIM ([\d.]+),",
@@ -241,14 +243,15 @@ def tour_figures() -> dict[str, float]:
 
 
 def tour(work: Path) -> dict[str, float]:
-    """The tour's commands run in ``work``; their outputs stand in README then."""
+    """The tour's commands run in ``work``; their outputs stand on its pages then."""
     for line, now in statuses(work).items():
         sys.stdout.write(f"{line} -> {now}\n")
-        README.write_text(README.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
+        STATUSES.write_text(STATUSES.read_text(encoding="utf-8").replace(line, now), encoding="utf-8")
     for verb, now in outputs(work):
         for difference in differences(printed(verb)[1], now):
             sys.stdout.write(f"{verb}: {difference}\n")
-        README.write_text(updated(README.read_text(encoding="utf-8"), verb, now), encoding="utf-8")
+        page = TOUR[verb]
+        page.write_text(updated(page.read_text(encoding="utf-8"), verb, now), encoding="utf-8")
     return tour_figures()
 
 
@@ -360,21 +363,21 @@ def walks(work: Path) -> dict[str, float]:
 
 
 def titles(picture: str) -> list[float]:
-    """Decibels in the titles of a picture of README, which its file holds as text."""
+    """Decibels in the titles of a picture, which its file holds as text."""
     from PIL.PngImagePlugin import PngImageFile
 
     return [float(psnr) for psnr in re.findall(r": ([\d.]+) dB", PngImageFile(IMAGES / picture).text["Description"])]
 
 
 def picture_figures() -> dict[str, float]:
-    """The figures in the titles of README's two pictures."""
+    """The figures in the titles of the pictures of README and of the tour."""
     names = ("uniform_psnr_db", "dots_psnr_db"), ("one_depth_psnr_db", "each_depth_psnr_db")
     values = titles("demo.png"), titles("depth.png")
     return {name: value for pair in zip(names, values, strict=True) for name, value in zip(*pair, strict=True)}
 
 
 def pictures(work: Path) -> dict[str, float]:
-    """README's pictures and all drawings, made anew; runs that are in ``work`` are used."""
+    """The pages' pictures and all drawings, made anew; runs that are in ``work`` are used."""
     for script, *arguments in (["make.py", str(work)], ["drawings.py"]):
         subprocess.run([sys.executable, str(IMAGES / script), *arguments], check=True)
     return picture_figures()

@@ -1,4 +1,4 @@
-"""Tables of docs/formats.md: the models that read and write each format in, Markdown out.
+"""Tables of docs/formats.md and docs/shipped.md: models of formats and lists of what is shipped in, Markdown out.
 
     python docs/tables.py
 
@@ -41,7 +41,7 @@ from mitsim.learn.pair_store import PairsManifest, Shard
 from mitsim.learn.training_request import ModelManifest
 from mitsim.light.plan import PlanFile
 
-FORMATS, README = Path(__file__).with_name("formats.md"), Path(__file__).parents[1] / "README.md"
+FORMATS, SHIPPED = (Path(__file__).with_name(name) for name in ("formats.md", "shipped.md"))
 MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
@@ -97,4 +97,4 @@ def _between(mark: str, made: str, text: str) -> str:
 
 if __name__ == "__main__":
     FORMATS.write_text(rewritten(FORMATS.read_text(encoding="utf-8")), encoding="utf-8")
-    README.write_text(with_lists(README.read_text(encoding="utf-8")), encoding="utf-8")
+    SHIPPED.write_text(with_lists(SHIPPED.read_text(encoding="utf-8")), encoding="utf-8")

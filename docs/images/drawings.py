@@ -1,4 +1,4 @@
-"""The drawings of docs/physics.md and docs/architecture.md: the shipped devices' numbers in, six PNG files out.
+"""The drawings of docs/physics.md and docs/architecture.md: the shipped devices' numbers in, seven PNG files out.
 
     python docs/images/drawings.py [FOLDER]
 
@@ -350,6 +350,61 @@ def _caustic(axes: Axes) -> None:
     _path(axes, (5.2, 0.55), SENSOR)
 
 
+BOXES = {
+    "files": (1, 0, "scene.xml, camera\nand projector files"),
+    "bench": (1, 1, "bench\nwhat is loaded, as data"),
+    "planner": (1, 2, "planner\npilot, then plan"),
+    "light": (1, 3, "light\npasses, light estimate"),
+    "transport": (2, 3, "transport\npaths of light"),
+    "optics": (1, 4, "optics\nexpected frames"),
+    "sensor": (2, 4, "sensor\nelectrons to numbers"),
+    "calibrate": (0, 2, "calibrate\nwhite board, stripes"),
+    "CAL": (0, 5, "CAL folder"),
+    "RUN": (2, 5, "RUN folder"),
+    "reconstruct": (1, 6, "reconstruct\naccumulate, solve"),
+    "image": (1, 7, "image\nuncertainty, status"),
+    "metrics": (2, 7, "metrics\nPSNR, SSIM"),
+    "report": (1, 8, "report, studies"),
+}
+"""Column, row and words of each stage on the way from files to an image."""
+FLOW = (
+    "files>bench bench>planner bench>calibrate planner>light transport>light light>optics optics>sensor sensor>RUN "
+    "calibrate>CAL CAL>reconstruct RUN>reconstruct reconstruct>image image>report metrics>report"
+)
+COLUMN, ROW, WIDE, HIGH = 3.0, 1.35, 2.5, 0.85
+"""Steps between boxes, and their size; chosen so that words of 10 points fit."""
+
+
+def way() -> Figure:
+    """The stages from files to an image. Frames alone lead from the camera's side to the solver's."""
+    figure, axes = _sheet(7, 8.4)
+    for name, (column, row, words) in BOXES.items():
+        x, y, color = column * COLUMN, -row * ROW, GREEN if name in ("RUN", "CAL") else INK
+        axes.add_patch(Rectangle((x - WIDE / 2, y - HIGH / 2), WIDE, HIGH, fc="white", ec=color, lw=1.6))
+        axes.text(x, y, words, ha="center", va="center", color=color, fontsize=10)
+    for arrow in FLOW.split():
+        axes.annotate("", **_between(*arrow.split(">")), arrowprops={"arrowstyle": "->", "color": GREY, "lw": 1.6})
+    truth = {"arrowstyle": "->", "color": GREY, "lw": 1.6, "ls": (0, (3, 3))}
+    axes.annotate("", **_between("RUN", "metrics"), arrowprops=truth)
+    axes.text(2 * COLUMN + 0.1, -5.9 * ROW, "truth.exr", color=GREY, va="center", fontsize=10)
+    axes.set(xlim=(-WIDE / 2 - 0.1, 2 * COLUMN + WIDE / 2 + 0.1), ylim=(-8 * ROW - 0.6, 0.6))
+    return figure
+
+
+def _between(start: str, end: str) -> dict[str, tuple[float, float]]:
+    """The ends of an arrow from one box to another: between the sides that face each other."""
+    (column, row, _), (last_column, last_row, _) = BOXES[start], BOXES[end]
+    down, right = np.sign(last_row - row), np.sign(last_column - column)
+    if down:
+        from_, to = (0.0, -down * HIGH / 2), (0.0, down * HIGH / 2)
+    else:
+        from_, to = (right * WIDE / 2, 0.0), (-right * WIDE / 2, 0.0)
+    return {
+        "xytext": (column * COLUMN + from_[0], -row * ROW + from_[1]),
+        "xy": (last_column * COLUMN + to[0], -last_row * ROW + to[1]),
+    }
+
+
 def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
     """A figure of one drawing without a frame."""
     figure = Figure(figsize=(width, height))
@@ -385,7 +440,7 @@ def _measure(
         )
 
 
-DRAWINGS = (devices, axes, shadow, anchors, parallax, passes)
+DRAWINGS = (devices, axes, shadow, anchors, parallax, passes, way)
 
 
 def main() -> None:

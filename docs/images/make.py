@@ -1,4 +1,4 @@
-"""The pictures of README and docs/bench.md, from nothing but mitsim's own commands.
+"""The pictures of README, docs/tour.md and docs/bench.md, from nothing but mitsim's own commands.
 
     python docs/images/make.py WORK [demo] [depth] [bench] [pictures]
     python docs/images/make.py WORK flatcam diffusercam

@@ -1,4 +1,4 @@
-"""docs/formats.md says what the models of each format say."""
+"""docs/formats.md says what the models of each format say, docs/shipped.md what is shipped."""
 
 import importlib.util
 from pathlib import Path
@@ -22,3 +22,11 @@ def test_the_tables_are_those_of_the_models() -> None:
     assert tables.rewritten(text) == text, "run: python docs/tables.py"
     for model in tables.MODELS:
         assert {*model.model_fields} == {*tables.meanings(model)}, model
+
+
+def test_the_lists_are_those_of_mitsim_list() -> None:
+    """(Planted: a row of the page taken away; the list of effects taken away.)"""
+    tables = documents()
+    text = tables.SHIPPED.read_text(encoding="utf-8")
+    assert tables.with_lists(text) == text, "run: python docs/tables.py"
+    assert all(f"<!-- list: {kind} -->" in text + tables.FORMATS.read_text("utf-8") for kind in tables.KINDS)
