@@ -47,7 +47,7 @@ TILES = {
     "ambient": "lamp/pictures/ambient.png",
     "colour": "coloured/pictures/image.png",
     "sweep": "sweep/images.png",
-    "flatcam": "run7/gb/pictures/frame.png",
+    "flatcam": "run7/gb/pictures/frames.png",
     "diffuser": "seen/pictures/image.png",
 }
 """What a tile of docs/gallery.md shows of what its commands wrote."""
