@@ -98,7 +98,9 @@ def notebooks() -> str:
         outputs = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
         picture = ROOT / PICTURES / f"{name}.png"
         picture.parent.mkdir(parents=True, exist_ok=True)
-        picture.write_bytes(base64.b64decode("".join([data["image/png"] for data in outputs if "image/png" in data][-1])))
+        picture.write_bytes(
+            base64.b64decode("".join([data["image/png"] for data in outputs if "image/png" in data][-1]))
+        )
         blocks.append(f"![{title}](/{PICTURES}/{name}.png)")
     blocks.append("```{toctree}\n:hidden:\n\n" + "\n".join(TUTORIALS) + "\n```")
     return "\n\n".join(blocks)

@@ -3,8 +3,9 @@
     python docs/images/make.py WORK [demo] [depth] [bench] [pictures] [gallery]
     python docs/images/make.py WORK flatcam diffusercam
 
-All of the first line, or those that are named; *gallery* runs the commands of docs/gallery.md, five minutes. Commands run in the folder WORK, which is made; runs of an earlier call
-found there are used again. Those of the second are of what the walks of docs/bench.md left in WORK.
+All of the first line, or those that are named; *gallery* runs the commands of docs/gallery.md. Commands run in the
+folder WORK, which is made; runs of an earlier call found there are used again. Those of the second are of what the
+walks of docs/bench.md left in WORK.
 """
 
 from __future__ import annotations
@@ -137,6 +138,7 @@ def gallery(work: Path) -> None:
     """Small pictures of what the commands of docs/gallery.md write; what is there already is used."""
     if not (work / "captures").exists():
         (work / "captures").symlink_to(ROOT / "captures")
+    shrink(ROOT / "docs/images/learned.png", ROOT / "docs/images/gallery/network.png")  # of a training of an hour
     for name, commands in tiles().items():
         for command in map(shlex.split, commands):
             if "-o" not in command or not (work / command[command.index("-o") + 1]).exists():
