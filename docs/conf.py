@@ -18,7 +18,10 @@ from sphinx.writers.html5 import HTML5Translator
 import mitsim
 
 ROOT = Path(__file__).resolve().parents[1]
-PICTURES = "docs/_build/gallery"
+PICTURES = "docs/_build/notebooks"
+TUTORIALS = "first_capture", "own_camera_and_picture", "ambient_light", "gloss_and_depth", "calibrate_and_drift"
+TUTORIALS += "real_captures", "teach_a_network"
+"""Notebooks in the order to learn by."""
 
 project = "mitsim"
 author = "the mitsim authors"
@@ -53,6 +56,7 @@ CONTENTS = """
 Five minutes </README>
 tour
 notebooks/index
+gallery
 ```
 
 ```{toctree}
@@ -108,22 +112,21 @@ def face() -> str:
     return "\n\n".join(blocks)
 
 
-def gallery() -> str:
-    """Markdown that shows every notebook by its title, its first words and the first picture stored in it."""
+def notebooks() -> str:
+    """Markdown that shows every notebook by its title, its first words and the last picture stored in it."""
     blocks = []
-    for path in sorted((ROOT / "docs/notebooks").glob("*.ipynb")):
-        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    for number, name in enumerate(TUTORIALS, 1):
+        cells = json.loads((ROOT / f"docs/notebooks/{name}.ipynb").read_text(encoding="utf-8"))["cells"]
         title, _, words = "".join(cells[0]["source"]).lstrip("# ").partition("\n")
-        blocks.append(f"## [{title}]({path.name})\n\n{words.strip()}")
+        blocks.append(f"## [{number}. {title}]({name}.ipynb)\n\n{words.strip()}")
         outputs = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
-        pictures = [data["image/png"] for data in outputs if "image/png" in data]
-        if pictures:
-            picture = ROOT / PICTURES / f"{path.stem}.png"
-            picture.parent.mkdir(parents=True, exist_ok=True)
-            picture.write_bytes(base64.b64decode("".join(pictures[0])))
-            blocks.append(f"![{title}](/{PICTURES}/{picture.name})")
-    if blocks:
-        blocks.append("```{toctree}\n:hidden:\n:glob:\n\n*\n```")
+        picture = ROOT / PICTURES / f"{name}.png"
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture.write_bytes(
+            base64.b64decode("".join([data["image/png"] for data in outputs if "image/png" in data][-1]))
+        )
+        blocks.append(f"![{title}](/{PICTURES}/{name}.png)")
+    blocks.append("```{toctree}\n:hidden:\n\n" + "\n".join(TUTORIALS) + "\n```")
     return "\n\n".join(blocks)
 
 
@@ -134,7 +137,7 @@ def plugins() -> str:
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 
 
-myst_substitutions = {"face": face(), "gallery": gallery(), "plugins": plugins()}
+myst_substitutions = {"face": face(), "notebooks": notebooks(), "plugins": plugins()}
 
 
 def add_contents(_: Sphinx, page: str, source: list[str]) -> None:

@@ -60,9 +60,9 @@ ACCURACY = "0.02"
 """For examples that name none: how the verbs fit together does not depend on it, and they take a tenth of the time."""
 
 
-def script(name: str) -> Any:
+def script(name: str, folder: str = "docs") -> Any:
     """A script of docs, as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, ROOT / folder / f"{name}.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
@@ -156,6 +156,7 @@ def test_every_option_in_the_docs_is_one_of_a_verb() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in EXAMPLES if examples(page) and page not in ELSEWHERE_RUN])
 def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) -> None:
+    (tmp_path / "captures").symlink_to(ROOT / "captures")  # as the repository's folder has it
     for example in examples(page):
         command = verbs()[example.arguments[0]]
         options = {option for parameter in command.params for option in parameter.opts}
@@ -348,6 +349,24 @@ def test_the_devices_are_drawn_as_they_are_shipped() -> None:
     for drawing in drawings.DRAWINGS:
         assert (ROOT / "docs" / "images" / f"{drawing.__name__}.png").is_file()
         assert any(f"images/{drawing.__name__}.png" in text_of(page) for page in PAGES)
+
+
+def test_each_tile_of_the_gallery_has_its_picture_a_sentence_and_commands_that_make_it() -> None:
+    """Pictures are small, none is left over, and of what a tile's commands write one is shown: its path begins as their
+    output. Whether the program takes the commands, and whether they run, tests above say.
+
+    (Planted: a tile without a command, a picture that no tile shows, an output under another name, a picture of 70 kB.)
+    """
+    make, page = script("make", "docs/images"), text_of("docs/gallery.md")
+    tiles = make.tiles()
+    pictures = {path.stem: path.stat().st_size for path in (ROOT / "docs/images/gallery").glob("*.png")}
+    assert pictures.keys() == tiles.keys() and len(tiles) >= 12
+    assert max(pictures.values()) < make.LARGEST
+    assert page.count("\n<div>\n") == len(tiles) == len(re.findall(r"^\*\*.+\*\*", page, flags=re.M))
+    assert [name for name, commands in tiles.items() if name not in make.TILES or not commands] == ["network"]
+    for name, shown in make.TILES.items():
+        outputs = [re.findall(r"(?:-o|report) (\S+)", command) for command in tiles[name]]
+        assert any(shown == output or shown.startswith(f"{output}/") for found in outputs for output in found), name
 
 
 # ---- how the text reads ----------------------------------------------------------------------------------------------

@@ -1,15 +1,18 @@
-"""The pictures of README, docs/tour.md and docs/bench.md, from nothing but mitsim's own commands.
+"""The pictures of README, docs/tour.md, docs/bench.md and docs/gallery.md, from nothing but mitsim's own commands.
 
-    python docs/images/make.py WORK [demo] [depth] [bench] [pictures]
+    python docs/images/make.py WORK [demo] [depth] [bench] [pictures] [gallery]
     python docs/images/make.py WORK flatcam diffusercam
 
-All of the first line, or those that are named. Commands run in the folder WORK, which is made; runs of an earlier call
-found there are used again. Those of the second are of what the walks of docs/bench.md left in WORK.
+All of the first line, or those that are named; *gallery* runs the commands of docs/gallery.md. Commands run in the
+folder WORK, which is made; runs of an earlier call found there are used again. Those of the second are of what the
+walks of docs/bench.md left in WORK.
 """
 
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +26,7 @@ from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
 from mitsim.learn.pictures import DrawnPictures
 
+ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = {
     "run": ("capture", "photograph", "--patterns", "dots:7"),
     "run-uniform": ("capture", "photograph", "--patterns", "uniform"),
@@ -31,6 +35,27 @@ COMMANDS = {
     "dots": ("patterns", "dots:7"),
     "stripes": ("patterns", "stripes", "--camera", "imx249", "--exposure", "0.006"),
 }
+TILES = {
+    "view": "view.png",
+    "patterns": "dots/patterns/pattern_00024.png",
+    "capture": "run/pictures/frame.png",
+    "calibrate": "cal/pictures/left.png",
+    "reconstruct": "image/pictures/image.png",
+    "uncertainty": "image/pictures/uncertainty.png",
+    "truth": "bag/pictures/truth.png",
+    "depth": "depths/pictures/depth.png",
+    "highlight": "card/pictures/truth.png",
+    "ambient": "lamp/pictures/ambient.png",
+    "colour": "coloured/pictures/image.png",
+    "sweep": "sweep/images.png",
+    "flatcam": "run7/gb/pictures/frames.png",
+    "diffuser": "seen/pictures/image.png",
+}
+"""What a tile of docs/gallery.md shows of what its commands wrote."""
+WIDEST = 560
+"""Pixels of a tile's picture: two for each of a tile's on the page, nearly."""
+LARGEST = 60_000
+"""Bytes of a tile's picture, so that the page loads at once."""
 Panel = tuple[str, np.ndarray]
 """Title, and image (n, n) as it is shown: numbers in 0..1 in grey or of red, green and blue, else a depth [mm]."""
 
@@ -38,6 +63,8 @@ Panel = tuple[str, np.ndarray]
 def main() -> None:
     work, names = Path(sys.argv[1]), sys.argv[2:]
     work.mkdir(exist_ok=True)
+    if not names or "gallery" in names:
+        gallery(work)
     for picture in (demo, depth, bench, pictures, flatcam, diffusercam):
         if picture.__name__ in (names or ("demo", "depth", "bench", "pictures")):
             draw(picture.__name__, *picture(work))
@@ -98,6 +125,39 @@ def diffusercam(work: Path) -> list[Panel]:
         ("Raw capture", raw / raw.max()),
         ("Image", picture(work / "hand/reconstruction/image.png")),
     ]
+
+
+def tiles() -> dict[str, list[str]]:
+    """Commands after `mitsim` of each tile of docs/gallery.md, by the name of its picture."""
+    page = ROOT.joinpath("docs/gallery.md").read_text(encoding="utf-8")
+    found = re.findall(r"\(images/gallery/(\w+)\.png\)(.*?)^</div>", page, flags=re.M | re.S)
+    return {name: re.findall(r"^    \$ mitsim (.*)$", text, flags=re.M) for name, text in found}
+
+
+def gallery(work: Path) -> None:
+    """Small pictures of what the commands of docs/gallery.md write; what is there already is used."""
+    if not (work / "captures").exists():
+        (work / "captures").symlink_to(ROOT / "captures")
+    shrink(ROOT / "docs/images/learned.png", ROOT / "docs/images/gallery/network.png")  # of a training of an hour
+    for name, commands in tiles().items():
+        for command in map(shlex.split, commands):
+            if "-o" not in command or not (work / command[command.index("-o") + 1]).exists():
+                mitsim(work, *command)
+        if name in TILES:
+            shrink(work / TILES[name], ROOT / f"docs/images/gallery/{name}.png")
+
+
+def shrink(path: Path, smaller: Path) -> None:
+    """The picture at ``path``, of a tall one its upper square, with as many greys or colours as ``LARGEST`` allows."""
+    shown = Image.open(path).convert("RGB")
+    if shown.height > 2 * shown.width:
+        shown = shown.crop((0, 0, shown.width, shown.width)).resize((WIDEST, WIDEST), Image.Resampling.NEAREST)
+    shown.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
+    for colours in (256, 128, 64, 32, 16):
+        shown.quantize(colours).save(smaller, optimize=True)
+        if smaller.stat().st_size < LARGEST:
+            return
+    raise SystemExit(f"{path}: no {LARGEST} bytes are enough for it")
 
 
 def lit(path: Path) -> np.ndarray:

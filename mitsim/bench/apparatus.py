@@ -422,12 +422,11 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
 
 def _check_camera(path: Path) -> None:
     """MitsimError for a camera file whose sensor breaks a rule, with the mistakes of its mask beside them."""
-    from mitsim.devices.sensor import SensorModel
+    from mitsim.devices.sensor import SensorModel, sensor_table
 
     table = read_toml(path)
     mask = table.part("mask") if isinstance(table.get("mask"), dict) else None
-    table.pop("mask", None)
-    found = mistakes(SensorModel, table)
+    found = mistakes(SensorModel, sensor_table(path))
     if found and mask is not None:
         from mitsim.devices.mask_profile import MaskProfile  # only now: it imports numpy
 

@@ -435,9 +435,14 @@ def check_exposure(seconds: float) -> float:
 
 
 def load_sensor(path: Path | str) -> SensorModel:
-    """The sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
+    """The sensor in the TOML file at ``path``; MitsimError names the file, field, value and rule."""
+    return validate(SensorModel, sensor_table(path), f"file {path}")
+
+
+def sensor_table(path: Path | str) -> Table:
+    """Fields of the sensor in the TOML file at ``path``, whose table ``[mask]`` is another's
     (:func:`mitsim.devices.mask_profile.load_mask`). A line ``base`` names a shipped camera, or a file beside it, whose
-    fields count where the file has none of its own. MitsimError names the file, field, value and rule."""
+    fields count where the file has none of its own. MitsimError for a base that there is not."""
     table, read, first = read_toml(path), [Path(path).resolve()], path
     while (base := table.pop(BASE, None)) is not None:
         if not isinstance(base, str):
@@ -455,7 +460,7 @@ def load_sensor(path: Path | str) -> SensorModel:
             below = {name: below[name] for name in below.keys() - set().union(*others)}
         table = Table({**below, **table}, table.text, table.place)
     table.pop("mask", None)
-    return validate(SensorModel, table, f"file {first}")
+    return table
 
 
 def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:
