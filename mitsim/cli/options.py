@@ -56,7 +56,7 @@ _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_fi
 NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 """Words of --colour beside `lines` and `bands:K`."""
 
-CAMERA, PROJECTOR, SESSION, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
+CAMERA, PROJECTOR, RECIPE, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
 """Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
 known of frames."""
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 import mitsim
+from mitsim.cli.help_page import WHAT
 from mitsim.cli.options import LimitedPictured, Resume, is_given, option, refuse_unused, verb
 from mitsim.cli.screen import finish
 from mitsim.core.errors import MitsimError
@@ -18,6 +19,8 @@ from mitsim.core.worker import RESUME, advise
 @dataclass(frozen=True)
 class Running:
     """How a session is run."""
+
+    PANEL = WHAT
 
     output: Path | None = option(
         None,
@@ -46,7 +49,14 @@ def run_(
     running: Running,
     limited: LimitedPictured,
 ) -> int:
-    """Take all steps of a session file, each into its folder: plan, capture, calibrate, reconstruct, study, export."""
+    """All steps of one session file, or the file that repeats a folder.
+
+    Each step, such as capture or a sweep, has its folder in that of the session.
+
+    $ mitsim run demo -o out
+    $ mitsim run fig1.toml -o out -D capture.patterns=dots:5
+    $ mitsim run --from out/image -o figure.toml
+    """
     if running.folder is not None:
         return _repeat(context, session, running.folder, running.output, limited)
     if session is None:

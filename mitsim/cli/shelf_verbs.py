@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.help_page import WHAT
-from mitsim.cli.options import CAMERA, PROJECTOR, SESSION, Common, completing, refuse_unused, verb
+from mitsim.cli.options import CAMERA, PROJECTOR, RECIPE, Common, completing, refuse_unused, verb
 from mitsim.cli.screen import finish
 from mitsim.core.configuration import DEFAULT_CAMERA, load_model, opening_words, read_toml, shipped_files
 from mitsim.core.errors import MitsimError, near_name
@@ -214,7 +214,9 @@ class _Starter:
 
     def files(self) -> Mapping[str, Path]:
         """Files that one may be like, by name."""
-        return shipped_files("calibration", ".toml", self.field) if self.field else shipped_files("scenes", "scene.xml")
+        if self.field:
+            return shipped_files("calibration", ".toml", self.field)
+        return shipped_files("scenes", "scene.xml") if self.lines is None else shipped_files("sessions", ".toml")
 
 
 def _camera(name: str, like: Path) -> Iterator[str]:
@@ -241,6 +243,11 @@ def _projector(name: str, like: Path) -> Iterator[str]:
 
 
 def _session(_: str, like: Path) -> Iterator[str]:
+    """Below the line that says what the shipped one is."""
+    yield from like.read_text(encoding="utf-8").splitlines()[1:]
+
+
+def _recipe(_: str, like: Path) -> Iterator[str]:
     from mitsim.core.field_docs import starter
     from mitsim.devices.session import SessionRecipe, load_recipe
 
@@ -271,7 +278,8 @@ _STARTERS = {
     "projector": _Starter("mitsim plan photograph --projector {}", _projector, "mp_cl1", PROJECTOR),
     "scene": _Starter("mitsim plan {}/scene.xml", None, "photograph"),
     "mask": _Starter(_CAPTURE, _mask, DEFAULT_CAMERA, CAMERA),
-    "session": _Starter("mitsim calibrate photograph -o cal --recipe {}", _session, "session", SESSION),
+    "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", _recipe, "session", RECIPE),
+    "session": _Starter("mitsim run {} -o session-output", _session, "demo"),
     "study": _Starter("mitsim study {} -o study --quick", _study),
     "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS", _list),
 }
@@ -297,10 +305,10 @@ def new(
         typer.Option(
             help="shipped one that it begins as",
             metavar="NAME",
-            show_default="imx249, mp_cl1, photograph, session",
+            show_default="imx249, mp_cl1, photograph, session, demo",
             rich_help_panel=WHAT,
             autocompletion=completing(
-                lambda: (*shipped_files("scenes", "scene.xml"), *shipped_files("calibration", ".toml"))
+                lambda: {name: None for each in _STARTERS.values() if each.like for name in each.files()}
             ),
         ),
     ] = None,
@@ -308,8 +316,8 @@ def new(
 ) -> int:
     """A file to begin with: commented, whole, valid as it is.
 
-    Each field says what it is and what it may be. A mask is a camera file with a table [mask], a session is a recipe
-    of calibrate --recipe, a list is of import --list.
+    Each field says what it is and what it may be. A mask is a camera file with a table [mask], a recipe is of
+    calibrate --recipe, a list is of import --list.
 
     $ mitsim new camera mine
     $ mitsim new scene bench --like cookie_bag
@@ -339,7 +347,11 @@ def new(
         with whole_folder(output) as folder:
             shutil.copytree(source.parent, folder, dirs_exist_ok=True)
     else:
-        head = [f"# {kind.capitalize()} {name}, for: {use}", *_HEAD] if ending == ".toml" else []
+        head = (
+            [f"# {kind.capitalize()} {name}, for: {use}", *([] if kind == "session" else _HEAD)]
+            if ending == ".toml"
+            else []
+        )
         text = "\n".join([*head, *begin.lines(name, source)]) + "\n"
         with output_file(output) as place:
             write_text(place, text)

@@ -141,7 +141,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
     )
 
 
-def shipped_files(shelf: Literal["scenes", "calibration"], ending: str, field: str = "") -> dict[str, Path]:
+def shipped_files(shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> dict[str, Path]:
     """Paths of shipped files by their names.
 
     Parameters

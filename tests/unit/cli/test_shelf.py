@@ -24,6 +24,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.exchange.capture_list import load_capture_list
 from mitsim.learn.training_request import METHODS as LEARNED
 from mitsim.reconstruct.request import METHODS
+from mitsim.sessions.session_file import read_session
 from mitsim.studies import EXPERIMENTS, STUDIES
 from mitsim.studies.framework.experiment import Scope, Setup, find_experiment
 
@@ -116,8 +117,11 @@ def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_p
     mask = begun(shell_of, "mask", tmp_path / "m.toml")
     found = load_mask(mask)
     assert load_sensor(mask).name == "mine" and found is not None and found.kind == "separable"
-    assert load_recipe(begun(shell_of, "session", tmp_path / "s.toml")).signed_capture == "pair"
-    assert load_recipe(begun(shell_of, "session", tmp_path / "d.toml", "--like", "drift")).drift is not None
+    assert load_recipe(begun(shell_of, "recipe", tmp_path / "s.toml")).signed_capture == "pair"
+    assert load_recipe(begun(shell_of, "recipe", tmp_path / "d.toml", "--like", "drift")).drift is not None
+    session = begun(shell_of, "session", tmp_path / "run.toml")
+    assert read_session(session).steps == read_session("demo").steps
+    assert session.read_text(encoding="utf-8").startswith(f"# Session mine, for: mitsim run {session}")
     listed = load_capture_list(begun(shell_of, "list", tmp_path / "l.toml"))
     read_name(str(listed.patterns), listed.n)
 
