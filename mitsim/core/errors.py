@@ -37,7 +37,11 @@ class ArgumentError(MitsimError):
 
     def __init__(self, argument: str, message: str) -> None:
         super().__init__(f"{argument} {message}")
-        self.argument = argument
+        self.argument, self._message = argument, message
+
+    def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, str]]:
+        """As a process that works for a study hands it back."""
+        return ArgumentError, (self.argument, self._message)
 
 
 def printable(text: str) -> str:

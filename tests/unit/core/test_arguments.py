@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,3 +102,9 @@ def test_what_is_allowed_is_said_in_words(name: str, value: object, line: str) -
 def test_a_call_that_cannot_be_one_is_pythons_own_error() -> None:
     with pytest.raises(TypeError, match="multiple values"):
         work("dots:3", plan="dots:4")
+
+
+def test_a_refusal_passes_between_processes() -> None:
+    """(Planted: the way of all exceptions, which makes one of what it says alone.)"""
+    refusal = pickle.loads(pickle.dumps(ArgumentError("sheet_z", "0: give a distance")))
+    assert (str(refusal), refusal.argument) == ("sheet_z 0: give a distance", "sheet_z")
