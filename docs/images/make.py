@@ -148,10 +148,10 @@ def gallery(work: Path) -> None:
 
 
 def shrink(path: Path, smaller: Path) -> None:
-    """The picture at ``path``, of a tall one its upper square, with as many greys or colours as ``LARGEST`` allows."""
+    """The picture at ``path``, of a long one its left square, with as many greys or colours as ``LARGEST`` allows."""
     shown = Image.open(path).convert("RGB")
-    if shown.height > 2 * shown.width:
-        shown = shown.crop((0, 0, shown.width, shown.width)).resize((WIDEST, WIDEST), Image.Resampling.NEAREST)
+    if shown.width > 2 * shown.height:
+        shown = shown.crop((0, 0, shown.height, shown.height)).resize((WIDEST, WIDEST), Image.Resampling.NEAREST)
     shown.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
     for colours in (256, 128, 64, 32, 16):
         shown.quantize(colours).save(smaller, optimize=True)

@@ -75,7 +75,7 @@ def study(
     """An experiment with figures, CSV and JSON.
 
     `mitsim list studies` says what each is for; all is those of the paper on one page, and merge joins the parts of
-    --shard. One of your own is a module, named with a dot.
+    --shard. One of your own is a file, or a module named with a dot.
 
     $ mitsim study patterns -o patterns --quick
     $ mitsim study sweep photograph -o sweep --over sheet_z=390:410:5

@@ -392,4 +392,4 @@ def free_disk(path: Path) -> float:
 
 def size_text(count: float) -> str:
     """A ``count`` of bytes for people."""
-    return f"{count / 2**30:.3g} GiB" if count >= 2**30 else f"{count / 2**20:.3g} MiB"
+    return f"{count / 2**30:.3g} GiB" if count >= 1000 * 2**20 else f"{count / 2**20:.3g} MiB"

@@ -373,7 +373,7 @@ class BenchView:
                 ),
             ]
             figure.add_trace(_line(name, np.array(path), color))
-        figure.add_trace(_line("window on the calibrated plane", layout.window[[0, 1, 2, 3, 0]], ORANGE, 6))
+        figure.add_trace(_line("calibrated window", layout.window[[0, 1, 2, 3, 0]], ORANGE, 6))
         for name, half, z, color in (
             ("sensor", geometry.half_sides, 0.0, BLUE),
             ("mask", (geometry.build_mask().extent_mm / 2,) * 2, geometry.mask_distance, BLACK),
@@ -387,7 +387,7 @@ class BenchView:
             scene={
                 **{name: {"title": {"text": title}} for name, title in titles.items()},
                 "aspectmode": "data",
-                "camera": {"eye": {"x": -1.9, "y": -1.3, "z": 1.0}},
+                "camera": {"eye": {"x": -2.1, "y": -1.45, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
             },
             legend={"orientation": "h", "y": 0, "yanchor": "top"},
             margin={"l": 0, "r": 0, "t": 0, "b": 0},

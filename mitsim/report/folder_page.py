@@ -261,9 +261,10 @@ def _of_calibration(folder: Path) -> Shown:
             Picture.of(
                 name,
                 f"The {name} factor, of {axis}",
-                side,
+                side.T,
                 Scale.of(side, "sqrt(electrons/s)"),
-                f"{side.shape[0]} sensor {axis} (down) x {side.shape[1]} projector {axis} (across)",
+                f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)",
+                wide=True,
             )
             for name, (side, axis) in sides.items()
         ),

@@ -96,12 +96,14 @@ class Picture:
     wide: bool = False
 
     @classmethod
-    def of(cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "") -> Picture:
+    def of(
+        cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "", wide: bool = False
+    ) -> Picture:
         """Of numbers.
 
         Parameters
         ----------
-        name, title, about
+        name, title, about, wide
             as the attributes; the caption is ``about`` and the scale.
         values
             (rows, columns).
@@ -110,7 +112,7 @@ class Picture:
         """
         words = scale.words(values)
         caption = f"{about}: {words}" if about else words
-        return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST))
+        return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST), wide)
 
     @property
     def uri(self) -> str:
