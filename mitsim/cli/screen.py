@@ -149,8 +149,9 @@ def kernel_lines(kernels: Mapping[str, float]) -> list[str]:
 
 def memory_line(payload: Mapping[str, Any]) -> str:
     """The line that is said of the memory that a capture or calibration took, by its ``payload``."""
-    taken, most = payload["memory_bytes"] / 2**30, payload["predicted_memory_bytes"] / 2**30
-    return f"Memory {taken:.2g} GiB of at most {most:.2g} predicted"
+    taken = f"Memory {payload['memory_bytes'] / 2**30:.2g} GiB"
+    most = payload.get("predicted_memory_bytes")  # of real frames nothing is predicted
+    return taken if most is None else f"{taken} of at most {most / 2**30:.2g} predicted"
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:

@@ -98,7 +98,7 @@ RUN = {
     "captures are a number": (put("patterns", "captures", value=10**9), "captures: got 1000000000"),
     "10^12 patterns": (
         lambda path: [put("patterns", side, value=[[0] * 10**6])(path) for side in ("P_L", "P_R")],
-        "P_L.0: got [0, 0, 0, 0, 0, 0, ...], tuple should have at most 4096 items",
+        "P_L.0: got [0, 0, 0, 0, 0, 0, ...]; tuple should have at most 4096 items",
     ),
     "16 million patterns": (
         lambda path: [put("patterns", side, value=[[0] * 4096])(path) for side in ("P_L", "P_R")],

@@ -171,9 +171,10 @@ def test_corners_are_found_among_other_numbers(tmp_path: Path, order: str, name:
     assert "0 to 3, but 3 vertices" in refusal(path)
 
 
-def test_an_obj_without_faces_is_left_to_mitsuba(tmp_path: Path) -> None:
+def test_an_obj_without_faces_is_refused(tmp_path: Path) -> None:
     file("m.obj", OBJ[: OBJ.index("f ")])(tmp_path)
-    assert check_file(prepared(tmp_path, mesh("m.obj", "obj")), {})
+    with pytest.raises(MitsimError, match="'m.obj' .*; the file has no faces: it is a cloud of points; export a mesh$"):
+        check_file(prepared(tmp_path, mesh("m.obj", "obj")), {})
 
 
 @pytest.mark.parametrize("verb", ["plan", "capture", "calibrate", "study", "render"])

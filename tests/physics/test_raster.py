@@ -168,7 +168,7 @@ def test_waves_beyond_a_small_mask_are_drawn(feature: float, order: int) -> None
 def test_waves_of_too_many_points_are_refused() -> None:
     """A random mask 1 um from 512 pixels needs 2 nm from point to point. (Planted: no limit: hours.)"""
     camera = made(kind="random", features=31).model_copy(update={"mask_distance": 1e-3, "pixels": 512})
-    with pytest.raises(MitsimError, match=r"0\.001 mm from the sensor.* points a side there, more than 65536"):
+    with pytest.raises(MitsimError, match=r"0\.001 mm from the sensor.* points a side, more than 65536"):
         raster(camera, 400.0, LINES)
 
 

@@ -198,7 +198,6 @@ _CURVE = "quantum_efficiency_curve = {wavelengths_nm = [600, 700], efficiency = 
         ("full_well_e = 32360.0", "full_well_e = nan", ["full_well_e", "nan"]),
         ("full_well_e = 32360.0", "full_well_e = inf", ["full well"]),
         ("binning = 2", "binning = 0", ["binning", "0"]),
-        ("binning = 2", "binning = 1", ["5.86 um", "11.72 um"]),
         ("gain_dn_per_e = 0.125", "gain_dn_per_e = 0", ["gain_dn_per_e", "0"]),
         ("bits = 12", "bits = 5", ["black_level_dn"]),
         ("bits = 12", "bits = 12.5", ["bits", "12.5"]),

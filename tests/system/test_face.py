@@ -148,7 +148,13 @@ def test_a_saved_capture_is_that_of_the_command_line(
     taken = reported.pop("memory_bytes")
     assert 0 <= taken < reported["predicted_memory_bytes"]
     summary = {**shots.summary(), "shape": [64, 64], "warnings": [], "output": reported["output"]}
-    timed = {"seconds": 0, "kernels": 0, "predicted_seconds": 0, "colour": untimed(tmp_path / "told")["plan"]["colour"]}
+    timed = {
+        "seconds": 0,
+        "kernels": 0,
+        "predicted_seconds": 0,
+        "report": None,
+        "colour": untimed(tmp_path / "told")["plan"]["colour"],
+    }
     assert {**summary, **timed} == {**reported, **timed}
 
 
@@ -423,6 +429,7 @@ def needed(bench: ms.Bench, shots: ms.Capture, factors: ms.Factors, called: Call
     given |= {"modelling": ms.Modelling("wave"), "model": "wave", "patterns": "dots:2", "variant": "llvm_ad_mono"}
     given |= {"method": "unrolled", "pairs": "new", "source": "new", "format": "mat", "camera": "imx249"}
     given |= {"reflectance": 0.5, "count": 1, "depth": 400.0, "stages": {}, "name": "x"}
+    given |= {"picture": "new.png", "mesh": "new.obj", "size": 120.0, "distance": 400.0, "session": {}}
     parameters = inspect.signature(called).parameters.values()
     return {each.name: given[each.name] for each in parameters if each.default is each.empty and each.kind < 2}
 

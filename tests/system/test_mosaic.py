@@ -150,7 +150,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
         (
             "capture",
             ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"),
-            "capture and calibrate it with --colour mosaic",
+            "capture and calibrate by --colour mosaic",
         ),
         (
             "capture",

@@ -71,7 +71,7 @@ def walk(call: Callable[..., Any], heading: str) -> None:
     iterations keep on any machine."""
     figures.put_inputs(heading, Path())
     for example in examples(PAGE, heading):
-        outcome = call(*example.arguments, "--quiet")
+        outcome = call(*example.arguments, "--quiet", pictures=True)
         assert outcome.code == example.status, outcome.err
         for reported, now in figures.pairs(example.output, outcome.out + outcome.err):
             assert float(now) == pytest.approx(float(reported), rel=0.1), example.arguments

@@ -85,7 +85,7 @@ def test_devices_are_camera_and_projector(tmp_path: Path) -> None:
     usual = opening.check_devices(None, None)
     assert [path.name for path in usual] == ["imx249.toml", "mp_cl1.toml"]
     own = tmp_path / "own.toml"
-    own.write_text("")
+    own.write_text(usual[0].read_text(encoding="utf-8"), encoding="utf-8")
     assert opening.check_devices(own, None) == (own, usual[1]) and opening.check_devices(None, own) == (usual[0], own)
     for devices in (("none", None), (None, "none")):
         with pytest.raises(MitsimError, match="none"):

@@ -98,8 +98,8 @@ def test_values_out_of_range_name_the_argument(argument: str, value: Any, allowe
 @pytest.mark.parametrize(
     ("values", "fragments"),
     [
-        ({"acuracy": 1e-3}, ["acuracy", "did you mean accuracy?", "noise_fraction"]),
-        ({"seed": 1.5}, ["seed", "1.5", "integer"]),
+        ({"acuracy": 1e-3}, ["acuracy", "did you mean accuracy?"]),
+        ({"seed": 1.5}, ["seed", "1.5", "whole number"]),
         ({"seed": True}, ["seed", "True"]),
         ({"seed": "1"}, ["seed", "'1'"]),
         ({"accuracy": "fine"}, ["accuracy", "'fine'"]),

@@ -66,7 +66,9 @@ def test_shadows_on_a_region_of_tall_pixels_are_parts_and_means_of_those_on_smal
 def test_tall_pixels_behind_a_mask_on_a_raster_are_refused() -> None:
     """Its cells are square. A mask of one term has no raster. (Planted: let pass.)"""
     tall = CameraGeometry(pixels=8, row_pitch=0.02)
-    with pytest.raises(MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* give square pixels"):
+    with pytest.raises(
+        MitsimError, match=r"row_pitch: got 0\.02 beside pixel_pitch 0\.01172; .* pixels must be square"
+    ):
         MaskProfile(kind="separable", feature_mm=0.06, order=5, rotation_deg=1.0).put_on(tall, Path())
     assert MaskProfile(kind="flatcam", feature_mm=0.06, order=5).put_on(tall, Path()).row_pitch == 0.02
 

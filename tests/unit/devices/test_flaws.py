@@ -125,7 +125,7 @@ def test_lines_that_are_not_even_weigh_by_their_width() -> None:
 def test_other_flaws_are_refused_in_one_line(table: str, word: str, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(f'[mask]\nkind = "separable"\nfeature_mm = 0.06\n{table}\n')
-    with pytest.raises(MitsimError, match=rf"^file .*\[mask\].*{word}[^\n]*$"):
+    with pytest.raises(MitsimError, match=rf"^file .*: mask.*{word}[^\n]*$"):
         load_mask(path)
 
 

@@ -217,7 +217,7 @@ def test_other_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
 def test_other_tables_are_refused_in_one_line(table: str, word: str, tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(f"[mask]\n{table}\n")
-    with pytest.raises(MitsimError, match=rf"^file .*\[mask\].*{word}[^\n]*$"):
+    with pytest.raises(MitsimError, match=rf"^file .*: mask.*{word}[^\n]*$"):
         load_mask(path)
     path.write_text("mask = 3\n")
     with pytest.raises(MitsimError, match=r"give a table"):

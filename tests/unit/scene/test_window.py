@@ -60,4 +60,5 @@ def test_patterns_of_more_periods_than_pixels_are_refused(tmp_path: Path) -> Non
         with pytest.raises(MitsimError, match="K is 7; give 1 to 6, the projector's pixels a side"):
             check_scene(scene, {}, patterns=["uniform", name])
     check_scene(scene, {"shown": "print.png"}, patterns=["dots:7"])
+    (tmp_path / "none.png").write_text("no picture")
     check_scene(scene, {"shown": "none.png"}, patterns=["dots:7"])
