@@ -137,7 +137,7 @@ WRONG: list[Any] = [
         "a\0b",
         "n" * 5000,
     ),
-    *((), [], {}, [1, "x"], (1.0, 2.0), {"x": object()}, type, Path("no such"), Path(__file__).parent),
+    *((), [], {}, [1, "x"], (1.0, 2.0), {"x": object()}, type, Path("no such"), Path(".")),
     *(np.array([]), np.ones((2, 3)), np.array([1j]), np.array([None, "x"]), np.float32("nan"), np.int8(-1)),
 ]
 """Values that are wrong for most arguments; a folder where a file belongs is the last path."""

@@ -49,7 +49,7 @@ def run_(
     running: Running,
     limited: LimitedPictured,
 ) -> int:
-    """All steps of one session file, or the file that repeats a folder.
+    """Take all steps of a session file, or write that of a folder.
 
     Each step, such as capture or a sweep, has its folder in that of the session.
 
