@@ -173,7 +173,9 @@ def test_corners_are_found_among_other_numbers(tmp_path: Path, order: str, name:
 
 def test_an_obj_without_faces_is_refused(tmp_path: Path) -> None:
     file("m.obj", OBJ[: OBJ.index("f ")])(tmp_path)
-    with pytest.raises(MitsimError, match="'m.obj' .*; the file has no faces: it is a cloud of points; export a mesh$"):
+    with pytest.raises(
+        MitsimError, match=r"'m.obj' .*; the file has no faces: it is a cloud of points; export a mesh$"
+    ):
         check_file(prepared(tmp_path, mesh("m.obj", "obj")), {})
 
 
