@@ -399,7 +399,8 @@ def by_bead(devices: MirrorBench, centre: np.ndarray, radius: float, at: np.ndar
     return total
 
 
-@pytest.mark.parametrize(("radius", "pixels"), [(2.0, 8), pytest.param(0.05, 32, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("radius", "pixels"), [(2.0, 8), (0.05, 32)])
 def test_beads_of_glass(variant: str, radius: float, pixels: int) -> None:
     """Two thirds of what a bead sends back comes from its last thirtieth; what comes from its last 64th is counted, and
     not found. (Planted: no arcs looked for, 0.37 of the light; what is too close not counted.)"""
@@ -499,6 +500,7 @@ def test_the_shipped_mirror_through_the_pipeline(shipped_bench, variant: str) ->
     assert abs(whole.sum() - board.sum()) > 50 * error
 
 
+@pytest.mark.slow
 def test_the_shipped_mirror_in_wave_optics(shipped_bench, variant: str) -> None:
     """A point source's shadow by its own propagated field, line by line; the mask separates, so does its field."""
     bench = shipped_bench("mirror")

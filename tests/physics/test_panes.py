@@ -125,6 +125,7 @@ def test_a_wall_close_behind_glass(scene: Callable[..., Bench], before: Callable
     assert close == pytest.approx(far, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_a_point_lamp_behind_a_pane(scene: Callable[..., Bench]) -> None:
     """E = I T sin a / (r dr/da) at a distance r from below the lamp, r = (z - t) tan a + t tan b, sin a = n sin b.
 

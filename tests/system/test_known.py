@@ -180,6 +180,7 @@ def same_run(one: Path, other: Path) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_what_auto_chose_is_captured_by_its_plan(
     shell: Callable[..., Any], sheet: tuple[object, ...], tmp_path: Path
 ) -> None:

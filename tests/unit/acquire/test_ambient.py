@@ -223,6 +223,7 @@ def test_other_numbers_of_shots_are_refused(light: SampledLight, shots: int) -> 
         light.expose("dots:2", ambient_shots=shots)
 
 
+@pytest.mark.slow
 def test_a_sky_and_a_lamp_brighter_than_the_projector(small_scene: Callable[..., Path]) -> None:
     """Nine tenths of the light are ambient, and the noise of what is left is as stated: to 5 % over 4 x 4096 pixels."""
     bright = open_bench(small_scene(n=N, extra=SKY + LAMPS), lamp=150)

@@ -88,6 +88,7 @@ def test_a_lamp_lights_the_sensor_as_its_closed_form(bench: Callable[[str], Benc
     assert abs(np.mean(light) - expected) < 7 * error + 2e-4 * expected
 
 
+@pytest.mark.slow
 def test_a_spot_lamp_is_taken_off(bench: Callable[[str], Bench], tmp_path: Path) -> None:
     """The dark frame holds the spot's light, and what is left of four frames is the projector's: both closed forms.
 

@@ -239,7 +239,14 @@ def test_every_method_learns(method: str, tmp_path: Path) -> None:
     assert after > before + 0.3
 
 
-@pytest.mark.parametrize("method", ["unrolled", "plug-and-play", "preprocessed", "flatnet"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "unrolled",
+        "flatnet",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("plug-and-play", "preprocessed")),
+    ],
+)
 def test_an_interrupted_training_goes_on_bit_equal(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

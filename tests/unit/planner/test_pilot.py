@@ -289,6 +289,7 @@ def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monke
     np.testing.assert_allclose(found.frames, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
     light's for one of them.)"""
@@ -490,6 +491,7 @@ def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.Mo
     assert not list(taken)
 
 
+@pytest.mark.slow
 def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
     """A closer look traces the new samples alone, and tells what one of all samples tells. (Planted: the first samples
     weighed as the new ones; the same samples twice; the camera's part of the new samples alone.)"""

@@ -149,6 +149,7 @@ def test_falloff_over_pixels_is_that_of_a_matt_sheet(turned: SampledLight) -> No
     assert lit.mean() > 0.9 and np.allclose((even * truth.board_flux)[lit], truth.board_flux.mean())
 
 
+@pytest.mark.slow
 def test_light_that_moves_keeps_its_glare(shared_scene: Callable[..., Path], variant: str, tmp_path: Path) -> None:
     """Of a projector of ANSI contrast 10, a fifth of all light: without blur or render noise frames are as bright.
     (Planted: glare among light that is followed further; the truth's whole flux for a pixel's own.)"""

@@ -19,6 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant", "kept_plans", "draft_figures")
 RHO = 0.8
 
 
+@pytest.mark.slow
 def test_each_surface_keeps_the_albedo_of_the_light(shared_scene: Callable[..., Path]) -> None:
     """Light of order k is even in a sphere, so its frames are rho times those of order k - 1, and all after them
     rho / (1 - rho) times; together they are what the pilot says of the effect. What they take is never negative.

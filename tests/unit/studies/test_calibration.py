@@ -53,7 +53,7 @@ class SampledLight(ToyLight):
         return [Frame(self.left @ picture @ self.right.T / self.unit, 0.0, 0.0, 0.0) for picture in pictures]
 
 
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
+@pytest.mark.parametrize("mode", [pytest.param("pair", marks=pytest.mark.slow), "uniform"])
 def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
     """Over 40 sessions of their own noise: 168 and 189 entries of unit variance each, less what a common scale takes.
     What the uniform shot brings to all responses is in one column alone, and there as much as predicted. (Planted: the

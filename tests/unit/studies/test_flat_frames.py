@@ -23,12 +23,12 @@ from tests.real_flats import CAMERAS, Light, camera, write_flats
 pytestmark = pytest.mark.usefixtures("draft_figures")
 SLOW = (
     *("few bits", "dark current", "high gain", "saturating ADC", "no black level"),
-    *("high read noise, cut darks", "six bits, next to no noise"),
+    *("high read noise, cut darks", "six bits, next to no noise", "darks of one code", "many hot pixels"),
 )
 """Cameras of the slow tests: the quick ones are one of each kind of fault. What cut darks and few bits do to the gain
 is looked at by a test of its own."""
-SLOW_LAMPS = "random walk", "step"
-"""Light that scatters, as that of the quick "scattering"."""
+SLOW_LAMPS = "random walk", "step", "linear"
+"""Light that scatters, as that of the quick "scattering", and drifts, as that of "weakly linear"."""
 
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:

@@ -58,7 +58,13 @@ def test_light_does_not_hang_on_how_paths_are_launched(
     assert alike(whole[0], PathSamples.join([tracer.trace(SEEDS[0], 0, 1), tracer.trace(SEEDS[0], 1, 2)]))
 
 
-@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "shared", "at anchors", "from_camera"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("direct", "anchored", "indirect", "from_camera"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("shared", "at anchors")),
+    ],
+)
 def test_replicates_in_one_kernel_are_what_each_seed_traces(
     bench: Bench, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
