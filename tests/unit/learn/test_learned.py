@@ -189,6 +189,16 @@ def test_the_step_of_the_frames_is_the_closed_form() -> None:
     assert_allclose(own.nearest(data, torch.as_tensor(start)[None, None], rho)[0, 0], expected, rtol=1e-8, atol=1e-9)
 
 
+def test_a_denoiser_gives_back_what_it_learned_nothing_of() -> None:
+    """Its last layer begins at zero, and the grey that is taken off is put back. (Planted: added before as well.)"""
+    network = CLASSES["plug-and-play"]((16, 16)).double()
+    images = torch.rand((2, 1, 16, 16), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    factors = bench().calibrated(1)
+    model = LearnedSolver(cast(Any, None), network, factors.sides, bench().run("uniform", picture(1), 1).patterns)
+    with torch.no_grad():
+        assert_allclose(model.denoiser()(images, 0.1), images, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
     """Its physics of the camera has an exact adjoint, our step of the frames is its proximal step, and its loop with

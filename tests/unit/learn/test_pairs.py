@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from scipy import sparse
 
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer
@@ -21,7 +23,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.session import load_recipe
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_request import PairsRequest, Variation
-from mitsim.learn.pair_store import PairStore
+from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import make_pairs
 from mitsim.learn.white_prints import electrons_per_joule
 from mitsim.optics.frames import Frame
@@ -91,7 +93,19 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
         ms.make_pairs(bench, lab.folder / "timed", 2, seconds=3.0)
     with pytest.raises(MitsimError, match="nowhere: is no folder"):
         ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
+    with pytest.raises(MitsimError, match="count 0: give 1 to"):
+        ms.make_pairs(bench, lab.folder / "timed", 0)
+    with pytest.raises(MitsimError, match="^2 pairs"):
+        ms.make_pairs(bench, lab.folder / "timed", 2, "dots:2", job=ms.Job(limits=ms.Limits(memory_bytes=1e6)))
     assert not (lab.folder / "timed").exists()
+
+
+def test_light_lies_in_the_pictures_pixel_of_its_own_row_and_column() -> None:
+    """Of cells that lie otherwise in rows than in columns, over two anchors a side. (Planted: rows for columns.)"""
+    light = sparse.csr_array(([1.0, 2.0, 3.0], [0, 7, 23], [0, 3]), shape=(1, 24))
+    optics = SimpleNamespace(shape=(4, 6), cells=(2, 3))
+    part = PrintPart(cast(Any, optics), light, np.array([2, 0]), np.array([3, 1, 2]), lamps=False)
+    assert part._pixel(4).tolist() == [2 * 4 + 3, 0 * 4 + 1, 0 * 4 + 2]
 
 
 @pytest.fixture
