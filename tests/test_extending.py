@@ -50,7 +50,7 @@ def test_the_code_of_a_section_keeps_the_rules(title: str) -> None:
             assert not participles(step.code)
 
 
-QUICK = ("A mask", "A projector", "A solver")
+QUICK = ("A mask", "A projector")
 """Sections that take a few seconds."""
 
 

@@ -48,7 +48,6 @@ MIRROR = """<shape type="rectangle"><transform name="to_world"><scale x="40" y="
 LAMP = """<shape type="rectangle"><transform name="to_world"><scale x="15" y="15"/><translate z="320" x="-40"/>
     </transform><emitter type="area"><spectrum name="radiance" value="0.5"/></emitter></shape>"""
 SCENES = {"slab": SLAB, "ball": BALL, "specular chain": MIRROR + SLAB, "lamp": SLAB + LAMP}
-QUICK = ("specular chain",)
 ROUNDING = 2e-6
 """Of sums of a few thousand paths in float32."""
 
@@ -174,7 +173,7 @@ def refusal(trace: Callable[[], object]) -> str:
 
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
-    """Light of a scene, traced with that of all others that are as quick."""
+    """Light of scenes, from a child process: this one has another variant."""
     program = (
         "import json, sys; from tests.physics.test_dispersion import traced; "
         "print(json.dumps(traced(sys.argv[1], sys.argv[2:]), default=float))"
@@ -189,19 +188,18 @@ def light(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str,
         found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
         return found
 
-    return lambda name: trace(*(each for each in SCENES if (each in QUICK) == (name in QUICK)))
+    return trace
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SCENES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_each_line_is_bent_by_its_own_index(light: Callable[[str], dict[str, Any]], name: str) -> None:
     """Light, places and pixels of each line are those of a line alone in plain glass of that index.
 
     By some way the lines differ, beside their power, by more than a hundred times the tolerance.
     """
     apart = []
-    for way, (whole, alone) in light(name)[name].items():
+    for way, (whole, alone) in light(*SCENES)[name].items():
         ours, theirs = np.array(whole), np.array(alone)
         np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING * np.abs(theirs).max(), err_msg=way)
         apart.append(np.ptp(theirs / np.abs(theirs).sum(axis=-1, keepdims=True), axis=-2).max())
@@ -210,6 +208,6 @@ def test_each_line_is_bent_by_its_own_index(light: Callable[[str], dict[str, Any
 
 def test_drawn_wavelengths_are_refused(light: Callable[[str], dict[str, Any]]) -> None:
     """By either estimator: paths of four wavelengths would all be bent as the first is."""
-    reported = light(QUICK[0])["refusals"]
+    reported = light()["refusals"]
     assert reported["factored"].startswith("variant llvm_ad_spectral: ") and "colour lines" in reported["factored"]
     assert "got 'mitsim_glass' in <bsdf" in reported["reference"] and "use a mono variant" in reported["reference"]

@@ -137,6 +137,7 @@ print(json.dumps({"reference": [frame.mean(), frame.std(ddof=1) / frame.size**0.
 """
 
 
+@pytest.mark.slow
 def test_rgb_and_spectral_see_the_grey_of_mono(small_scene: Callable[..., Path]) -> None:
     path = small_scene(mask="open")
     expected = {"reference": quadrature(64 * 0.01172 / 2), "factored": quadrature(1e-9)}

@@ -125,9 +125,8 @@ def test_a_thin_pane_dims_the_wall_by_its_transmittance_squared(scene: Callable[
     assert direct_light(behind, 1) == pytest.approx(transmittance**2 * direct_light(alone, 1), rel=2e-3)
 
 
-@pytest.mark.parametrize(
-    "name", [*list(SCENES)[:1], *(pytest.param(n, marks=pytest.mark.slow) for n in list(SCENES)[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_all_light_is_that_of_the_reference(scene: Callable[..., Bench], name: str) -> None:
     bench = scene(SCENES[name])
     found, error = mean([float(all_light(bench, seed).sum()) for seed in range(SEEDS)])

@@ -101,7 +101,7 @@ def rays_counted(camera: CameraGeometry, plate: Plate, at: list[np.ndarray], lig
 @pytest.mark.parametrize(
     ("feature", "degrees", "bare"),
     [
-        (0.05, 3.0, {}),
+        pytest.param(0.05, 3.0, {}, marks=pytest.mark.slow),
         (0.05, 3.0, {"mask_offset_row": 0.11, "mask_offset_column": -0.07}),
         (0.05, 5.0, {"rows": 33, "columns": 21}),
         (0.004, 7.0, {"pixels": 31}),

@@ -15,6 +15,7 @@ from tests.system.refusals import Refused, mentions
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
 
+@pytest.mark.slow
 def test_a_plan_prints_what_it_takes_and_writes_its_recipe(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     options = "--plan", "--psnr", 20, "--patterns", "dots:4", "--json", "--quiet", "-o", tmp_path / "recipe.toml"
     done = call("calibrate", *lab.arguments, *options)

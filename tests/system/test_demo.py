@@ -81,6 +81,7 @@ def test_the_folders_are_those_of_capture_and_calibrate(
     assert found["psnr"] == pytest.approx(report["psnr"]["dots:7"], abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_second_demo_of_ones_own_devices_and_patterns_replaces_the_first(
     call: Callable[..., Any], lab: Any, done: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:

@@ -71,6 +71,7 @@ def stopped(call: Callable[..., Any], lab: Any, run: Path, whole: Path, how: sig
     assert_resumed(call, lab, run, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "least"),
     [

@@ -169,6 +169,7 @@ for arguments in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.slow
 def test_a_new_effect_is_an_entry_and_its_physics(small_scene: Callable[..., Path], tmp_path: Path) -> None:
     """`dimming`: a lamp at 90 % where the projector's name says so, added to a copy of the package.
 

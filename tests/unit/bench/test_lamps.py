@@ -163,9 +163,10 @@ def glowing(x: float, z: float, radius: float) -> str:
         (glowing(20, 300, 2), False),  # found by paths
         (glowing(0.19 * 300, 300, 0.3), False),
         (glowing(0, 500, 0.3), False),  # behind the sheet
-        (
+        pytest.param(
             glowing(20, 300, 0.3) + BEHIND.format(HOLE.format(1)).replace("<translate", '<scale value="9"/><translate'),
             False,
+            marks=pytest.mark.slow,
         ),
     ],
 )

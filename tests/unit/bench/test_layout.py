@@ -61,6 +61,7 @@ def test_light_that_is_seen_is_counted(small_scene: Callable[..., Path]) -> None
     assert dark.seen == 0 and dark.depths is None and dark.trouble and "no light of the projector" in dark.trouble
 
 
+@pytest.mark.slow
 def test_shapes_without_triangles_have_their_outlines(small_scene: Callable[..., Path]) -> None:
     """By rays from six sides, also of an instance, whose parts Mitsuba tells nobody. (Planted: rays from one side;
     corners of neighbouring rays joined over the gap between sphere and cube.)"""

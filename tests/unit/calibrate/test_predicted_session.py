@@ -29,12 +29,13 @@ def exposed(lit: LitSession) -> list[Estimate]:
     return [estimate(replace(lit, session=session), Job())[0] for session in sessions]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "n", "repeats"),
     [
-        pytest.param("pair", 7, 1, marks=pytest.mark.slow),
+        ("pair", 7, 1),
         ("uniform", 8, 1),
-        pytest.param("pair", 4, 3, marks=pytest.mark.slow),
+        ("pair", 4, 3),
     ],
 )
 def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: int, repeats: int) -> None:

@@ -439,7 +439,7 @@ def test_repeats_leave_their_numbers_part_of_the_noise(mode: str) -> None:
     [
         ("pair", {}),
         ("uniform", {}),
-        ("pair", {"exposure_ladder": (1.0, 3.0, 5.0), "ladder_merge": "longest"}),
+        pytest.param("pair", {"exposure_ladder": (1.0, 3.0, 5.0), "ladder_merge": "longest"}, marks=pytest.mark.slow),
         pytest.param("pair", {"exposure_ladder": (1.0, 2.0, 3.5), "repeats": 2}, marks=pytest.mark.slow),
         ("uniform", {"exposure_ladder": (1.0, 3.0)}),
         ("uniform", {"exposure_ladder": (1.0, 3.0), "dark_frames": 2}),

@@ -237,7 +237,13 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
 # -------- Training
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if name in ("preprocessed", "plug-and-play") else [])
+        for name in METHODS
+    ],
+)
 def test_every_method_learns(method: str, tmp_path: Path) -> None:
     """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
     made = train_network(

@@ -95,7 +95,7 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
         ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
     with pytest.raises(MitsimError, match="count 0: give 1 to"):
         ms.make_pairs(bench, lab.folder / "timed", 0)
-    with pytest.raises(MitsimError, match="^2 pairs"):
+    with pytest.raises(MitsimError, match=r"^2 pairs"):
         ms.make_pairs(bench, lab.folder / "timed", 2, "dots:2", job=ms.Job(limits=ms.Limits(memory_bytes=1e6)))
     assert not (lab.folder / "timed").exists()
 

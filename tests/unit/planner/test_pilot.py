@@ -562,6 +562,7 @@ def test_a_mirror_shows_some_shots_only(shipped_bench: Callable[..., Bench]) -> 
     assert found.value == pytest.approx(actual, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_refined_run_is_in_what_was_found(bench: Bench) -> None:
     """More samples of a run tell its changes with half of the standard error. (Planted: the former is kept.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, seed=3)

@@ -156,7 +156,7 @@ def speckle(rng: np.random.Generator) -> np.ndarray:
         (lenses, 0.05, "nonnegative", 1, 0.01),
         (speckle, 0.02, "nonnegative", 0.03, 0.02),
         (lenses, 0.05, "tv", 10, 0.04),
-        (lenses, 0.05, "tv", 100, 0.02),
+        pytest.param(lenses, 0.05, "tv", 100, 0.02, marks=pytest.mark.slow),
         (lenses, 0.01, "tv", 1, 0.07),
     ],
 )

@@ -107,11 +107,16 @@ COARSE: dict[str, tuple[dict[str, object], str]] = {
 }  # fmt: skip
 
 
+SLOW_COARSE = "6 bits, next to no noise", "8 bits, noise of 0.6 DN"
+
+
 def coarse(name: str) -> SensorModel:
     return sensor(**{**PLAIN, "full_well_e": 10_000.0, **COARSE[name][0]})
 
 
-@pytest.mark.parametrize("name", COARSE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_COARSE else []) for name in COARSE]
+)
 def test_few_bits_and_clipped_darks_are_expected_and_flagged(name: str) -> None:
     """Where the ADC's ends and steps mislead the procedure, that is said with its cause; and nowhere else.
 

@@ -42,6 +42,7 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> TwinFiles:
     return TwinFiles.find(CAPTURES)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("draft_figures")
 def test_a_capture_is_seen_by_what_the_other_taught(
     reduced: TwinFiles, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

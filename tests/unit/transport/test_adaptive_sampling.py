@@ -16,7 +16,8 @@ BLOCKS = 5
 """Blocks a side of 18 pixels: the last are of two pixels."""
 
 
-@pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [False, True])
 def test_repeated_light_is_the_same_light(shared_scene: Callable[..., Path], shared: bool) -> None:
     """Of each class of pixels, how much and from where, whatever the repeats; and less noise where there are more.
 

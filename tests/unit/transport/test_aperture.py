@@ -102,6 +102,7 @@ def test_defocus_keeps_the_flux() -> None:
         assert flux == pytest.approx(expected, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_light_traced_from_the_projector_agrees() -> None:
     """``sample_ray`` against ``sample_direction``: mean of what a particle tracer and a path tracer render."""
     parts = aperture_scene_parts(stock(turn=3.0), 3.0, 300.0)

@@ -47,7 +47,8 @@ def tracer(bench: Bench, **followed: object) -> FromCameraTracer:
     return FromCameraTracer(bench.setup, grid(bench), Paths(**followed))
 
 
-@pytest.mark.parametrize("interreflection", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("interreflection", [False, True])
 def test_an_even_sky(outdoors: Bench, interreflection: bool) -> None:
     """The sheet of albedo 0.5 shows half of the sky's radiance, and where the sheet ends is the sky itself.
 

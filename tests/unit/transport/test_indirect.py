@@ -72,6 +72,7 @@ def test_a_flat_scene_has_no_indirect_light(small_scene: Callable[..., Path]) ->
     assert not tracer(open_bench(small_scene())).trace(0, 0, 4).value.size
 
 
+@pytest.mark.slow
 def test_both_sides_together_find_all_light(shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """In a shiny sphere: as much by both, each below its threshold, as when one of them has everything.
 

@@ -24,6 +24,7 @@ N, SEEDS, SIGMAS, RHO = 16, 8, 7.0, 0.5
 SKY = '<emitter type="constant"><spectrum name="radiance" value="20"/></emitter>'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [IndirectTracer, PathReuseTracer])
 def test_each_reflection_in_a_sphere_keeps_the_albedo(
     shared_scene: Callable[..., Path], kind: type[IndirectTracer]
@@ -59,7 +60,9 @@ def tracers(bench: Bench) -> dict[str, FollowingTracer]:
     }
 
 
-@pytest.mark.parametrize("name", ["projector", "neighbours", pytest.param("camera", marks=pytest.mark.slow), "lens"])
+@pytest.mark.parametrize(
+    "name", ["projector", "lens", *(pytest.param(name, marks=pytest.mark.slow) for name in ("neighbours", "camera"))]
+)
 def test_orders_add_up_to_all_light(hall: Bench, name: str) -> None:
     """Path by path, so pixel by pixel to the rounding: direct light in mirrors, indirect light, that of lamps.
 

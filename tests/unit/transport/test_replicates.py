@@ -40,7 +40,9 @@ def alike(one: PathSamples, other: PathSamples) -> bool:
     return same and np.allclose(value, expected, rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("name", ["direct", "anchored", "indirect", "at anchors", "from_camera"])
+@pytest.mark.parametrize(
+    "name", ["direct", "anchored", "indirect", pytest.param("at anchors", marks=pytest.mark.slow), "from_camera"]
+)
 def test_light_does_not_hang_on_how_paths_are_launched(
     bench: Bench, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -61,8 +63,8 @@ def test_light_does_not_hang_on_how_paths_are_launched(
 @pytest.mark.parametrize(
     "name",
     [
-        *("direct", "anchored", "indirect", "from_camera"),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("shared", "at anchors")),
+        *("direct", "indirect"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("anchored", "shared", "at anchors", "from_camera")),
     ],
 )
 def test_replicates_in_one_kernel_are_what_each_seed_traces(

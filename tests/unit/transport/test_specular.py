@@ -142,7 +142,11 @@ GLASS = fresnel(COSINE, 1.5)
         ({"type": "blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
         ({"type": "mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
         ({"type": "mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
-        ({"type": "mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}}, GLASS / 2),
+        pytest.param(
+            {"type": "mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
+            GLASS / 2,
+            marks=pytest.mark.slow,
+        ),
         ({"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
