@@ -480,7 +480,9 @@ def _fill_surfaces(axes: Axes, surfaces: Sequence[Surface], axis: int) -> None:
         order = np.argsort(np.concatenate(heights), kind="stable")
         shown = np.concatenate(colors)[order]
         # The edge keeps a sheet visible that is seen edge on, and closes seams.
-        axes.add_collection(PolyCollection(np.concatenate(corners)[order], facecolors=shown, edgecolors=shown, lw=1.4))
+        faces = PolyCollection(np.concatenate(corners)[order], facecolors=shown, edgecolors=shown, lw=1.4)
+        faces.set_rasterized(True)  # as shapes, those of a print of 128 x 128 pixels take 6 MB of a page
+        axes.add_collection(faces)
 
 
 def _hull(points: FloatArray) -> FloatArray:
