@@ -80,13 +80,14 @@ def _stand(props: mi.Properties, path: Path) -> None:
     if kind not in kinds:
         raise MitsimError(f"object {path}: ends in {kind or 'nothing'}; read are .ply (triangles) and .obj")
     try:
-        kinds[kind](path)
+        smooth = kinds[kind](path)
         mesh = mi.load_dict({"type": kind[1:], "filename": str(path)})
     except (ValueError, RuntimeError, OSError) as error:
         said = str(error).strip().splitlines()[-1]
         raise MitsimError(f"object {path}: the file {said}") from None
     props.set_plugin_name(kind[1:])
     props["filename"] = str(path)
+    props["face_normals"] = not smooth  # Mitsuba would smooth the edges of a mesh that states no normals
     _, sides = tilts(props)
     behind = int((sides < 0).sum())
     if behind > _BEHIND * sides.size:

@@ -127,7 +127,7 @@ def test_where_a_named_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_mesh_stands_on_the_shelf(variant: str, tmp_path: Path) -> None:
     """Its longest side, 20, is 50 mm; its lowest point is on the shelf, its box's middle over the object's place.
-    (Planted: scaled by its height; hung by its middle.)"""
+    It states no normals, so its faces are flat. (Planted: scaled by its height; hung by its middle; smoothed.)"""
     (tmp_path / "a.obj").write_text(TETRAHEDRON)
     bench = ms.shelf_scene(tmp_path / "a.obj", size_mm=50, variant=variant)
     import mitsuba as mi
@@ -140,6 +140,10 @@ def test_a_mesh_stands_on_the_shelf(variant: str, tmp_path: Path) -> None:
     level = np.stack([x, y * cosine - z * sine, y * sine + z * cosine], axis=1)
     box = np.array([[0, 0, 0], [5, 20, 3], [10, 0, 0], [4, 2, 9]]) * 2.5 - [12.5, -0.05, 11.25]
     assert_allclose(level, box, atol=1e-3)
+    assert not shape.has_vertex_normals()
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n")
+    smooth = ms.shelf_scene(tmp_path / "b.obj", variant=variant).loaded.scene.shapes()
+    assert next(shape for shape in smooth if shape.id() == "object").has_vertex_normals()
 
 
 @pytest.mark.parametrize(
