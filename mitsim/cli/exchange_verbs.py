@@ -18,6 +18,7 @@ from mitsim.cli.options import (
     Limited,
     OfPatterns,
     Overwrite,
+    Pictured,
     Projector,
     Scene,
     Seed,
@@ -30,6 +31,7 @@ from mitsim.cli.options import (
     refuse_unused,
     verb,
 )
+from mitsim.cli.report_verb import finish_folder
 from mitsim.cli.screen import finish
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import pattern_names
@@ -125,7 +127,7 @@ def import_(
         Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
     ],
     frames: Frames,
-    common: Common,
+    pictured: Pictured,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
     calibration_output: Annotated[
         Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
@@ -159,7 +161,9 @@ def import_(
     lines += payload.get("notes", ())
     if payload["left_out"]:
         lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
-    return finish(common.as_json, payload, lines, payload["warnings"])
+    if payload["output"]:
+        return finish_folder(pictured, Path(payload["output"]), payload, lines, payload["warnings"])
+    return finish(pictured.as_json, {**payload, "report": None}, lines, payload["warnings"])
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ MITSIM = Path(sys.executable).with_name("mitsim")
 HANGS_S = 1200
 """Seconds on the clock after which a program counts as hung: ten times 120, which captures in colour passed while a
 dozen other busy processes shared two processors."""
-PICTURED = {"capture", "calibrate", "reconstruct", "render", "sense"}
+PICTURED = {"capture", "calibrate", "import", "reconstruct", "render", "sense"}
 """Verbs whose work has pictures."""
 _commands = cache(typer.main.get_command)
 """Typer builds all commands anew whenever one is called, for longer than most refusals take."""

@@ -17,7 +17,7 @@ from tests.exchanged import frame_of
 from tests.system.refusals import mentions
 
 EXPORTED = {"format", "frames", "calibration", "notes", "output"}
-IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "notes", "warnings"}
+IMPORTED = {"frames", "output", "calibration_output", "holds", "left_out", "report", "notes", "warnings"}
 
 
 def image(call: Callable[..., Any], run: Path, calibration: Path, to: Path) -> np.ndarray:
