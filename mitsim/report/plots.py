@@ -125,7 +125,7 @@ def curves(
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
             axes.errorbar(points[:, 0], points[:, 1], _bar_errors(points[:, 2]), label=name, **style)
         axes.set_title(panel, fontsize=FONT)
-        label_axes(axes, x if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
+        label_axes(axes, fill(x, _TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
         if log or spans_decades(measured):
             axes.set_xscale("log")
         if spans_decades(levels):

@@ -60,8 +60,10 @@ _MOST_SHOWN = 6
 """Images along either side of the grid: more are too small to be compared on a page."""
 _OWN_AXES = {"accuracy": "relative rms error of the light [1]", "seed": "of the noise [1]"}
 """What knobs with numbers are that no scene file has."""
-_UNIT = re.compile(r"(mm|um|degrees)\b,?\s*")
-"""How the comment on a parameter with a unit begins."""
+_UNIT = re.compile(r"^(mm|um|degrees)\b,?\s*|\s*\[([^]]+)\]")
+"""Where the comment on a parameter has a unit: first, or in square brackets."""
+_ASIDE = re.compile(r"(, see| \().*")
+"""What such a comment says of the file besides."""
 Item = TypeVar("Item")
 
 
@@ -83,9 +85,9 @@ def axis_of(setup: Setup, knob: str) -> tuple[str, str]:
     except (OSError, MitsimError):  # parts may be merged where the scene is not
         text = ""
     found = re.search(rf'<default\s+name="{re.escape(knob)}"[^>]*>\s*<!--(.*?)-->', text, re.DOTALL)
-    comment = " ".join(found[1].split()) if found else "[as in the scene file]"
-    unit = _UNIT.match(comment)
-    return (f"{knob} [{unit[1]}]", comment[unit.end() :]) if unit else (knob, comment)
+    comment = " ".join(found[1].split()) if found else ""
+    unit, said = _UNIT.search(comment), _ASIDE.sub("", _UNIT.sub("", comment, 1))
+    return (f"{knob} [{unit[1] or unit[2]}]", said) if unit else (knob, f"{said} [as in the scene file]".lstrip())
 
 
 def _figures(results: Results) -> Mapping[str, Figure]:

@@ -119,8 +119,11 @@ def test_a_parameter_has_the_unit_that_its_scene_states(tmp_path: Path) -> None:
     )
     setup = Setup(str(scene))
     assert axis_of(setup, "far") == ("far [mm]", "how far it is")
-    assert axis_of(setup, "lamp") == ("lamp", "radiance [W m^-2 sr^-1]")
+    assert axis_of(setup, "lamp") == ("lamp [W m^-2 sr^-1]", "radiance")
     assert axis_of(setup, "bare") == ("bare", "[as in the scene file]")
+    assert axis_of(Setup("lamp_bench"), "lamp") == ("lamp [W m^-2 sr^-1]", "radiance of the lamp")
+    rough = axis_of(Setup("cookie_bag"), "roughness")
+    assert rough == ("roughness", "of the bag's foil: alpha of a GGX distribution [as in the scene file]")
     assert axis_of(Setup("photograph"), "sheet_z") == ("sheet_z [mm]", "where the printed sheet stands")
     assert axis_of(Setup(str(tmp_path / "gone.xml")), "far") == ("far", "[as in the scene file]")
 
