@@ -60,7 +60,8 @@ def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
     camera: Path, small_scene: Callable[..., Path], tmp_path: Path, variant: str
 ) -> None:
     """A file of two lines that stands on a sensor alone captures with it: its pitch, rows and columns, whatever the
-    scene's film is. (Planted: columns for rows; the scene's pitch kept; the window of its film kept.)"""
+    scene's film is. (Planted: columns for rows; the scene's pitch kept; the window of its film kept;
+    a bench in another variant without the camera's sensor.)"""
     own, sensor = tmp_path / "own.toml", load_sensor(camera)
     own.write_text(f'base = "{camera.stem}"\nquantum_efficiency = 0.5\nbinning = 16\n')
     scene = small_scene()
@@ -71,8 +72,9 @@ def test_a_scene_has_the_pixels_of_the_camera_that_is_named(
     assert bench.sensor.quantum_efficiency == 0.5 and bench.sensor.mosaic is None
     assert bench.geometry.shape == (sensor.rows // 16, sensor.columns // 16) and bench.geometry.roi is None
     assert bench.geometry.pitches == pytest.approx((16e-3 * sensor.pixel_pitch_um,) * 2, rel=1e-12)
-    assert [*bench.loaded.camera.film().size()] == [sensor.columns // 16, sensor.rows // 16]
-    assert bench.in_variant(variant).geometry == bench.geometry
+    for each in (bench, bench.in_variant(variant)):
+        assert [*each.loaded.camera.film().size()] == [sensor.columns // 16, sensor.rows // 16]
+        assert each.geometry == each.loaded.camera.geometry == bench.geometry
 
 
 def test_a_camera_with_the_scenes_own_pixels_says_nothing(small_scene: Callable[..., Path], variant: str) -> None:
