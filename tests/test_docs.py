@@ -165,6 +165,8 @@ def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) ->
         coarse = ["--accuracy", ACCURACY] if "--accuracy" in options - set(example.arguments) else []
         if example.arguments[0] == "render" and "factored" not in example.arguments:
             coarse = []  # the reference has samples in its place
+        if example.arguments[0] == "study" and "--quick" not in example.arguments:
+            coarse.append("--quick")  # all points of a study take minutes, of all studies an hour
         done = subprocess.run(
             [sys.executable, "-m", "mitsim", *example.arguments, *coarse],
             cwd=tmp_path,
