@@ -150,7 +150,8 @@ def import_(
     elif output is None or calibration_output is not None:
         raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
     else:
-        payload = mitsim.import_frames(source, output, **given_of(context, vars(frames)))
+        with pictured.job() as job:
+            payload = mitsim.import_frames(source, output, job, **given_of(context, vars(frames)))
     lines = []
     if payload["output"]:
         lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")

@@ -31,6 +31,7 @@ from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 
 if TYPE_CHECKING:
+    from mitsim.core.job import Job
     from mitsim.exchange.packed import Run
 
 
@@ -263,7 +264,7 @@ def _frames_of(run: Run) -> int:
 
 
 @check_arguments
-def import_frames(source: Path | str, output: Path | str, **known: Any) -> dict[str, Any]:
+def import_frames(source: Path | str, output: Path | str, job: Job | None = None, **known: Any) -> dict[str, Any]:
     """Make a RUN folder of a real camera's frames, whole or not at all.
 
     Parameters
@@ -272,6 +273,8 @@ def import_frames(source: Path | str, output: Path | str, **known: Any) -> dict[
         folder of frames, in the order of the numbers in their names; or one file.
     output
         RUN folder to make.
+    job
+        whose command line the manifest keeps; None: Python asks.
     **known
         what is known of them: ``list``, a list's name or file, or in its place ``patterns``, ``camera``, ``exposure``,
         ``calibration`` and others of :class:`mitsim.exchange.capture_list.FrameFacts`.
@@ -291,7 +294,7 @@ def import_frames(source: Path | str, output: Path | str, **known: Any) -> dict[
     facts = FrameFacts(**options_of(FrameFacts, known, "import_frames")).of(Path(source))
     from mitsim.exchange.real import import_capture
 
-    return import_capture(Path(source), Path(output), facts)
+    return import_capture(Path(source), Path(output), facts, None if job is None else job.command)
 
 
 STRIPES = "stripes"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -40,7 +40,7 @@ LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """What nobody knows of a real capture."""
 
 
-def import_capture(source: Path, output: Path, known: RealCapture) -> dict[str, Any]:
+def import_capture(source: Path, output: Path, known: RealCapture, command: str | None = None) -> dict[str, Any]:
     """Write the RUN folder of a real capture, of all planes a coloured one, whole or not at all.
 
     Parameters
@@ -51,6 +51,8 @@ def import_capture(source: Path, output: Path, known: RealCapture) -> dict[str, 
         RUN folder to make.
     known
         what is known of the capture.
+    command
+        command line that asks for it, which the manifests keep; None: Python does.
 
     Returns
     -------
@@ -87,7 +89,8 @@ def import_capture(source: Path, output: Path, known: RealCapture) -> dict[str, 
     runs = {}
     for name, fit in fits.items():
         how = prepare.model_copy(update={"channel": name}) if name else prepare
-        runs[name], shape, unlit = _run_of(source, known, camera, how, fit, patterns[name], scan)
+        run, shape, unlit = _run_of(source, known, camera, how, fit, patterns[name], scan)
+        runs[name] = replace(run, manifest=run.manifest.model_copy(update={"command": command}))
         if unlit:
             warnings.append(
                 f"flat: {unlit} pixels{f' of {name}' if name else ''} have less than {LEAST_RESPONSE:g} of the mean "

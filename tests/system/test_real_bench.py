@@ -81,11 +81,12 @@ def test_a_flatcams_captures_lead_to_the_image_of_its_authors(
     call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a capture that was not learned from, in colour, no darker and no brighter. (Planted: planes of another
-    mosaic; the image turned by a half.)"""
+    mosaic; the image turned by a half; a run that does not say by which command it was made.)"""
     monkeypatch.chdir(tmp_path)
     walk(call, figures.WALKS[0])
     for name, stated in figures.correlations(tmp_path).items():
         assert stated == pytest.approx(figures.read()["walks"][f"correlation_{name}"], abs=0.01), name
+    assert "mitsim import captures/flatcam/fc_7.png -o run7" in Path("run7/report.html").read_text(encoding="utf-8")
     ours = np.array(Image.open("run7/reconstruction/image.png")) / 255
     theirs = lightness(np.array(Image.open("captures/flatcam/rec_7.png")) / 255)
     assert np.abs(ours.mean(axis=(0, 1)) - theirs.mean(axis=(0, 1))).max() < 0.05
