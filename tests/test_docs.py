@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import mitsim
+from mitsim.studies import EXPERIMENTS
 from tests import prose
 from tests.conftest import write_small_scene
 from tests.exchanged import made
@@ -47,6 +48,12 @@ ELSEWHERE = {"--check", "--closed-form", "--install-completion", "--strict"}
 ELSEWHERE_RUN = {"docs/bench.md", "docs/extending.md"}
 """Pages whose commands need files that a camera writes between them (tests/system/test_real_bench.py), or that a reader
 writes (tests/test_extending.py)."""
+
+WRITTEN = {"docs/sessions.md": ("session.toml", "sweep.toml")}
+"""Files that a reader writes of a page's blocks, by page."""
+
+MANY = {*EXPERIMENTS, "all"} - {"sweep"}
+"""Studies of many points."""
 
 NO_MODULES = {"mitsim.key"}
 """Names in the docs that only look like modules: metadata of OpenEXR files."""
@@ -159,13 +166,15 @@ def test_every_option_in_the_docs_is_one_of_a_verb() -> None:
 @pytest.mark.parametrize("page", [page for page in EXAMPLES if examples(page) and page not in ELSEWHERE_RUN])
 def test_the_commands_of_a_page_run_in_their_order(page: str, tmp_path: Path) -> None:
     (tmp_path / "captures").symlink_to(ROOT / "captures")  # as the repository's folder has it
+    for name, text in zip(WRITTEN.get(page, ()), blocks(page, "toml"), strict=False):
+        (tmp_path / name).write_text(text, encoding="utf-8")
     for example in examples(page):
         command = verbs()[example.arguments[0]]
         options = {option for parameter in command.params for option in parameter.opts}
         coarse = ["--accuracy", ACCURACY] if "--accuracy" in options - set(example.arguments) else []
         if example.arguments[0] == "render" and "factored" not in example.arguments:
             coarse = []  # the reference has samples in its place
-        if example.arguments[0] == "study" and "--quick" not in example.arguments:
+        if example.arguments[0] == "study" and example.arguments[1] in MANY and "--quick" not in example.arguments:
             coarse.append("--quick")  # all points of a study take minutes, of all studies an hour
         done = subprocess.run(
             [sys.executable, "-m", "mitsim", *example.arguments, *coarse],
