@@ -157,7 +157,7 @@ class Session:
         if found is not None and too_many(found.patterns, count):
             raise MitsimError(
                 f"{found.words}: {found.patterns} of {2 * count} patterns would show another shape than the rest, too "
-                f"many for factors; {found.remedy}; it can be planned and captured all the same"
+                f"many for factors; {found.remedy}; it can be planned and captured, and no image of it is solved"
             )
 
     @property

@@ -227,7 +227,10 @@ def patterns(
             f"Copy {payload['session']} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
         )
     else:
-        after = f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} -o RUN"
+        after = (
+            f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} --camera NAME "
+            "--exposure SECONDS --calibration CAL -o RUN"
+        )
     from mitsim.exchange.png_files import describe_cells
 
     where = payload["projector"]

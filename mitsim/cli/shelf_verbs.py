@@ -272,6 +272,13 @@ def _begun_as(like: Path, model: BaseModel, **more: str) -> dict[str, Any]:
     return {**model.model_dump(exclude_unset=True), **more, "source": f"as the shipped {like.stem}, to be replaced"}
 
 
+def _captures(like: Path) -> bool:
+    """Whether the camera of the file ``like`` says what light makes of electrons."""
+    from mitsim.devices.sensor import load_sensor
+
+    return load_sensor(like).states_efficiency
+
+
 _CAPTURE = "mitsim capture photograph -o run --patterns dots:7 --camera {}"
 _STARTERS = {
     "camera": _Starter(_CAPTURE, _camera, DEFAULT_CAMERA, CAMERA),
@@ -343,6 +350,8 @@ def new(
             f"--like {like}: is no shipped {kind}; {near_name(str(like), known)}shipped are {', '.join(known)}"
         )
     use = begin.use.format(output)
+    if begin.field == CAMERA and not _captures(source):
+        use = f"mitsim characterise {output} -o figures"
     if begin.lines is None:
         with whole_folder(output) as folder:
             shutil.copytree(source.parent, folder, dirs_exist_ok=True)

@@ -26,7 +26,10 @@ class Points:
     jobs: int | None = option(None, "processes; one a processor if not given")
     scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS")
     over: list[str] | None = option(
-        None, "what sweep varies; may be given again", metavar="NAME=FIRST:LAST:COUNT", rich_help_panel=WHAT
+        None,
+        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy; may be given again",
+        metavar="NAME=FIRST:LAST:COUNT",
+        rich_help_panel=WHAT,
     )
     measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...", metavar="NAME,...", rich_help_panel=WHAT)
 

@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, locate, read_toml, validate
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.configuration import Configuration, locate, read_toml, shipped_files, validate
+from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import Digital
 from mitsim.core.mistakes import Table
 
@@ -447,7 +447,12 @@ def sensor_table(path: Path | str) -> Table:
     while (base := table.pop(BASE, None)) is not None:
         if not isinstance(base, str):
             raise MitsimError(f"file {path}: {BASE}: got {base!r}; give the name of a camera, or a file")
-        beside = Path(path).parent / base
+        beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", "full_well_e")
+        if not beside.is_file() and Path(base).name == base and not Path(base).suffix and base not in known:
+            raise MitsimError(
+                f"file {path}: {BASE}: got {base!r}, no such camera; {near_name(base, known)}shipped are "
+                f"{', '.join(known)}"
+            )
         path = beside if beside.is_file() else locate(base, "calibration", ".toml")
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")

@@ -96,7 +96,7 @@ class BenchView:
             "light is seen": self._light_words,
             "parallax": self._parallax_words,
             "field stop": stop,
-            "sensor": f"{columns} x {rows} pixels of {pitch}: {columns * column:.3g} x {rows * row:.3g} mm",
+            "sensor": f"{rows} x {columns} pixels of {pitch}: {rows * row:.3g} x {columns * column:.3g} mm",
             "mask": f"{mask}, features of {geometry.build_mask().feature_mm * 1e3:.3g} um",
         }
 

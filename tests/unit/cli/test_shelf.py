@@ -111,6 +111,13 @@ def test_a_new_camera_loads(shell_of: Callable[..., str], tmp_path: Path, like: 
     assert all(len(line) <= 100 for line in text.splitlines()[1:] if line.startswith("#"))
 
 
+def test_a_camera_that_cannot_capture_is_begun_for_what_it_can(shell_of: Callable[..., str], tmp_path: Path) -> None:
+    """(Planted: a command that is refused.)"""
+    for like, verb in (("imx250", "characterise"), ("imx249", "capture")):
+        found = json.loads(shell_of("new", "camera", "mine", "-o", tmp_path / f"{like}.toml", "--like", like, "--json"))
+        assert found["use"].startswith(f"mitsim {verb} ")
+
+
 def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_path: Path) -> None:
     projector = load_model(begun(shell_of, "projector", tmp_path / "p.toml"), ProjectorModel)
     assert (projector.name, projector.columns) == ("mine", 1920)

@@ -85,6 +85,14 @@ def test_a_camera_with_the_scenes_own_pixels_says_nothing(small_scene: Callable[
     assert named.geometry == usual.geometry and named.identity() == usual.identity()
 
 
+def test_a_base_that_is_no_camera_is_told_with_all_cameras(tmp_path: Path) -> None:
+    """And with no projector or list, which lie beside them. (Planted: every file of the shelf.)"""
+    (tmp_path / "own.toml").write_text('base = "imx251"\n')
+    with pytest.raises(MitsimError, match=r"base: got 'imx251', .* did you mean imx255\?") as refusal:
+        load_sensor(tmp_path / "own.toml")
+    assert "mp_cl1" not in str(refusal.value) and "session" not in str(refusal.value)
+
+
 def test_the_page_of_formats_lists_every_camera() -> None:
     page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
     rows = [
