@@ -62,7 +62,7 @@ class SensorModel(Configuration, defer_build=True):
     row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
     """Distance between rows of pixels that are not square, um; none: as above."""
     rows: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
-    """Rows of pixels that are read, about the sensor's middle; none: as many as the scene's film has."""
+    """Rows of pixels that are read, before binning, about the sensor's middle; none: as many as the scene's film has."""
     columns: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Columns of the same."""
     binning: int = Field(default=1, ge=1, le=64)
@@ -460,6 +460,10 @@ def sensor_table(path: Path | str) -> Table:
         below: dict[str, object] = read_toml(path)
         if "mask" in below and "mask" not in table:
             raise MitsimError(f"file {first}: {BASE}: {path} has a table [mask], which stays there; give one here")
+        for name in ("rows", "columns"):
+            most, asked = below.get(name), table.get(name)
+            if isinstance(most, int) and isinstance(asked, int) and asked > most:
+                raise MitsimError(f"file {first}: {name}: got {asked}, but {path.stem} has {most}; give no more")
         if any(kind & table.keys() for kind in _EFFICIENCIES):
             others = [kind for kind in _EFFICIENCIES if not kind & table.keys()]
             below = {name: below[name] for name in below.keys() - set().union(*others)}

@@ -93,6 +93,13 @@ def test_a_base_that_is_no_camera_is_told_with_all_cameras(tmp_path: Path) -> No
     assert "mp_cl1" not in str(refusal.value) and "session" not in str(refusal.value)
 
 
+def test_a_sensor_has_no_more_rows_than_its_base(tmp_path: Path) -> None:
+    """(Planted: let pass: frames of rows that no such sensor has.)"""
+    (tmp_path / "own.toml").write_text('base = "imx250"\nrows = 4000\nbinning = 4\n')
+    with pytest.raises(MitsimError, match=r"rows: got 4000, but imx250 has \d+; give no more"):
+        load_sensor(tmp_path / "own.toml")
+
+
 def test_the_page_of_formats_lists_every_camera() -> None:
     page = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
     rows = [
