@@ -195,7 +195,7 @@ class Session:
         rays, cause = residual if told is None else best_term(self.shadow(geometry)).residual, ""
         if rays < _IN_RAYS * residual:
             cause = f" by diffraction ({rays:.1%} without)"
-            remedy = "take a separable mask, or one nearer to the sensor or of larger features"
+            remedy = "bring the mask nearer to the sensor, or give it larger features: without waves it is separable"
         words = (
             f"the mask ({geometry.mask_words}) is not separable{cause}: the best separable one leaves {residual:.1%} "
             f"of its shadow, {-decibels(residual):.1f} dB below it"

@@ -62,7 +62,7 @@ class SensorModel(Configuration, defer_build=True):
     row_pitch_um: float | None = Field(default=None, ge=1e-3, le=1e4)
     """Distance between rows of pixels that are not square, um; none: as above."""
     rows: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
-    """Rows of pixels that are read, before binning, about the sensor's middle; none: as many as the scene's film has."""
+    """Rows of pixels that are read, before binning, about the sensor's middle; none: those of the scene's film."""
     columns: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Columns of the same."""
     binning: int = Field(default=1, ge=1, le=64)
