@@ -246,8 +246,8 @@ class _Search:
             if not spared:
                 why = f"Parallax seems to span {span / self.pixel:.1f} of the {period:.0f} pixels of a period"
             return (
-                f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of a "
-                "longer period along the baseline, or of more rows across it, such as dots:7x16."
+                f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of "
+                "a longer period along the baseline, or of more rows across it, such as dots:7x16."
             )
         ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
         others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
