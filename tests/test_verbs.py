@@ -63,7 +63,13 @@ FURTHER: dict[str, list[Any]] = {
     "export": [],
 }
 """Classes whose fields a verb's call takes by name, of verbs that are one call with the same options."""
-ALIKE = {"define": "parameters", "outside": "allow_outside_files", "scenes": "scene", "family": "patterns"}
+ALIKE = {
+    "define": "parameters",
+    "outside": "allow_outside_files",
+    "scenes": "scene",
+    "family": "patterns",
+    "repeated": "folder",
+}
 """Arguments that the command line calls otherwise."""
 OF_THE_COMMAND_LINE = {"as_json", "quiet", "verbose", "help", "variant", "no_pictures", "max_seconds", "max_memory"}
 """Options that say how it is reported and bounded, as a job does; the variant is a bench's."""

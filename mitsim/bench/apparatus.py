@@ -495,7 +495,7 @@ def open_apparatus(
 
 def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:
     """MitsimError, which begins with ``where``, for the usual camera in a ``scene`` whose pixels are another's."""
-    from mitsim.scene.film import PITCH_TOLERANCE
+    from mitsim.devices.sensor import PITCH_TOLERANCE
 
     pitches = zip(
         ("pixel_pitch", "row_pitch"), sensor.pitches_mm[::-1], loaded.camera.geometry.pitches[::-1], strict=True

@@ -48,7 +48,7 @@ _SPELLED = {
     "lam": "--lambda",
     "parameters": "-D",
     "values": "-D",
-    "folder": "--from",
+    "repeated": "--from",
 }
 """Options that are not called like their parameter."""
 _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_files", "for_render")

@@ -36,7 +36,7 @@ class Running:
     resume: Resume = False
     shard: str = option("1/1", "measure part I of N of a sweep's points", metavar="I/N")
     scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
-    folder: Path | None = option(None, "write the session file that repeats a folder", "--from", metavar="FOLDER")
+    repeated: Path | None = option(None, "write the session file that repeats a folder", "--from", metavar="FOLDER")
 
 
 @verb
@@ -57,8 +57,8 @@ def run_(
     $ mitsim run fig1.toml -o out -D capture.patterns=dots:5
     $ mitsim run --from out/image -o figure.toml
     """
-    if running.folder is not None:
-        return _repeat(context, session, running.folder, running.output, limited)
+    if running.repeated is not None:
+        return _repeat(context, session, running.repeated, running.output, limited)
     if session is None:
         raise MitsimError("run: give a session file, or --from FOLDER to write one")
     values: dict[str, Any] = {}

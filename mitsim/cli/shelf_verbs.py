@@ -184,8 +184,19 @@ def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
 # ---- `mitsim new` ----------------------------------------------------------------------------------------------------
 
 _NAME = re.compile(r"[A-Za-z][\w-]*")
-_MASK = {"kind": "separable", "feature_mm": 0.06, "order": 9}
-"""The mask of the shipped scenes."""
+_MASKS: dict[str, dict[str, Any]] = {
+    "separable": {"order": 9},
+    "flatcam": {"order": 9},
+    "open": {"order": 9},
+    "mura": {"features": 127},
+    "random": {"features": 127},
+    "drawing": {"file": "mask.png"},
+    "psf": {"file": "psf.png", "psf_distance_mm": 400.0, "aperture_mm2": 1.0},
+}
+"""What masks of each kind begin with: features as fine and about as many as those of the shipped scenes, or a picture
+beside the file."""
+_FEATURE_MM = 0.06
+"""Side of a feature of the shipped scenes' mask."""
 _HEAD = "# To set a field after a #, take the # away, and that of its table; what it says is its default.", ""
 _LIST = {"patterns": "dots:7", "n": 128}
 """What `mitsim import` needs beside a camera and an exposure."""
@@ -226,13 +237,13 @@ def _camera(name: str, like: Path) -> Iterator[str]:
     return starter(SensorModel, _begun_as(like, load_sensor(like), name=name))
 
 
-def _mask(name: str, like: Path) -> Iterator[str]:
+def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
     from mitsim.core.field_docs import starter
     from mitsim.devices.mask_profile import MaskProfile
 
     yield from _camera(name, like)
     yield ""
-    yield from starter(MaskProfile, _MASK, "mask")
+    yield from starter(MaskProfile, {"kind": kind, "feature_mm": _FEATURE_MM, **_MASKS[kind]}, "mask")
 
 
 def _projector(name: str, like: Path) -> Iterator[str]:
@@ -310,12 +321,12 @@ def new(
     like: Annotated[
         str | None,
         typer.Option(
-            help="shipped one that it begins as",
+            help="shipped one that it begins as; of a mask also its kind",
             metavar="NAME",
             show_default="imx249, mp_cl1, photograph, session, demo",
             rich_help_panel=WHAT,
             autocompletion=completing(
-                lambda: {name: None for each in _STARTERS.values() if each.like for name in each.files()}
+                lambda: {name: None for each in _STARTERS.values() if each.like for name in [*each.files(), *_MASKS]}
             ),
         ),
     ] = None,
@@ -328,6 +339,7 @@ def new(
 
     $ mitsim new camera mine
     $ mitsim new scene bench --like cookie_bag
+    $ mitsim new mask noise --like random
     $ mitsim new study tilt -o studies/tilt.py
     """
     from mitsim.core.files import output_file, whole_folder, write_text
@@ -344,11 +356,11 @@ def new(
     if output.suffix != ending and ending:
         raise MitsimError(f"--output {output}: a {kind} is a file that ends in {ending}; give such a name")
     known = begin.files() if begin.like else {"": Path()}
-    source = known.get(like or begin.like)
+    masks = _MASKS if kind == "mask" else ()
+    source = known.get(begin.like if like is None or like in masks else like)
     if source is None:
-        raise MitsimError(
-            f"--like {like}: is no shipped {kind}; {near_name(str(like), known)}shipped are {', '.join(known)}"
-        )
+        names = [*masks, *known]
+        raise MitsimError(f"--like {like}: is no shipped {kind}; {near_name(str(like), names)}give {', '.join(names)}")
     use = begin.use.format(output)
     if begin.field == CAMERA and not _captures(source):
         use = f"mitsim characterise {output} -o figures"
@@ -361,7 +373,8 @@ def new(
             if ending == ".toml"
             else []
         )
-        text = "\n".join([*head, *begin.lines(name, source)]) + "\n"
+        lines = _mask(name, source, like) if like is not None and like in masks else begin.lines(name, source)
+        text = "\n".join([*head, *lines]) + "\n"
         with output_file(output) as place:
             write_text(place, text)
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}

@@ -26,8 +26,8 @@ KINDS: Mapping[str, str] = MappingProxyType({
     "flatcam": "the same in two terms, as a FlatCam has it, half of it open",
     "open": "an aperture of the same size, all of it open",
     "mura": "one period of a modified uniformly redundant array (Gottesman and Fenimore, Appl. Opt. 28, 4344, 1989)",
-    "random": "every feature open or closed by a draw of its own",
-    "drawing": "a picture or array of transmissions, a feature each",
+    "random": "every feature open or closed by a draw of its own: frames, and no two factors that solve an image",
+    "drawing": "a picture or array of transmissions, a feature each; calibrated where it is next to separable",
     "psf": "a phase mask by its point spread function, measured or rendered",
 })  # fmt: skip
 """What each kind of mask is."""

@@ -24,6 +24,8 @@ ExposureFraction = Annotated[
 ]
 MOST_PIXELS = 1 << 20
 """Along a side of a sensor, before binning: frames are of at most 16 384, binned up to 64 times."""
+PITCH_TOLERANCE = 1e-3
+"""Relative difference of two pitches of the same pixels that is rounding in a data sheet."""
 BASE = "base"
 """Name of a file's line that says which camera's fields it takes where it has none of its own."""
 _MOST_BASES = 4

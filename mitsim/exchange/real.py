@@ -29,6 +29,7 @@ from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, Ru
 from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
 from mitsim.core.recorders import AMBIENT, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.devices.sensor import PITCH_TOLERANCE
 from mitsim.exchange.capture_list import Electronics, RealCapture
 from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
 
@@ -71,6 +72,8 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     camera, prepare = known.electronics()
     colours = known.colours
     fits = {name: _Fit.of(known, name) for name in (colours.names if colours else ("",))}
+    for fit in fits.values():
+        fit.check_pixels(camera)
     patterns = {name: _patterns(known, fit.scene) for name, fit in fits.items()}
     count = len(next(iter(patterns.values())).captures)
     pages = [image_pages(path, known.wanted) for path in files]
@@ -203,6 +206,23 @@ class _Fit:
         if n is not None and (n, n) != (left[1], right[1]):
             raise ArgumentError("projector_pixels", f"{n}: the calibration has {left[1]} x {right[1]}; leave it out")
         return cls(dict(calibration.manifest.camera), (left[0], right[0]), (left[1], right[1]))
+
+    def check_pixels(self, camera: Electronics) -> None:
+        """ArgumentError for a ``camera`` whose pixels have another pitch than those of the calibration, where the files
+        of both state it: its frames would be taken for frames of the calibration's camera."""
+        calibrated, own = (data.get("sensor", {}) for data in (self.camera or {}, camera.stated))
+        if not {"pixel_pitch_um", "binning"} <= calibrated.keys() & own.keys():
+            return
+        for axis in ("row", "pixel"):
+            theirs, ours = (
+                (each.get(f"{axis}_pitch_um") or each["pixel_pitch_um"]) * each["binning"] for each in (calibrated, own)
+            )
+            if abs(ours - theirs) > PITCH_TOLERANCE * theirs:
+                raise ArgumentError(
+                    "camera",
+                    f"{camera.name}: has pixels of {ours:g} um, but the calibration's camera of {theirs:g} um; give "
+                    "the camera of the calibration, or a calibration of this camera",
+                )
 
     def part(self, path: Path, frame: Channel, how: Preparation) -> Channel:
         """Of a ``frame`` of the file ``path`` the part that the calibration is of: all of it, or the middle of a plane

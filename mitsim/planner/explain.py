@@ -356,6 +356,7 @@ class _Words:
         on_raster, by_fft = f"on a raster of {cells} cells a pixel", seconds(cells)
         if drawn.needed:
             reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {leaves}"
+            reason += "; calibrate tells, before any light, whether two factors hold it, which an image needs"
             if cells == fewest or drawn.error is None:
                 return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
             reason += f", {fewest} {_error_words(drawn.error)}"

@@ -77,7 +77,8 @@ class Cause(Enum):
     AMBIENT = ("ambient light, the same in every shot", "darken the room, or capture with ambient_frame=yes")
     DEPTH = (
         "depth, light that lands beside where the calibration saw it",
-        "put the scene at the calibrated distance, calibrate at the scene's, or give its depth as focus",
+        "put the scene at the calibrated distance, calibrate at the scene's, or give its depth as focus (map: one for "
+        "each pixel)",
     )
     INDIRECT = (
         "light from scene pixels that are not lit, over other surfaces or from depths along both axes",

@@ -53,7 +53,7 @@ _RIVAL, _ASTRAY = 2.0, 0.05
 a period beside it: two cards under dots too near to each other come out either way, and 1.8 times as much is left."""
 _RELIABLE = 0.5
 """Confidence from which a pixel's depth counts as told: twice as much light arrives there as anywhere else."""
-_SPARE = 2.0
+SPARE = 2.0
 """Projector pixels of the period that told depths must leave free, or they may be another's by a whole period: as many
 as a dot's image is wide. With one, two cards that span 3 of 4 pixels came out 2 dB worse than at one depth."""
 
@@ -239,7 +239,7 @@ class _Search:
             float((np.abs(self._arrivals.most(*rival)[0] - shift)[reliable] > self.width / 2).mean())
             for rival in rivals
         )
-        spared = not self._arrivals.limited or self.width - span >= _SPARE * self.pixel
+        spared = not self._arrivals.limited or self.width - span >= SPARE * self.pixel
         if not spared or astray > _ASTRAY:
             period = self.width / self.pixel
             why = f"Depths a period of the dots away, {period:.0f} projector pixels, explain nearly as much"
@@ -247,7 +247,7 @@ class _Search:
                 why = f"Parallax seems to span {span / self.pixel:.1f} of the {period:.0f} pixels of a period"
             return (
                 f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of "
-                "a longer period along the baseline, or of more rows across it, such as dots:7x16."
+                f"a period of {2 * period:.0f} along the baseline, and of a short one across it."
             )
         ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
         others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]

@@ -150,14 +150,16 @@ class Factors:
 
     @check_arguments
     def check_fit(self, shots: Capture) -> None:
-        """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: the first thing that
-        differs."""
+        """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: names first, then
+        the first thing that differs."""
         ours, theirs = (_parts(each.manifest.camera) for each in (shots, self))
-        for name in sorted({*ours, *theirs}):
+        for name in sorted({*ours, *theirs}, key=lambda name: (not name.endswith("name"), name)):
             own, other = ours.get(name), theirs.get(name)
             if own == other or (name in _LIGHT and None in (own, other)):
                 continue
-            which = "in this light: its diffraction at the mask differs" if name in _LIGHT else "this camera"
+            which = "the run's camera, with its scene, --camera, --projector and -D"
+            if name in _LIGHT:
+                which = "in this light: its diffraction at the mask differs"
             raise MitsimError(
                 f"calibration {self.name}: {cut(name)} is {cut(str(other))}, but {shots.name} has {cut(str(own))}; "
                 f"calibrate {which}"

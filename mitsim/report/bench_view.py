@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
+from scipy.spatial import ConvexHull
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import Layout, Preview, Surface, layout_of, previews
@@ -24,6 +26,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import check_arguments
 from mitsim.core.files import whole_file
 from mitsim.core.images import lightness
+from mitsim.reconstruct.depth_map import SPARE
 from mitsim.report.pages import page_figure, render_page, typeset
 from mitsim.report.plots import BLACK, BLUE, GREY, ORANGE, PALE
 
@@ -42,6 +45,8 @@ _FLAT = 1e-4
 """Relative difference of depths below which they are one: single precision is 1e-7."""
 _NO_PIXELS = 5e-3
 """Parallax [projector pixels] that no image shows."""
+_ACROSS = 7
+"""Period of dots across the baseline: the paper's."""
 _NAMES = 3
 """Of things outside a plan that its title has room for."""
 _BESIDE, _BEHIND = 0.3, 1.2
@@ -81,11 +86,11 @@ class BenchView:
         """Distances and sizes in words, by what they are of."""
         bench, layout, geometry = self.bench, self.layout, self.bench.geometry
         height, width = self._window_mm
-        window = f"{width:.4g} x {height:.4g} mm at {geometry.scene_distance:.4g} mm, {bench.n} x {bench.n} pixels"
+        window = f"{height:.4g} x {width:.4g} mm at {geometry.scene_distance:.4g} mm, {bench.n} x {bench.n} pixels"
         if bench.loaded.pixels.keystone:
             window += f"; keystone: its corners are up to {bench.loaded.pixels.keystone:.3g} pixels off a rectangle"
         (rows, columns), (row, column) = geometry.shape, geometry.pitches
-        pitch = f"{column * 1e3:.4g} um" if row == column else f"{column * 1e3:.4g} x {row * 1e3:.4g} um"
+        pitch = f"{column * 1e3:.4g} um" if row == column else f"{row * 1e3:.4g} x {column * 1e3:.4g} um"
         stop = f"{geometry.fov:g} degrees, {2 * geometry.tan_half_fov * geometry.scene_distance:.4g} mm wide there"
         if bench.field_stop_cuts:
             stop += "; it hides a part of the window from a part of the sensor"
@@ -95,6 +100,7 @@ class BenchView:
             "window": window,
             "light is seen": self._light_words,
             "parallax": self._parallax_words,
+            **self._dots_words,
             "field stop": stop,
             "sensor": f"{rows} x {columns} pixels of {pitch}: {rows * row:.3g} x {columns * column:.3g} mm",
             "mask": f"{mask}, features of {geometry.build_mask().feature_mm * 1e3:.3g} um",
@@ -167,6 +173,18 @@ class BenchView:
         rows, columns = ("0" if value < _NO_PIXELS else f"{value:.3g}" for value in between)
         return f"{where} the window moves by {rows} rows and {columns} columns of its pixels"
 
+    @property
+    def _dots_words(self) -> dict[str, str]:
+        """Which dots tell the depths apart, where there are several: no two are a period of the dots away."""
+        rows, columns = self.layout.parallax
+        if max(rows, columns) < _NO_PIXELS:
+            return {}
+        period = 2 ** math.ceil(math.log2(max(rows, columns) + SPARE))
+        if period > self.bench.n:
+            return {"depth map": "no dots tell it: parallax spans the window"}
+        name = f"dots:{_ACROSS}x{period}" if columns >= rows else f"dots:{period}x{_ACROSS}"
+        return {"depth map": f"{name} and reconstruct --focus map tell it; a shorter period may leave it off by one"}
+
     # ---- As a drawing ----
 
     def figure(self) -> Figure:
@@ -225,7 +243,8 @@ class BenchView:
         length = end - start
         _fill_surfaces(axes, [each for each in layout.surfaces if self._has_room(each.points)], axis)
         light = np.concatenate([layout.projector[None], layout.window_at(end)])[:, [2, axis]]
-        axes.add_patch(Polygon(_hull(light), closed=True, facecolor=ORANGE, alpha=0.22, lw=0))
+        outline = light[ConvexHull(light).vertices]
+        axes.add_patch(Polygon(outline, closed=True, facecolor=ORANGE, alpha=0.22, lw=0))
         axes.plot([end, 0, end], [tan * end, 0, -tan * end], color=BLUE, lw=1, ls=(0, (5, 4)))
         axes.axvline(aligned, color=BLACK, lw=0.8, ls=":")
         window = layout.window[:, axis]
@@ -255,7 +274,7 @@ class BenchView:
         place, stop, gap = self.layout.projector, self.bench.geometry, 0.04 * length
         names = [("projector", place, _DARK), ("camera", np.zeros(3), BLUE)]
         if np.hypot(place[2], place[axis]) < 2 * gap:
-            names = [("camera and\nprojector", np.array([min(place[2], 0.0)] * 3) * [0, 0, 1], BLACK)]
+            names = [("camera and\nprojector", np.array([0.0, 0.0, min(place[2], 0.0)]), BLACK)]
         elif abs(place[axis]) > gap:
             _measure(axes, (gap, 0), (gap, place[axis]), f"{abs(place[axis]):.4g} mm", upright=True)
         for name, at, color in names:
@@ -485,21 +504,6 @@ def _fill_surfaces(axes: Axes, surfaces: Sequence[Surface], axis: int) -> None:
         axes.add_collection(faces)
 
 
-def _hull(points: FloatArray) -> FloatArray:
-    """Corners of the convex polygon around points (k, 2), in order (Andrew's monotone chain)."""
-    ordered, hull = sorted({(float(x), float(y)) for x, y in points}), list[tuple[float, float]]()
-    for way in (ordered, ordered[::-1]):
-        first = len(hull)
-        for x, y in way:
-            while len(hull) > first + 1 and (hull[-1][0] - hull[-2][0]) * (y - hull[-2][1]) <= (
-                hull[-1][1] - hull[-2][1]
-            ) * (x - hull[-2][0]):
-                hull.pop()
-            hull.append((x, y))
-        hull.pop()
-    return np.array(hull)
-
-
 def _body(place: FloatArray, along: FloatArray, half: float) -> FloatArray:
     """Corners (4, 2) of a device's symbol behind its pinhole, which looks along a direction."""
     ahead = along / np.linalg.norm(along)
@@ -545,18 +549,17 @@ def _mesh(name: str, points: FloatArray, triangles: Any, reflectance: FloatArray
 
     z, x, y = points.astype(np.float32).T[[2, 0, 1]]
     shown = lightness(reflectance)
-    color: dict[str, Any] = (
-        {"color": _LAMP}
-        if is_lamp
-        else {"intensity": shown[:, 0].astype(np.float32), "colorscale": "gray", "cmin": 0, "cmax": 1}
-        if shown.shape[1] == 1
-        else {"vertexcolor": np.rint(255 * shown).astype(int).tolist()}
-    )
+    color: dict[str, Any]
+    if is_lamp:
+        color = {"color": _LAMP}
+    elif shown.shape[1] == 1:
+        grey = shown[:, 0].astype(np.float32)
+        color = {"intensity": grey, "colorscale": "gray", "cmin": 0, "cmax": 1, "showscale": False}
+    else:
+        color = {"vertexcolor": np.rint(255 * shown).astype(int).tolist()}
     i, j, k = triangles.astype(np.int32).T
     light = {"ambient": 0.75, "diffuse": 0.35, "specular": 0.0}
-    common = {"name": name, "showlegend": True, "showscale": False, "lighting": light, "flatshading": True}
-    if "intensity" not in color:
-        del common["showscale"]
+    common = {"name": name, "showlegend": True, "lighting": light, "flatshading": True}
     hover = "%{x:.4g} mm from the sensor<br>x %{y:.4g} mm, y %{z:.4g} mm"
     return graph_objects.Mesh3d(x=z, y=x, z=y, i=i, j=j, k=k, hovertemplate=hover, **common, **color)
 

@@ -130,8 +130,6 @@ def lines_of(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
-    return ("yes" if value else "no") if isinstance(value, bool) else f"{value:.6g}" if _is_real(value) else str(value)
-
-
-def _is_real(value: Any) -> bool:
-    return isinstance(value, float)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

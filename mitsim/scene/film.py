@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.sensor import PITCH_TOLERANCE, SensorModel
 from mitsim.scene.limits import PLUGINS, references
 
 if TYPE_CHECKING:
-    from mitsim.devices.sensor import SensorModel
     from mitsim.scene.check import CheckedScene
 
-PITCH_TOLERANCE = 1e-3
-"""Relative difference of the scene's pixel pitch from the camera's that is rounding in a data sheet."""
 _WINDOW = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
 _PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
 

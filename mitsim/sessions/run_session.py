@@ -443,7 +443,7 @@ class _Steps:
                 found = self.bench.calibrate_mosaic(**{**whole, "recipe": recipe if "recipe" in values else None})
             else:
                 found = _in_colour(self.bench, colour).calibrate_lines(**whole)
-            return _of_lines({f"{name}": _of_calibration(each.manifest.result) for name, each in found.items()})
+            return _of_lines({str(name): _of_calibration(each.manifest.result) for name, each in found.items()})
 
         return _Task(work, is_finished)
 
@@ -592,19 +592,16 @@ def _in_colour(bench: Bench, colour: str) -> Bench:
 
 def _of_run(found: Mapping[str, Any]) -> Said:
     size = "x".join(map(str, found["shape"]))
-    bound = found["total_error_bound"]
-    return f"{found['frames']} frames of {size}, error up to {bound:.1e}, {found['exposure_s']:.3g} s each", found[
-        "warnings"
-    ]
+    says = f"{found['frames']} frames of {size}, error up to {found['total_error_bound']:.1e}"
+    return f"{says}, {found['exposure_s']:.3g} s each", found["warnings"]
 
 
 def _of_calibration(result: Mapping[str, Any]) -> Said:
     error, residual = (
         math.inf if result[name] is None else result[name] for name in ("phi_error", "separability_residual")
     )
-    return f"{result['frames']} frames, factor error {error:.1e}, separability residual {residual:.2%}", result[
-        "warnings"
-    ]
+    says = f"{result['frames']} frames, factor error {error:.1e}, separability residual {residual:.2%}"
+    return says, result["warnings"]
 
 
 def _of_lines(each: Mapping[str, Said]) -> Said:

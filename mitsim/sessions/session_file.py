@@ -359,13 +359,7 @@ def _is_file(table: str, key: str, value: str, base: Path) -> bool:
         return key == "method" and path.suffix == ".pt"
     if os.sep in value or path.suffix:
         return True
-    shipped = (
-        shipped_path(
-            "scenes",
-        )
-        / value,
-        shipped_path("calibration") / f"{value}.toml",
-    )
+    shipped = shipped_path("scenes") / value, shipped_path("calibration") / f"{value}.toml"
     return not any(each.exists() for each in shipped) and (base / path).exists()
 
 
@@ -394,7 +388,7 @@ OF_A_BENCH = "plan", "transport", "capture", "calibrate"
 
 
 @dataclass
-class _Found:
+class _Mistakes:
     """Mistakes, each with its line."""
 
     lines: Mapping[Place, int]
@@ -422,7 +416,7 @@ class _Found:
 
 def _mistakes_of_values(session: Session, data: _Lined) -> Iterator[Mistake]:
     """What the calls would refuse before they look at files, and steps that lack another."""
-    found, numbers = _Found(data.lines()), dict[str, int]()
+    found, numbers = _Mistakes(data.lines()), dict[str, int]()
     for step in session.steps:
         number = numbers[step.verb] = numbers.get(step.verb, -1) + 1
         place: Place = (step.verb, number) if step.verb in SEVERAL else (step.verb,)
@@ -444,13 +438,13 @@ def request_of(step: Step) -> dict[str, Any]:
     return {name: value for name, value in step.values.items() if name in Request.model_fields}
 
 
-def _check_request(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_request(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     request = request_of(step)
     if all([found.attempt((*place, name), partial(Request.of, **{name: value})) for name, value in request.items()]):
         found.attempt(place, partial(Request.of, **request))
 
 
-def _check_capture(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_capture(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     _check_request(session, step, place, found)
     _check_colour(step, place, found)
     plan, light = session.step("plan"), session.step("transport")
@@ -466,7 +460,7 @@ def _check_capture(session: Session, step: Step, place: Place, found: _Found) ->
         found.say((*place, "colour"), f"stands beside [{above.verb}], which tells no light apart; leave one out")
 
 
-def _check_colour(step: Step, place: Place, found: _Found) -> None:
+def _check_colour(step: Step, place: Place, found: _Mistakes) -> None:
     from mitsim.core.spectral_manifests import BANDS, bands_of
 
     word = step.values.get("colour", "no")
@@ -476,7 +470,7 @@ def _check_colour(step: Step, place: Place, found: _Found) -> None:
         found.say((*place, "colour"), f"{cut(repr(word))}: give no, lines, bands:K or mosaic")
 
 
-def _check_calibrate(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_calibrate(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     _check_request(session, step, place, found)
     _check_colour(step, place, found)
     capture = session.step("capture")
@@ -500,7 +494,7 @@ def image_request(step: Step) -> dict[str, Any]:
     return {"lam" if name == "lambda" else name: value for name, value in own.items()}
 
 
-def _check_reconstruct(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_reconstruct(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     asked = {name: value for name, value in image_request(step).items() if not str(value).endswith(".pt")}
     found.attempt(place, lambda: ImageRequest(**asked))
     for name, verb in (("run", "capture"), ("calibration", "calibrate")):
@@ -508,11 +502,7 @@ def _check_reconstruct(session: Session, step: Step, place: Place, found: _Found
             found.say((*place, name), f"is missing, and there is no [{verb}]; give the folder, or add the table")
 
 
-def _check_demo(session: Session, step: Step, place: Place, found: _Found) -> None:
-    _check_request(session, step, place, found)
-
-
-def _check_export(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_export(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     values = step.values
     calibration = values.get("calibration") or calibration_for(session, step)
     found.attempt(place, partial(check_format, values["format"], step.output, calibration, values.get("projector")))
@@ -529,7 +519,7 @@ def calibration_for(session: Session, step: Step) -> str | None:
     return own.output if own and chosen and chosen.calibration != "none" else None
 
 
-def _check_sweep(session: Session, step: Step, place: Place, found: _Found) -> None:
+def _check_sweep(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
     found.attempt(place, lambda: sweep_options(session, step))
     for other in session.steps:
         if other.verb in ("plan", "transport", "demo", "export"):
@@ -583,13 +573,13 @@ def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
     return {name: values(name, each) for name, each in swept.items()}
 
 
-_CHECKS: dict[str, Callable[[Session, Step, Place, _Found], None]] = {
+_CHECKS: dict[str, Callable[[Session, Step, Place, _Mistakes], None]] = {
     "plan": _check_request,
     "transport": _check_request,
     "capture": _check_capture,
     "calibrate": _check_calibrate,
     "reconstruct": _check_reconstruct,
-    "demo": _check_demo,
+    "demo": _check_request,
     "export": _check_export,
     "sweep": _check_sweep,
 }

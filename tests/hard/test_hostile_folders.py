@@ -70,7 +70,7 @@ BOTH = {
     ),
     "wrong checksum": (put("checksums", value={"left.exr": "0", "frame_01.exr": "0"}), "its checksum differs"),
     "another camera of 10 MB": (put("camera", value={"name": "x" * 10_000_000}), "name is"),
-    "another camera of several lines": (put("camera", value={"na\nme": "x"}), "calibrate this camera"),
+    "another camera of several lines": (put("camera", value={"na\nme": "x"}), "calibrate the run's camera"),
 }
 RUN = {
     "file above": (put(*FILE, value="../cal/left.exr"), "captures.1.file"),

@@ -130,7 +130,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
     mono = shell("calibrate", scene, "-o", tmp_path / "mono", "--colour", "lines", *devices[2:], *COMMON[2:])
     assert mono.code in (0, 1)
     refused = shell("reconstruct", run, "--calibration", tmp_path / "mono", "-o", tmp_path / "other").refusal
-    assert "calibrate this camera" in refused and "sensor" in refused
+    assert "calibrate the run's camera" in refused and "sensor" in refused
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from mitsim.bench.effects import SWITCHES
 from mitsim.cli import app
 from mitsim.cli.shelf_verbs import KINDS
 from mitsim.core.configuration import load_model, shipped_path
+from mitsim.devices.mask_profile import KINDS as MASK_KINDS
 from mitsim.devices.mask_profile import load_mask
 from mitsim.devices.patterns import read_name
 from mitsim.devices.projector import ProjectorModel
@@ -133,6 +134,14 @@ def test_new_devices_sessions_and_lists_load(shell_of: Callable[..., str], tmp_p
     read_name(str(listed.patterns), listed.n)
 
 
+@pytest.mark.parametrize("kind", MASK_KINDS)
+def test_a_new_mask_is_of_any_kind(shell_of: Callable[..., str], tmp_path: Path, kind: str) -> None:
+    """(Planted: always separable; what its kind cannot do without left out.)"""
+    path = begun(shell_of, "mask", tmp_path / "m.toml", "--like", kind)
+    found = load_mask(path)
+    assert found is not None and found.kind == kind and load_sensor(path).name == "mine"
+
+
 def test_a_field_that_is_uncommented_takes_its_default(shell_of: Callable[..., str], tmp_path: Path) -> None:
     """Every commented line of plain fields is one that the model takes. (Planted: defaults written as Python has
     them.)"""
@@ -167,6 +176,8 @@ def test_a_new_scene_is_a_folder_of_its_own(shell_of: Callable[..., str], tmp_pa
         ("new camra mine", ["did you mean camera?", "session"]),
         ("new camera 2x", ["a name of letters"]),
         ("new camera mine --like mp_cl1", ["no shipped camera", "imx249, imx249_rggb"]),
+        ("new camera mine --like random", ["no shipped camera", "imx249, imx249_rggb"]),
+        ("new mask mine --like rando", ["did you mean random?", "separable, flatcam", "imx249"]),
         ("new scene mine --like photo", ["did you mean photograph?"]),
         ("new study mine --like depth", ["--like", "leave it out"]),
         ("new camera mine -o mine.txt", ["mine.txt", ".toml"]),

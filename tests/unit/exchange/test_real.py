@@ -210,6 +210,31 @@ def test_what_does_not_fit_is_refused_and_no_folder_is_left(tmp_path: Path) -> N
     refused("holds numbers of 8 bits, but camera bench 3 counts to 4095", tmp_path, tmp_path / "eight", scaled)
 
 
+@pytest.mark.parametrize(
+    ("calibrated", "words"),
+    [
+        ({"pixel_pitch_um": 2.5, "binning": 2}, None),
+        ({"pixel_pitch_um": 5.001, "binning": 1}, None),
+        ({"pixel_pitch_um": 5.0, "binning": 2}, r"camera bench 3: has pixels of 5 um, but the calibration's .* 10 um"),
+        ({"pixel_pitch_um": 5.0, "row_pitch_um": 6.0, "binning": 1}, "5 um, but the calibration's camera of 6 um"),
+    ],
+)
+def test_pixels_of_another_pitch_than_the_calibrations_are_refused(
+    calibrated: dict[str, float], words: str | None, tmp_path: Path
+) -> None:
+    """(Planted: never looked; rows not looked at; binning left out.)"""
+    bench = made(tmp_path)
+    manifest = bench.calibration / "manifest.json"
+    read = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**read, "camera": {"sensor": {"name": "bench 3", **calibrated}}}))
+    source = tmp_path / "frames"
+    written(source, "png", ms.load_run(bench.run).dn)
+    if words is None:
+        assert import_capture(source, tmp_path / "run 2", known(bench))["frames"] == 6
+    else:
+        refused(words, tmp_path, source, known(bench))
+
+
 def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice in all, not once for every frame before. (Planted: each frame found from the first page on.)"""
     bench = made(tmp_path)

@@ -249,7 +249,7 @@ def listing(**more: object) -> Callable[[Path], None]:
     [
         (turned, "the calibration's images lie turned beside these pictures"),
         (transposed, "the calibration's images lie transposed beside these pictures"),
-        (with_camera, "name is .*another.*calibrate this camera"),
+        (with_camera, "name is .*another.*calibrate the run's camera"),
         (listing(orientation="upright"), "orientation is of codes.*leave orientation out"),
         (listing(centre=True), "centre is True, but False in calibration"),
         (listing(known=[{"run": "small", "picture": "small/truth.exr"}]), "16 scene pixels.*has 32"),

@@ -176,7 +176,7 @@ def test_parallax_beyond_the_period_is_told_and_the_image_is_as_before(near: flo
     rivals.)"""
     run, factors = shots(np.where(cards() < 400, near, far), patterns), calibrated()
     image, before = reconstruct(run, factors, focus="map"), reconstruct(run, factors)
-    assert "off by a whole period" in str(image.status) and "longer period along the baseline" in str(image.status)
+    assert "off by a whole period" in str(image.status) and "Use dots of a period of" in str(image.status)
     assert not image.ok and image.depths is None and np.array_equal(image.image, before.image)
     assert image.summary()["depths"] is None and "no depths are told" in str(image.focus)
 

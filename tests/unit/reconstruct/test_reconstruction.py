@@ -145,7 +145,7 @@ def test_solvers_prepare_once_and_solve_any_number_of_scenes(shots: Capture, fac
 def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors) -> None:
     """Sizes fit, so that nothing else would say it."""
     manifest = factors.manifest.model_copy(update={"camera": {"name": "other"}})
-    with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate this camera"):
+    with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate the run's camera"):
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
 
 

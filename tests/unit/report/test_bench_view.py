@@ -91,6 +91,7 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     assert words["window"] == "120 x 120 mm at 400 mm, 16 x 16 pixels"
     assert words["light is seen"] == "from 340 to 400 mm, of 250 of 256 projector pixels (97.7%)"
     assert words["parallax"].endswith("by 0 rows and 1.41 columns of its pixels")
+    assert words["depth map"].startswith("dots:7x4 and reconstruct --focus map")
     said = json.loads(json.dumps(seen.summary()))
     assert (
         said["depths_mm"] == [340, 400]
@@ -101,6 +102,13 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     flat = replace(seen, layout=replace(seen.layout, depths=(400.0, 400.0)))
     assert flat.facts["light is seen"].startswith("at 400 mm, ")
     assert flat.facts["parallax"].startswith("none; 4 mm nearer the window moves by 0 rows and 0.0808 columns")
+    assert "depth map" not in flat.facts
+    near = replace(seen, layout=replace(seen.layout, depths=(200.0, 400.0)))
+    assert near.facts["depth map"].startswith("dots:7x16 ")
+    nearer = replace(seen, layout=replace(seen.layout, depths=(100.0, 400.0)))
+    assert nearer.facts["depth map"] == "no dots tell it: parallax spans the window"
+    above = replace(near, layout=replace(near.layout, moves=near.layout.moves[::-1]))
+    assert above.facts["depth map"].startswith("dots:16x7 ")
     far = replace(seen, layout=replace(seen.layout, projector=np.array([-5.0, 20, -30])))
     assert far.facts["projector"] == "5 mm right of, 20 mm above, 30 mm behind the camera's sensor"
     dark = replace(seen, layout=replace(seen.layout, depths=None, seen=0, trouble="no light"))

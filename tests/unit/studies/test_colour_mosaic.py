@@ -147,7 +147,7 @@ def test_folders_that_do_not_fit_are_refused(
     shutil.copytree(calibration, tmp_path / "cal")
     path = tmp_path / "cal" / "520nm" / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "camera": {"sensor": {"mosaic": "RGGB"}}}))
-    with pytest.raises(MitsimError, match=r"520nm: sensor.* is .*; calibrate this camera"):
+    with pytest.raises(MitsimError, match=r"520nm: sensor.* is .*; calibrate the run's camera"):
         solved((run, tmp_path / "cal"), tmp_path / "image")
     named = json.loads((calibration / "colour.json").read_text())
     named["channels"].pop()
