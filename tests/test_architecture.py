@@ -558,7 +558,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
-MOST_FILES, MOST_LINES_OF_CODE = 290, 56_000
+MOST_FILES, MOST_LINES_OF_CODE = 282, 54_000
 """What the house was when its rooms were last counted, and room for an extension or two: a change that needs more says
 so here. A new file or line is one more that the next reader has to know."""
 LONG = 450

@@ -138,7 +138,8 @@ def _usage(error: Any) -> str:
     checked = getattr(error.__cause__, "errors", None)
     if checked is not None:
         message += f"; got {checked()[0].get('input')!r}"
-    return message
+    context = getattr(error, "ctx", None)
+    return message if context is None else f"{message.rstrip('.')}; see {context.command_path} --help"
 
 
 def _fail(*lines: str) -> None:
@@ -273,7 +274,7 @@ class Capturing(Sampling):
 
     PANEL = WHAT
 
-    patterns: str | None = option(None, pattern_names(), show_default="those of --plan", metavar="PATTERNS")
+    patterns: str | None = option(None, f"{pattern_names()}; needed without --plan", metavar="PATTERNS")
     exposure: str = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
     exposure_fraction: ExposureFraction = 0.8
     noise_fraction: float | None = option(

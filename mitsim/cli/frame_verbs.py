@@ -213,11 +213,14 @@ def reconstruct(
 def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> int:
     """Print a ``result``, whose JSON is the ``payload``; the exit status."""
     image, rank = result.reconstruction, payload["rank"]
-    verdict = image.status.verdict.value.capitalize()
+    inherits = image.status.verdict.good and not image.ok
+    verdict = "Flagged" if inherits else image.status.verdict.value.capitalize()
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
     trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit) if known)
     lines = [
-        f"{image.status.sentence}." if result.quality is None else f"{verdict}: {result.quality}",
+        f"{'Flagged: ' if inherits else ''}{image.status.sentence}."
+        if result.quality is None
+        else f"{verdict}: {result.quality}",
         f"Image: {payload['output']}",
         *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
         *([] if image.focus is None else [str(image.focus)]),

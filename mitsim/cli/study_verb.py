@@ -27,8 +27,9 @@ class Points:
     scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS")
     over: list[str] | None = option(
         None,
-        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy; may be given again",
-        metavar="NAME=FIRST:LAST:COUNT",
+        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy; FIRST:LAST:COUNT or "
+        "VALUE,VALUE; may be given again",
+        metavar="NAME=VALUES",
         rich_help_panel=WHAT,
     )
     measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...", metavar="NAME,...", rich_help_panel=WHAT)
@@ -81,7 +82,7 @@ def study(
     --shard. One of your own is a file, or a module named with a dot.
 
     $ mitsim study patterns -o patterns --quick
-    $ mitsim study sweep photograph -o sweep --over sheet_z=390:410:5
+    $ mitsim study sweep photograph --over sheet_z=395,400 --over accuracy=0.03
     $ mitsim study accuracy cookie_bag -o accuracy
     """
     named = {"parameters": "define", "allow_outside_files": "outside"}

@@ -356,11 +356,12 @@ class _Words:
         on_raster, by_fft = f"on a raster of {cells} cells a pixel", seconds(cells)
         if drawn.needed:
             reason = f"the mask's shadow is drawn {on_raster}, and frames are formed by FFT: that leaves {leaves}"
+            spent = 0.0
+            if cells != fewest and drawn.error is not None:
+                reason += f", {fewest} {_error_words(drawn.error)}"
+                spent = max(by_fft - seconds(fewest), 0.0)
             reason += "; calibrate tells, before any light, whether two factors hold it, which an image needs"
-            if cells == fewest or drawn.error is None:
-                return (PlanRow("mask-shadow", "approximate", reason, None, 0.0),)
-            reason += f", {fewest} {_error_words(drawn.error)}"
-            return (PlanRow("mask-shadow", "approximate", reason, None, max(by_fft - seconds(fewest), 0.0)),)
+            return (PlanRow("mask-shadow", "approximate", reason, None, spent),)
         sums = seconds(0)
         terms = f"{forming.geometric_terms:.0f} separable terms"
         if settings.raster:

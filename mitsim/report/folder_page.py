@@ -44,6 +44,7 @@ _ELSEWHERE = {
 }
 """Keys of a manifest that are no lines of the table of numbers: they stand elsewhere on the page, or for programs."""
 
+_TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
 _MISFIT = 2.0
 """Chi-square a datum that is white at least: chance alone, some hundredths about 1, would fill any smaller scale."""
 
@@ -222,7 +223,7 @@ def _run_pictures(shots: Capture) -> Iterator[Picture]:
             "ambient", "Projector off: what is taken off", ambient, Scale.of(ambient, _ABOVE_BLACK, 0.0), name
         )
     if shots.truth is not None:
-        yield Picture.of("truth", "The truth", shots.truth, REFLECTANCE, "what a perfect image would show")
+        yield Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH)
     if shots.folder is not None and is_mosaic(shots.folder):
         for name in read_mosaic(shots.folder).names:
             if (path := shots.folder / name / TRUTH).is_file():
@@ -249,13 +250,14 @@ def _of_calibration(folder: Path) -> Shown:
     errors = (result.get(name) for name in ("phi_error", "predicted_phi_error"))
     error = next((value for value in errors if isinstance(value, float)), None)
     verdict = (manifest.verdict or "a calibration").capitalize()
+    verdict = f"Flagged. {verdict}" if manifest.warnings else verdict
     seconds, kernels = result.get("seconds"), result.get("kernels")
     sides = {"left": (factors.left, "rows"), "right": (factors.right, "columns")}
     return Shown(
         kind="Calibration",
         verdict=verdict if error is None else f"{verdict}, factor error {error:.1e}",
-        detail=manifest.estimate or "",
-        warnings=tuple(text for text in manifest.warnings if text != manifest.estimate),
+        detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
+        warnings=manifest.warnings,
         command=manifest.command,
         pictures=tuple(
             Picture.of(
@@ -321,9 +323,9 @@ def _image_pictures(
     by_spread = POINT_SPREAD in (result.get("inputs") or {})
     white = result.get("white")
     scale = Scale(0.0, white, "electrons/s") if by_spread and isinstance(white, float) else REFLECTANCE
-    yield Picture.of("image", "The image", image, scale, f"{image.shape[0]} x {image.shape[1]} pixels")
+    yield Picture.of("image", "The image", image, scale, f"{image.shape[0]} x {image.shape[1]} projector pixels")
     if truth is not None and truth.shape == image.shape:
-        yield Picture.of("truth", "The truth", truth, REFLECTANCE, "what a perfect image would show")
+        yield Picture.of("truth", "The truth", truth, REFLECTANCE, _TRUTH)
         yield error_picture(image, truth)
     if (path := folder / UNCERTAINTY_FILE).is_file():
         values = finite_channel(read_frame(path)[0], "uncertainty", path)

@@ -306,6 +306,10 @@ def test_the_command_ends_with_1(
     status = json.loads(out)["status"]
     assert stop.value.code == 1 and "The calibration was flagged: 12 of 64 frames" in status and status in err
     assert (run / "reconstruction" / "image.exr").is_file(), "the image is kept"
+    monkeypatch.setattr(sys, "argv", [*sys.argv[:-1], "-o", str(run / "again")])
+    with pytest.raises(SystemExit):
+        cli.run()
+    assert capsys.readouterr().out.startswith("Flagged: "), "solved, but of what was flagged"
 
 
 @pytest.mark.parametrize(

@@ -189,6 +189,18 @@ def test_a_calibration_shows_its_factors(folders: Made, tmp_path: Path) -> None:
     assert "Made from Python" in text
 
 
+def test_a_flagged_calibration_says_so_at_the_head(folders: Made, tmp_path: Path) -> None:
+    """In red, as a flagged image does, and once. (Planted: its estimate among the details.)"""
+    flags = {
+        "verdict": "mostly noise",
+        "estimate": "Factors are mostly noise.",
+        "warnings": ["Factors are mostly noise."],
+    }
+    page = page_of(copy(folders.calibration, tmp_path / "cal", **flags))
+    assert words(page).count("Factors are mostly noise.") == 1 and "Flagged. Mostly noise" in words(page)
+    assert '<p class="trouble">Factors are mostly noise.</p>' in page
+
+
 def test_lines_and_depths_have_a_page_for_all_and_one_each(folders: Made, tmp_path: Path) -> None:
     """(Planted: pages of the lines left out.)"""
     coloured = tmp_path / "col"
