@@ -109,7 +109,7 @@ class PilotRuns:
     Raises
     ------
     MitsimError
-        when no light of the projector reaches the camera.
+        when no light of the projector reaches the camera, or none passes its mask.
     """
 
     def __init__(self, bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
@@ -221,6 +221,12 @@ class PilotRuns:
         elif run == "effects":
             judged = self.fine.judging, self.accuracy, lambda: self.fine.coarse
             self.switched = EffectRuns(bench, self._everything, sample, seed, *judged)
+            if not self.switched.light:
+                feature = bench.geometry.build_mask().feature_mm
+                raise MitsimError(
+                    "no light of the projector passes the mask: what lies between the scene and the sensor is closed; "
+                    f"give a mask that opens there (its features are {feature:g} mm wide)"
+                )
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
             before = vars(self).get("followed")

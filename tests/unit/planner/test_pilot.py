@@ -531,6 +531,12 @@ def test_a_scene_without_light_is_refused(small_scene: Callable[..., Path]) -> N
         measured(black, seed=0)
 
 
+def test_a_mask_that_is_closed_before_the_sensor_is_refused(small_scene: Callable[..., Path]) -> None:
+    """Its features are wider than the sensor sees, and the middle one is closed: it was a division by zero."""
+    with pytest.raises(MitsimError, match=r"no light of the projector passes the mask.* features are 40 mm wide"):
+        measured(open_bench(small_scene("closed", mask_feature=40)), seed=0)
+
+
 def test_applicable(bench: Bench, small_scene: Callable[..., Path], tmp_path: Path) -> None:
     assert "ambient" in effects.present(bench) and "mirrors" not in effects.present(bench)
     projector = tmp_path / "projector.toml"
