@@ -474,8 +474,8 @@ def characterise(
     camera
         name or TOML file; None: a real one, by its frames.
     output
-        folder of JSON, plots and the camera's file, or of an earlier characterisation, which is replaced; None writes
-        nothing.
+        folder of page, plots, JSON and the camera's file, or of an earlier characterisation, which is replaced; None
+        writes nothing.
     frames
         of each stack; without a camera, folder of a real one's frames under even light and in the dark.
     job

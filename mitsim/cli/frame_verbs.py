@@ -385,7 +385,7 @@ def characterise(
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="folder of JSON, plots and camera.toml", metavar="DIR")
+        Path, typer.Option("-o", "--output", help="folder of page, plots, JSON and camera.toml", metavar="DIR")
     ] = Path("characterise-output"),
     asked: Procedure,
     common: Common,

@@ -157,8 +157,8 @@ def _content(folder: Path) -> Shown:
     if depths and all(_number(name) < np.inf for name in depths):
         return _of_parts(folder, depths, "depth", " mm")
     raise MitsimError(
-        f"{folder}: holds no run, calibration or image; give a folder of mitsim capture, calibrate or reconstruct "
-        "(studies and the demo write their page as they run)"
+        f"{folder}: holds no run, calibration or image; give a folder of mitsim capture, calibrate, reconstruct or "
+        "import (studies and the demo write their page as they run)"
     )
 
 

@@ -30,7 +30,7 @@ def report_folder(folder: Path | str) -> Path:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise MitsimError(f"{folder}: no such folder; give one of mitsim capture, calibrate or reconstruct")
+        raise MitsimError(f"{folder}: no such folder; give one of mitsim capture, calibrate, reconstruct or import")
     data = read_json(folder / COLOUR) if is_coloured(folder) else {}
     if isinstance(data, dict) and data.get("kind") == IMAGE:
         from mitsim.report.colour_image import report_colours  # it takes long to import

@@ -20,6 +20,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.devices.flatlist import FlatFrames
 from mitsim.devices.sensor import SensorModel
+from mitsim.report.pages import write_html
 from mitsim.sensor import emva
 from mitsim.sensor.found_camera import FoundCamera, Stated, find_camera
 from mitsim.sensor.photon_transfer import Taken
@@ -28,6 +29,7 @@ from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 from mitsim.studies.emva_plots import figures_of
 from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
 from mitsim.studies.flat_frames import read_sets, remarks
+from mitsim.studies.framework.page import build_findings
 from mitsim.studies.framework.run import study_folder, write_figures
 
 CAMERA_FILE = "camera.toml"
@@ -37,8 +39,8 @@ CAMERA_FILE = "camera.toml"
 def characterise(
     sensor: SensorModel, procedure: Procedure | None = None, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Run EMVA 1288's procedure on frames of a camera, and write JSON, plots and the camera found where a folder is
-    given.
+    """Run EMVA 1288's procedure on frames of a camera, and write page, plots, JSON and the camera found where a folder
+    is given.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames, and write JSON, plots and the camera's file where a folder is given.
+    """Measure a real camera by its frames, and write page, plots, JSON and the camera's file where a folder is given.
 
     Parameters
     ----------
@@ -136,8 +138,10 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         done = measure(str(folder))
         results = folder / "characterise.json"  # last, so that a folder with it is whole
         results.unlink(missing_ok=True)
-        for name, figure in figures_of(done).items():
-            write_figures(folder, {name: figure})
+        figures = write_figures(folder, figures_of(done))
+        titles = done.title, done.message
+        page = build_findings("characterise", titles, done.where, done.parts, figures, done.warnings)
+        write_html(folder / "characterise.html", page)
         write_text(folder / CAMERA_FILE, done.found.toml())
         write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,14 @@ from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.report.pages import round_to_error, typeset
-from mitsim.report.plots import BLACK, BLUE, FONT, GREY, ORANGE, VERMILION, WIDTH, figure_of, label_axes
+from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, VERMILION, figure_of, label_axes
 from mitsim.sensor.emva import LINEAR, MOST_FITTED, Session
 from mitsim.studies.emva_results import MOST_OFF, Characterisation, Row
 
+_HEIGHT = 3.3
+"""Inches of a plot."""
+_LETTERS = 46
+"""Of a line of its title."""
 _CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5}
 _PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
 """How what is expected and what was found are drawn."""
@@ -34,10 +39,10 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
 def _chart(
     done: Characterisation, points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str
 ) -> tuple[Figure, Axes]:
-    figure, axes = figure_of(0.45 * WIDTH)
+    figure, axes = figure_of(_HEIGHT, COLUMN)
     axes.plot(*points(done.expected), **_CLOSED, label="camera found" if done.real else "closed form")
     axes.plot(*points(done.session), **_PAIRS)
-    axes.set_title(title, fontsize=FONT + 1)
+    axes.set_title(fill(title, _LETTERS), fontsize=FONT)
     label_axes(axes, x, y)
     return figure, axes
 
@@ -50,16 +55,14 @@ def _photon_transfer(done: Characterisation) -> Figure:
         return signal, noise
 
     title = f"Photon transfer: EMVA 1288 finds a gain of {_figure_text(done, 'system_gain')}"
-    figure, axes = _chart(
-        done, points, title, "signal less dark signal [DN]", "temporal variance less dark variance [DN$^2$]"
-    )
+    figure, axes = _chart(done, points, title, "signal less dark signal [DN]", "variance less dark variance [DN$^2$]")
     signal, noise = points(done.session)
     full = float(signal[int(noise.argmax())]) if done.session.saturates else float(signal.max())
     line = np.array([0.0, MOST_FITTED * full if done.session.saturates else full])
-    label = "fit to 70 % of saturation" if done.session.saturates else "fit"
+    label = "fit to 70 %" if done.session.saturates else "fit"
     axes.plot(line, _figure(done, "system_gain").found * line, color=VERMILION, lw=2, ls="--", label=label)
     if done.session.saturates:
-        axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="largest variance: saturation")
+        axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="saturation")
         axes.set_xlim(right=1.1 * float(signal.max()))
     axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left")
     return figure
@@ -108,7 +111,7 @@ def _figure_text(done: Characterisation, name: str) -> str:
 
 def _deviations(done: Characterisation) -> Figure:
     """By how many standard errors each figure is off."""
-    figure, axes = figure_of(0.6 + 0.26 * len(done.rows))
+    figure, axes = figure_of(0.9 + 0.26 * len(done.rows), COLUMN)
     place = np.arange(len(done.rows))[::-1]
     off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
     axes.axvspan(-MOST_OFF, MOST_OFF, color="#eef2f7", zorder=0)
@@ -118,9 +121,9 @@ def _deviations(done: Characterisation) -> Figure:
     axes.set_yticks(place, names, fontsize=FONT - 1)
     far = sum(not abs(row.deviations) <= MOST_OFF for row in done.rows)
     verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
-    axes.set_title(f"{verdict} more than {MOST_OFF:g} standard errors off", fontsize=FONT + 1)
+    axes.set_title(f"{verdict}\nmore than {MOST_OFF:g} standard errors off", fontsize=FONT)
     axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
     of = "the camera's" if done.real else "set"
-    label = f"found less {of} or expected [predicted standard errors]; shaded: within {MOST_OFF:g}"
+    label = f"found less {of} or expected\n[standard errors]; shaded: within {MOST_OFF:g}"
     label_axes(axes, label, "", grid="x")
     return figure

@@ -16,7 +16,7 @@ from mitsim.sensor.found_camera import FoundCamera
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.studies.emva_frames import Frames
 from mitsim.studies.emva_options import capacity_of
-from mitsim.studies.framework.page import text_table
+from mitsim.studies.framework.page import Part, text_table
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),
@@ -61,6 +61,8 @@ _CUT = 1e-3
 """Part of the dark readings that are 0 from which these are named as the cause."""
 _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 """Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
+_WHOLE = 1e4
+"""From which a headline has whole numbers."""
 MOST_OFF = 5.0
 """Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
 
@@ -118,7 +120,7 @@ class Characterisation:
     about
         what was noticed in the frames, and what is to be mended.
     output
-        folder of JSON, plots and the camera file; None where none was asked for.
+        folder of page, plots, JSON and the camera file; None where none was asked for.
     """
 
     camera: str
@@ -194,18 +196,30 @@ class Characterisation:
             "output": self.output,
         }  # fmt: skip
 
-    def lines(self) -> list[str]:
-        """For people."""
-        head = (
-            "figure",
-            "symbol",
-            "unit",
-            "camera" if self.real else "set",
-            "expected",
-            "found",
-            "std. error",
-            "off by",
+    @property
+    def title(self) -> str:
+        """Of which camera it is."""
+        return f"{self.camera} after EMVA 1288"
+
+    @property
+    def message(self) -> str:
+        """What is asked first of a camera, as found."""
+        found = {row.name: row for row in self.fields}
+        named = {"Gain": "gain_dn_per_e", "read noise": "read_noise_e", "full well": "full_well_e"}
+        rows = {name: found[each] for name, each in named.items() if each in found}
+        return ", ".join(
+            f"{name} {row.found:{'.4g' if row.found < _WHOLE else '.0f'}} {row.unit}" for name, row in rows.items()
         )
+
+    @property
+    def where(self) -> str:
+        """In which frames."""
+        (m, n), lit, unlit = self.frames.shape, len(self.session.lit), len(self.session.unlit)
+        return f"{m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"
+
+    @property
+    def parts(self) -> tuple[Part, Part]:
+        """Tables, and the plots that stand with them: the figures of EMVA 1288, and the camera that was found."""
         rows = [
             (
                 row.name, row.symbol, row.unit, f"{row.set:.5g}",
@@ -215,15 +229,12 @@ class Characterisation:
             )
             for row in self.rows
         ]  # fmt: skip
-        counts = self.frames.shape, len(self.session.lit), len(self.session.unlit)
-        (m, n), lit, unlit = counts
-        lines = [f"{self.camera}: {m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"]
-        if self.output:
-            lines.append(f"JSON, plots and the camera found, camera.toml: {self.output}")
-        lines += text_table(head, rows)
+        beside = "camera" if self.real else "set"
+        head = ("figure", "symbol", "unit", beside, "expected", "found", "std. error", "off by")
+        notes = []
         if any(row.expected is not None for row in self.rows):
             figure = "the camera has" if self.real else "the one set"
-            lines.append(f"expected: where the procedure finds another figure than {figure}, at these steps and frames")
+            notes.append(f"expected: where the procedure finds another figure than {figure}, at these steps and frames")
         fields = [
             (
                 row.name, row.unit, *(() if self.real else (f"{row.set:.5g}" if row.set is not None else "",)),
@@ -232,9 +243,37 @@ class Characterisation:
             )
             for row in self.fields
         ]  # fmt: skip
-        beside = ("set",) if not self.real else ()
-        head = ("camera found", "unit", *beside, "found", "std. error", *(("off by",) if beside else ()))
-        return [*lines, "", *text_table(head, fields), *self.found.notes]
+        of_fields = (
+            ("camera found", "unit", "found", "std. error")
+            if self.real
+            else ("camera found", "unit", "set", "found", "std. error", "off by")
+        )
+        return (
+            Part(
+                "Figures of EMVA 1288",
+                "What the standard's procedure finds, with its standard error, and by how many of these it is off.",
+                head,
+                tuple(rows),
+                ("deviations.png", "photon_transfer.png", "linearity.png", "dark_current.png"),
+                tuple(notes),
+            ),
+            Part(
+                "The camera that explains the frames",
+                "The fields of camera.toml, which --camera takes.",
+                of_fields,
+                tuple(fields),
+                notes=tuple(self.found.notes),
+            ),
+        )
+
+    def lines(self) -> list[str]:
+        """For people."""
+        figures, camera = self.parts
+        lines = [f"{self.camera}: {self.where}"]
+        if self.output:
+            lines.append(f"Page, plots, JSON and the camera found, camera.toml: {self.output}")
+        lines += [*text_table(figures.head, figures.rows), *figures.notes]
+        return [*lines, "", *text_table(camera.head, camera.rows), *camera.notes]
 
 
 def _set(frames: Frames, name: str) -> float:

@@ -331,7 +331,7 @@ DEMO_FOLDERS, DEMO_PAGE = ("run", "calibration"), "report.html"
 _PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         ALL: (*PAPER, "*.html"),
-        "characterise": ("*.png", "camera.toml"),
+        "characterise": ("*.png", "camera.toml", "characterise.html"),
         "demo": (*DEMO_FOLDERS, DEMO_PAGE),
         **{name: ("*.png", "*.csv", f"{name}.html") for name in STUDIES},
     }

@@ -154,16 +154,21 @@ def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.Mo
     assert any(line.startswith("system_gain: found 0.2") for line in done.warnings)
 
 
-def test_json_and_plots_lie_in_the_folder(tmp_path: Path) -> None:
+def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
     done = characterise(camera("plain"), Procedure(32, 20, 2), tmp_path / "found")
     assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
-        "camera.toml", "characterise.json", "dark_current.png", "deviations.png", "linearity.png",
+        "camera.toml", "characterise.html", "characterise.json", "dark_current.png", "deviations.png", "linearity.png",
         "photon_transfer.png",
     ]  # fmt: skip
+    page = (tmp_path / "found" / "characterise.html").read_text(encoding="utf-8")
+    assert page.count('<img src="data:image/') == 4 and done.message in page and done.warnings == ()
+    gain = next(row for row in done.fields if row.name == "gain_dn_per_e")
+    assert done.message.startswith(f"Gain {gain.found:.4g} DN/e-, read noise ")
+    assert all(f"<td>{row.name}</td>" in page for row in (*done.rows, *done.fields))
     written = json.loads((tmp_path / "found" / "characterise.json").read_text())
     assert written["kind"] == "characterise" and written["pixels"] == 32
     assert [figure["name"] for figure in written["figures"]] == [row.name for row in done.rows]
-    assert done.lines()[1] == f"JSON, plots and the camera found, camera.toml: {tmp_path / 'found'}"
+    assert done.lines()[1] == f"Page, plots, JSON and the camera found, camera.toml: {tmp_path / 'found'}"
     assert load_sensor(tmp_path / "found" / "camera.toml") == done.found.sensor
 
 
