@@ -103,7 +103,7 @@ class BenchView:
             **self._dots_words,
             "field stop": stop,
             "sensor": f"{rows} x {columns} pixels of {pitch}: {rows * row:.3g} x {columns * column:.3g} mm",
-            "mask": f"{mask}, features of {geometry.build_mask().feature_mm * 1e3:.3g} um",
+            "mask": f"{mask}, features of {geometry.build_mask().feature_mm * 1e3:.4g} um",
         }
 
     @property
