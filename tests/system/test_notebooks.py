@@ -106,6 +106,9 @@ def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     # Without folders of kernels only that of this Python is known.
     kernel = AsyncKernelManager(kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, km=kernel, timeout=600, resources={"metadata": {"path": str(empty)}}).execute()
+    NotebookClient(notebook, km=kernel, timeout=600, resources={"metadata": {"path": str(empty)}}).execute(
+        cleanup_kc=True  # a manager of one's own would leave its kernel running, with a gigabyte
+    )
+    assert not kernel.has_kernel
     for cell, stored in zip(code(notebook), code(read(path)), strict=True):
         assert kinds(cell) == kinds(stored), cell["source"]
