@@ -107,7 +107,7 @@ _KINDS: dict[str, Kind] = {
     "int": ("a whole number", lambda value: isinstance(value, Integral) and not isinstance(value, bool)),
     "float": ("a number", lambda value: isinstance(value, Real) and not isinstance(value, bool)),
     "str": ("text", lambda value: isinstance(value, str)),
-    "Path": ("a path", lambda value: isinstance(value, os.PathLike) or (isinstance(value, str) and _is_path(value))),
+    "Path": ("a path", lambda value: isinstance(value, (str, os.PathLike)) and is_path(os.fspath(value))),
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     "tuple": ("a tuple", lambda value: isinstance(value, tuple)),
     "Iterable": ("several values", lambda value: isinstance(value, Iterable)),
@@ -132,7 +132,8 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             allowed = kinds.get(name, rest)
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                raise ArgumentError(name, f"{cut(repr(value))}: give {words}")
+                shown = os.fsdecode(value) if isinstance(value, os.PathLike) else repr(value)
+                raise ArgumentError(name, f"{cut(shown)}: give {words}")
         plain = {name: _plain(value) for name, value in named.items()}
         return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
 
@@ -204,7 +205,7 @@ def _is_real_array(value: object) -> bool:
     return getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf") and getattr(value, "ndim", 0) > 0
 
 
-def _is_path(text: str) -> bool:
+def is_path(text: str | bytes) -> bool:
     """Whether a ``text`` can be a path: an empty one would be the working folder, and of a longer one the operating
     system has an error of its own."""
     data = os.fsencode(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from bisect import bisect_left
 from collections.abc import Sequence
 from pathlib import Path
@@ -450,12 +451,13 @@ def sensor_table(path: Path | str) -> Table:
         if not isinstance(base, str):
             raise MitsimError(f"file {path}: {BASE}: got {base!r}; give the name of a camera, or a file")
         beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", "full_well_e")
-        if not beside.is_file() and Path(base).name == base and not Path(base).suffix and base not in known:
+        is_beside = os.path.isfile(beside)  # False of a name that is too long
+        if not is_beside and Path(base).name == base and not Path(base).suffix and base not in known:
             raise MitsimError(
                 f"file {path}: {BASE}: got {base!r}, no such camera; {near_name(base, known)}shipped are "
                 f"{', '.join(known)}"
             )
-        path = beside if beside.is_file() else locate(base, "calibration", ".toml")
+        path = beside if is_beside else locate(base, "calibration", ".toml")
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
         read.append(path.resolve())

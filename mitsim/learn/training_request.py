@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from mitsim.core.configuration import Configuration, Positive
-from mitsim.core.errors import ArgumentError, MitsimError, near_name
+from mitsim.core.errors import ArgumentError, MitsimError, checked_fields, near_name
 from mitsim.core.manifests import FORMAT, Plain
 from mitsim.core.seeds import check_root
 
@@ -29,6 +29,7 @@ FEWEST_PAIRS = 8
 """Fewer cannot be parted into those that teach and those that judge; chosen so."""
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Training:
     """How a network is trained. MitsimError for what none is trained by.
@@ -64,7 +65,7 @@ class Training:
             raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
         for name, most in (("steps", _LONGEST), ("batch", _LARGEST_BATCH)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+            if not 1 <= value <= most:
                 raise ArgumentError(name, f"{value}: give a whole number, 1 to {most}")
         check_root(self.seed)
         if not 0 < self.rate <= 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request, Task
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.errors import MitsimError, check_arguments, options_of
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
 from mitsim.learn.pair_request import CALIBRATION, PairsRequest
@@ -135,7 +135,7 @@ def train(
         where torch is not installed, for options that no network is trained by, folders that cannot be read or do not
         fit each other, a file that is there, and more time or memory than is allowed.
     """
-    request = Training(method, **options)
+    request = Training(method, **options_of(Training, options, "train"))
     place = Path(pairs) / CALIBRATION if calibration is None else Path(calibration)
     if calibration is None and not place.is_dir():
         raise MitsimError(f"calibration: {pairs} holds none; give the folder of `mitsim calibrate`")

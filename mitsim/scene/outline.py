@@ -384,7 +384,7 @@ class SceneFiles:
         """
         own, here = self.folder / name, Path(name)
         places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
-        found = {place.resolve(): place for place in places if place.is_file()}
+        found = {place.resolve(): place for place in places if os.path.isfile(place)}  # also of a name too long
         if not found:
             folders = " or ".join(str(folder) for folder in dict.fromkeys((Path.cwd(), self.folder)))
             raise MitsimError(f"parameter {cut(parameter)}={cut(name)}: no such file in {folders}; mend the name")

@@ -22,7 +22,7 @@ import pydantic
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request, SessionRequest
 from mitsim.core.configuration import Configuration, locate, read_toml, shipped_path, validate
-from mitsim.core.errors import ArgumentError, MitsimError, cut, near_name
+from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name
 from mitsim.core.mistakes import Mistake, Place, Table, mistakes, told_together
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import check_format, export
@@ -55,8 +55,17 @@ def _several_values(values: Any) -> Any:
     raise ValueError(f"got {cut(repr(values))}; give a list of values, or {{ from = A, to = B, count = N }}")
 
 
+def _path(value: Any) -> Any:
+    """A ``value`` that is no text, or one that can be a path; ValueError for another."""
+    if isinstance(value, str) and not is_path(value):
+        raise ValueError(f"got {cut(repr(value))}; give a path")
+    return value
+
+
 _Value = Annotated[Any, pydantic.AfterValidator(_one_value)]
 _Values = Annotated[Any, pydantic.AfterValidator(_several_values)]
+_Path = Annotated[str, pydantic.AfterValidator(_path)]
+_Recipe = Annotated[str | dict[str, Any], pydantic.AfterValidator(_path)]
 _Number = Annotated[float, pydantic.Field(allow_inf_nan=True)]
 _Two = Annotated[tuple[_Number, _Number], pydantic.Field(strict=False)] | None
 _OWN = {"self", "output", "resume", "job", "overwrite", "for_render"}
@@ -84,7 +93,7 @@ def _fields(call: Callable[..., Any], *leave_out: str, **other: Any) -> dict[str
             continue
         kind = eval(each.annotation, known)  # as typing.get_type_hints does
         if Path in getattr(kind, "__args__", (kind,)):
-            kind = str | None if type(None) in kind.__args__ else str
+            kind = _Path | None if type(None) in kind.__args__ else _Path
             _PATHS.add(name)
         found[name] = kind, ... if each.default is each.empty else each.default
     return {**found, **other}
@@ -101,7 +110,7 @@ _REQUEST: dict[str, Any] = {
 _REQUEST["effects"] = (str | dict[str, bool], {})
 _PLANNED = {name: _REQUEST[name] for name in ("patterns", "accuracy", "seconds", "seed", "effects")}
 _COLOUR = {"colour": (str, "no")}
-_WHERE = {"output": (str | None, None)}
+_WHERE = {"output": (_Path | None, None)}
 
 
 class _SceneTable(Configuration):
@@ -130,12 +139,12 @@ TABLES: dict[str, Any] = {
     "transport": _table("transport", {**_PLANNED, **_WHERE}),
     "capture": _table("capture", {**_REQUEST, **_COLOUR, **_WHERE}),
     "calibrate": _table(
-        "calibrate", {**_fields(SessionRequest, recipe=(str | dict[str, Any] | None, None)), **_COLOUR, **_WHERE}
+        "calibrate", {**_fields(SessionRequest, recipe=(_Recipe | None, None)), **_COLOUR, **_WHERE}
     ),
     "reconstruct": _table(
         "reconstruct",
-        {"run": (str | None, None), "calibration": (str | None, None), "lambda": (float | str, "auto"), **_IMAGE,
-         "chart": (str | None, None), **_WHERE},
+        {"run": (_Path | None, None), "calibration": (_Path | None, None), "lambda": (float | str, "auto"), **_IMAGE,
+         "chart": (_Path | None, None), **_WHERE},
     ),
     "demo": _table("demo", {**_fields(demo, "scene"), **_WHERE}),
     "sweep": _table(
@@ -145,12 +154,12 @@ TABLES: dict[str, Any] = {
     ),
     "study": _table(
         "study",
-        {"name": (str, ...), "scene": (str | None, None), "patterns": (str | None, None),
+        {"name": (str, ...), "scene": (_Path | None, None), "patterns": (str | None, None),
          **_fields(StudyOptions, "shard", "scheduler", "experiment", parameters=(dict[str, _Value], {}),
                    over=(dict[str, _Values], {})),
          **_WHERE},
     ),
-    "export": _table("export", {**_fields(export, run=(str | None, None)), "output": (str, ...)}),
+    "export": _table("export", {**_fields(export, run=(_Path | None, None)), "output": (_Path, ...)}),
 }  # fmt: skip
 """Model of each table, in the order in which the steps are taken."""
 SEVERAL = "reconstruct", "study", "export"
@@ -349,18 +358,18 @@ def _resolve(data: dict[str, Any], base: Path, only: set[tuple[str, str]] | None
 
 
 def _is_file(table: str, key: str, value: str, base: Path) -> bool:
-    """Whether a ``value`` names a file beside the session's, and no shipped one."""
+    """Whether a ``value`` names a file beside the session's, and no shipped one; none does that is too long."""
     if "\0" in value or table not in TABLES:
         return False
     path = Path(value)
     if key not in TABLES[table].model_fields:  # a parameter of the scene
-        return bool(path.suffix) and (base / path).is_file()
+        return bool(path.suffix) and os.path.isfile(base / path)
     if key not in _PATHS:
         return key == "method" and path.suffix == ".pt"
     if os.sep in value or path.suffix:
         return True
     shipped = shipped_path("scenes") / value, shipped_path("calibration") / f"{value}.toml"
-    return not any(each.exists() for each in shipped) and (base / path).exists()
+    return not any(map(os.path.exists, shipped)) and os.path.exists(base / path)
 
 
 def _session_of(model: Any, where: str) -> Session:

@@ -49,7 +49,9 @@ def test_a_frame_that_is_no_exr(refused: Refused, lab: Any) -> None:
 
 
 def test_a_name_that_no_file_can_have(refused: Refused, to: Callable[[str], tuple[object, ...]]) -> None:
-    mentions(refused(*to("n" * 300 + ".exr")), "nnn", "name too long")
+    said = refused(*to("n" * 300 + ".exr"))
+    mentions(said, "nnn")
+    assert "name too long" in said or "give a path" in said
 
 
 def test_no_input_is_replaced(refused: Refused, lab: Any, tmp_path: Path) -> None:

@@ -30,9 +30,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_holds_the_package_and_all_shipped_data(wheel: Path) -> None:
-    """Every module, template and type marker; of scenes and calibration everything but the code that drew them."""
+    """Every module, template and type marker; of scenes, calibration and sessions everything but the code
+    that drew them, and no test of that name."""
     expected = {str(path.relative_to(ROOT)) for path in (ROOT / "mitsim").rglob("*") if path.is_file()}
-    for folder in ("scenes", "calibration"):
+    for folder in ("scenes", "calibration", "sessions"):
         files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and path.suffix != ".py"]
         expected |= {f"mitsim/_shipped/{path.relative_to(ROOT)}" for path in files}
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}

@@ -19,7 +19,7 @@ WRONG: list[Any] = [
     *NO_KIND,
     *(None, True, False, 0, -1, 3, 10**40, 2**63, 0.5, -1e-300, 1e300, float("nan"), float("inf"), -float("inf")),
     *("", "x", "a\0b", "\udcff", "n" * 5000, (), [], {}, {"x": object()}, [1, "x"], (1.0, 2.0), np.ones((2, 3))),
-    *(np.float32("nan"), np.int8(-1), Path("no such"), type, lambda: None, ms),
+    *(np.float32("nan"), np.int8(-1), Path("no such"), Path("n" * 5000), type, lambda: None, ms),
 ]
 """These, and values that are wrong for most."""
 MORE = {

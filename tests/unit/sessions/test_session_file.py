@@ -134,6 +134,8 @@ SCENE = '[scene]\nscene = "photograph"\n'
         (SCENE + "[sweep]\nscene.camera = ['a', 'b']\n", "sweep.scene: camera: is no parameter of the scene"),
         (SCENE + "[sweep]\nscene.x = [1]\n[capture]\nexposure = 1.0\n", "capture.exposure: is not in a sweep's points"),
         (SCENE + "[sweep]\nscene.x = {from = 1, to = 2}\n", "scene.x: got {'from': 1, 'to': 2}; give a list of"),
+        (f'[scene]\nscene = "{"n" * 300}"\n[plan]\n', "scene.scene: got 'nnn"),
+        (SCENE + f'[calibrate]\nrecipe = "{"n" * 300}"\n', "calibrate.recipe: got 'nnn"),
         (SCENE + "[demo]\nquick = true\n", "demo.quick: got True, no such field"),
     ],
 )  # fmt: skip
