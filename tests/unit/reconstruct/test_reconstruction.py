@@ -149,6 +149,13 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_lambda_that_leaves_nothing_of_the_data_gives_black(shots: Capture, factors: Factors) -> None:
+    """Its weights are 0 in double precision. (Planted: what halves disagree on divided by their sum.)"""
+    image = reconstruct(shots, factors, lam=1e300)
+    assert np.abs(image.image).max() < 1e-200
+
+
 def test_the_condition_of_each_side_is_told(shots: Capture, factors: Factors) -> None:
     """Columns of very different light on the right alone."""
     worse = Factors(factors.left, factors.right * np.array([1.0, 1.0, 1.0, 1e-3]), factors.manifest, factors.status)
