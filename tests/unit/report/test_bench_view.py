@@ -15,6 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
 from PIL import Image
+from scipy.ndimage import label
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.layout import Layout, Preview, Surface
@@ -145,7 +146,8 @@ def test_a_view_is_written_whole_or_not_at_all(
 
 @pytest.mark.slow
 def test_a_page_needs_no_network_and_shows_the_model(seen: BenchView, tmp_path: Path) -> None:
-    """In Chromium with a renderer in software and no host that can be found the lamp's yellow is on the screen."""
+    """In Chromium with a renderer in software and no host that can be found the lamp's yellow is on the screen, high as it is.
+    (Planted: a black lamp; an eye that stays where it is.)"""
     page = seen.save(tmp_path / "bench.html")
     text = page.read_text()
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)
@@ -158,6 +160,7 @@ def test_a_page_needs_no_network_and_shows_the_model(seen: BenchView, tmp_path: 
     done = subprocess.run([*command, "--window-size=1280,2400", page.as_uri()], capture_output=True, timeout=600)
     assert done.returncode == 0 and picture.is_file(), done.stderr[-500:]
     shown = np.asarray(Image.open(picture).convert("RGB")).astype(int)
-    # The lamp's yellow is nowhere but in the model; the drawings have a star of it alone.
+    # The lamp's yellow: a triangle in the model; in the legend and the drawings a square and stars.
     yellow = (shown[..., 0] > 150) & (shown[..., 1] > 110) & (shown[..., 2] < 90) & (shown[..., 0] - shown[..., 1] < 70)
-    assert yellow.sum() > 2000
+    areas = np.bincount(label(yellow)[0][yellow])
+    assert areas.max() > 400, np.sort(areas)[-4:]
