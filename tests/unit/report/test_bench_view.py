@@ -146,8 +146,8 @@ def test_a_view_is_written_whole_or_not_at_all(
 
 @pytest.mark.slow
 def test_a_page_needs_no_network_and_shows_the_model(seen: BenchView, tmp_path: Path) -> None:
-    """In Chromium with a renderer in software and no host that can be found the lamp's yellow is on the screen, high as it is.
-    (Planted: a black lamp; an eye that stays where it is.)"""
+    """In Chromium with a renderer in software and no host that can be found the lamp's yellow is on the screen,
+    high as it is. (Planted: a black lamp; an eye that stays where it is.)"""
     page = seen.save(tmp_path / "bench.html")
     text = page.read_text()
     assert not re.search(r'<(script|link|img)[^>]*\b(src|href)="https?:', text)
