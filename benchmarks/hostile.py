@@ -20,6 +20,7 @@ import json
 import os
 import pkgutil
 import random
+import re
 import signal
 import sys
 import tempfile
@@ -173,7 +174,7 @@ def judge(
         broken.append(f"status {status}")
     if "Traceback" in message or "a fault of mitsim's own" in message:
         broken.append("traceback")
-    if status == 2 and len(lines) != 1:
+    if status == 2 and not is_refusal(lines):
         broken.append(f"{len(lines)} lines of a refusal")
     if not all(line.isprintable() for line in lines):
         broken.append("control characters")
@@ -184,6 +185,15 @@ def judge(
     if outcome.memory_bytes > MEMORY:
         broken.append(f"{outcome.memory_bytes / 2**30:.2f} GiB")
     outcome.said = message[-1500:] if broken else message[:200]
+
+
+def is_refusal(lines: Sequence[str]) -> bool:
+    """Whether some ``lines`` are what a refusal is: one, or of a file with several mistakes one more for each, of
+    twenty at most, and one that counts the rest."""
+    several = re.search(r": has (\d+) mistakes:$", lines[0]) if lines else None
+    if several is None:
+        return len(lines) == 1
+    return len(lines) - 1 == min(int(several[1]), 21) and all(line.startswith("  ") for line in lines[1:])
 
 
 def listed(folder: Path) -> dict[str, tuple[int, ...]]:
