@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -143,6 +144,8 @@ def gallery(work: Path) -> None:
         for command in map(shlex.split, commands):
             if "-o" not in command or not (work / command[command.index("-o") + 1]).exists():
                 mitsim(work, *command)
+        if name == "view":
+            shutil.copyfile(work / TILES[name], ROOT / "docs/images/view.png")  # the tour shows it whole
         if name in TILES:
             shrink(work / TILES[name], ROOT / f"docs/images/gallery/{name}.png")
 
@@ -150,7 +153,7 @@ def gallery(work: Path) -> None:
 def shrink(path: Path, smaller: Path) -> None:
     """The picture at ``path``, of a long one its left square, with as many greys or colours as ``LARGEST`` allows."""
     shown = Image.open(path).convert("RGB")
-    if shown.width > 2 * shown.height:
+    if shown.width > 3 * shown.height:
         shown = shown.crop((0, 0, shown.height, shown.height)).resize((WIDEST, WIDEST), Image.Resampling.NEAREST)
     shown.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
     for colours in (256, 128, 64, 32, 16):
