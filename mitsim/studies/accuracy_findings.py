@@ -17,7 +17,7 @@ from mitsim.report.plots import (
     error_bars,
     stacked_bars,
 )
-from mitsim.studies.framework.page import Part
+from mitsim.studies.framework.findings import Part
 from mitsim.studies.framework.run import Findings
 
 SOLVER = "mitsim study solver"

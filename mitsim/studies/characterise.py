@@ -20,7 +20,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.devices.flatlist import FlatFrames
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.pages import write_html
+from mitsim.report.pages import write_html, written_figure
 from mitsim.sensor import emva
 from mitsim.sensor.found_camera import FoundCamera, Stated, find_camera
 from mitsim.sensor.photon_transfer import Taken
@@ -29,7 +29,7 @@ from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 from mitsim.studies.emva_plots import figures_of
 from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
 from mitsim.studies.flat_frames import read_sets, remarks
-from mitsim.studies.framework.page import build_findings
+from mitsim.studies.framework.findings import build_findings
 from mitsim.studies.framework.run import study_folder, write_figures
 
 CAMERA_FILE = "camera.toml"
@@ -139,8 +139,9 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         results = folder / "characterise.json"  # last, so that a folder with it is whole
         results.unlink(missing_ok=True)
         figures = write_figures(folder, figures_of(done))
+        pictures = {name: written_figure(figure, folder / name) for name, figure in figures.items()}
         titles = done.title, done.message
-        page = build_findings("characterise", titles, done.where, done.parts, figures, done.warnings)
+        page = build_findings("characterise", titles, done.where, done.parts, pictures, done.warnings)
         write_html(folder / "characterise.html", page)
         write_text(folder / CAMERA_FILE, done.found.toml())
         write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})

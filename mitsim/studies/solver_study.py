@@ -44,7 +44,7 @@ from mitsim.reconstruct.factorisation import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import plots
 from mitsim.report.pages import typeset
-from mitsim.studies.framework.page import Part
+from mitsim.studies.framework.findings import Part
 from mitsim.studies.framework.run import Findings
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import wrap
 
 from matplotlib.figure import Figure
 
@@ -16,12 +14,8 @@ from mitsim.report.pages import page_figure, render_page, write_html
 from mitsim.studies.framework.claims import CONFIRMED, NOT_CONFIRMED
 from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
-_NUMBER = re.compile(r"[+-]?\d|nothing$")
-"""How a cell of a column of numbers begins."""
 _IN_PART, _NOT_DECIDED = "confirmed in part", "not decided"
 """What a tally says of claims that hold somewhere, and of those that more prints or seeds would decide."""
-_LETTERS = 100
-"""Of a line of text, as wide as most terminals."""
 
 
 @dataclass(frozen=True)
@@ -83,42 +77,6 @@ class Section:
         )
 
 
-@dataclass(frozen=True)
-class Part:
-    """Of a page of one study: a table of ``rows`` under ``head``, in words, ``figures`` by file name, and ``notes``
-    that say how these are to be read."""
-
-    title: str
-    lead: str
-    head: tuple[str, ...] = ()
-    rows: tuple[tuple[str, ...], ...] = ()
-    figures: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def numeric(self) -> tuple[bool, ...]:
-        """Of which columns all cells begin with a number: these stand to the right."""
-        return _numeric(self.rows)
-
-    def lines(self) -> list[str]:
-        """As text: the title, what leads to the table, and the table."""
-        return [f"{self.title}:", *wrap(self.lead, _LETTERS), *text_table(self.head, self.rows)]
-
-
-def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table of ``rows`` under their ``head``, its columns as wide as they need be; none without rows."""
-    table = [head, *rows] if rows else []
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    sides = [str.rjust if right else str.ljust for right in _numeric(rows)]
-    lines = [[side(*cell) for side, cell in zip(sides, zip(row, widths, strict=True), strict=True)] for row in table]
-    return ["  ".join(cells).rstrip() for cells in lines]
-
-
-def _numeric(rows: Sequence[Sequence[str]]) -> tuple[bool, ...]:
-    columns = zip(*rows, strict=True)
-    return tuple(any(cells) and all(not cell or _NUMBER.match(cell) for cell in cells) for cells in columns)
-
-
 def tally(claims: Sequence[Claim]) -> str:
     """How many of some ``claims`` hold; empty of none."""
     counts = Counter(
@@ -153,44 +111,6 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     return (
         f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
         f"count all the same (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
-    )
-
-
-def build_findings(
-    name: str,
-    titles: tuple[str, str],
-    where: str,
-    parts: Sequence[Part],
-    figures: Mapping[str, Figure],
-    warnings: Sequence[str] = (),
-) -> str:
-    """The page of a study of one bench, as HTML.
-
-    Parameters
-    ----------
-    name, titles
-        of the study, and the page's title and message, which may be empty.
-    where
-        of which scene and patterns it is.
-    parts
-        of the page, in order.
-    figures
-        by file name.
-    warnings
-        why its findings may not be trusted, for its head.
-    """
-    title, message = titles
-    pictures = {file: page_figure(figure) for file, figure in figures.items()}
-    return render_page(
-        "findings.html",
-        name=name,
-        title=title,
-        message=message or title,
-        where=where,
-        parts=parts,
-        pictures=pictures,
-        warnings=warnings,
-        versions=versions(),
     )
 
 

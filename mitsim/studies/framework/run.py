@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from mitsim.api.bench import Bench
     from mitsim.report.pages import Table
-    from mitsim.studies.framework.page import Part
+    from mitsim.studies.framework.findings import Part
 
 
 DPI = 150
@@ -180,12 +180,14 @@ def run_study(
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = write_figures(folder, findings.figures())
         if findings.title:
-            from mitsim.studies.framework.page import build_findings
+            from mitsim.report.pages import page_figure
+            from mitsim.studies.framework.findings import build_findings
 
             scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
             where = f"{scene_name} {request.seed}."
             titles = findings.title, findings.message
-            page = build_findings(name, titles, where, findings.parts(), figures, result.warnings)
+            pictures = {file: page_figure(figure) for file, figure in figures.items()}
+            page = build_findings(name, titles, where, findings.parts(), pictures, result.warnings)
             with whole_file(folder / f"{name}.html") as part:
                 part.write_text(page, encoding="utf-8")
         for file, table in findings.tables().items():

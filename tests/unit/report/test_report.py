@@ -17,9 +17,10 @@ from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
+from mitsim.report.pages import page_figure
 from mitsim.report.parts import stages_of
 from mitsim.studies.demo import _no_image
-from mitsim.studies.framework.page import Part, build_findings
+from mitsim.studies.framework.findings import Part, build_findings
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32
@@ -343,7 +344,9 @@ def test_numbers_of_findings_stand_to_the_right_and_words_to_the_left() -> None:
     rows = (("shot noise", "+7.4 +- 0.1", "2.8e+12", "1"), ("read noise", "nothing", "", "one"))
     part = Part("Title", "512 x 512 pixels", ("Source", "Lost", "Photons", "Runs"), rows, ("a.png",))
     assert part.numeric == (False, True, True, False)
-    page = build_findings("toy", ("A study", "7 dB"), "Scene toy", [part], {"a.png": Figure(figsize=(3.0, 2.0))})
+    page = build_findings(
+        "toy", ("A study", "7 dB"), "Scene toy", [part], {"a.png": page_figure(Figure(figsize=(3.0, 2.0)))}
+    )
     assert (
         '<p class="verdict">7 dB</p>' in page
         and page.count('<th class="n">') == 2

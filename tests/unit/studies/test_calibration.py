@@ -30,7 +30,7 @@ from mitsim.studies.calibration_study import (
     singular_rows,
 )
 from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gain_without, session_rendering
-from mitsim.studies.framework.page import build_findings
+from mitsim.studies.framework.findings import build_findings
 from mitsim.studies.perturbation import Expected, Noise
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
@@ -299,9 +299,7 @@ def test_the_page_has_every_loss_in_one_table() -> None:
     (line,) = [line for line in found.lines() if "mask down the rows" in line]
     assert line.split("  ")[0] == "drift, not in this image" and line.endswith("3.00 \N{PLUS-MINUS SIGN} 0.20")
     assert "read noise" not in " ".join(found.lines())
-    assert "mask down the rows" in build_findings(
-        "calibration", (found.title, found.message), "toy", found.parts(), found.figures()
-    )
+    assert "mask down the rows" in build_findings("calibration", (found.title, found.message), "toy", found.parts(), {})
     assert not CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT).parts()[0].figures
 
 
