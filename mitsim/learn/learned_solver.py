@@ -23,7 +23,8 @@ from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
 from mitsim.learn.diagonal import Binning, Data, Diagonal
 from mitsim.learn.methods import CLASSES, Denoiser, Method, PlugAndPlay
-from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED, ModelManifest
+from mitsim.learn.model_manifest import ModelManifest
+from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance

@@ -30,9 +30,10 @@ from mitsim.learn.critic import Critic
 from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, on_device, relative_noise, write_tensors
 from mitsim.learn.methods import CLASSES, Method, decibels
+from mitsim.learn.model_manifest import ModelManifest
 from mitsim.learn.networks import drawn_way, has_half
 from mitsim.learn.pair_store import PairStore
-from mitsim.learn.training_request import FEWEST_PAIRS, ModelManifest, Training
+from mitsim.learn.training_request import FEWEST_PAIRS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared

@@ -1,14 +1,10 @@
-"""How a network is asked to be trained in, a refusal out, before torch is imported; and what its file says of it."""
+"""How a network is asked to be trained in, a refusal out, before torch is imported."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import Field
-
-from mitsim.core.configuration import Configuration, Positive
 from mitsim.core.errors import ArgumentError, MitsimError, checked_fields, near_name
-from mitsim.core.manifests import FORMAT, Plain
 from mitsim.core.seeds import check_root
 
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
@@ -76,28 +72,3 @@ class Training:
                 raise ArgumentError(name, f"{value}: give a number, 0 to {_LARGEST_WEIGHT}")
             if value and self.method == PLUG_AND_PLAY:
                 raise ArgumentError(name, f"{value}: {PLUG_AND_PLAY} learns from noise alone; leave it out")
-
-
-class ModelManifest(Configuration):
-    """What a network was trained for, and how."""
-
-    format: int = Field(default=FORMAT, ge=1, le=FORMAT)
-    """Version of this format."""
-    method: str
-    """Name of the method, as `mitsim train` takes it."""
-    camera: Plain
-    """Identity of the camera, as its calibration states it."""
-    factors: str
-    """Fingerprint of the calibration's factors."""
-    patterns: str
-    """Name of the patterns' family."""
-    exposure_s: Positive
-    """Of the pairs' frames [s]."""
-    noise: tuple[float, float] = Field(strict=False)
-    """Noise of a datum over its rms, least and largest of the pairs."""
-    pairs: Plain
-    """What the store of the pairs says of itself."""
-    training: Plain
-    """Steps, batch, rate, seed and weights of losses; PSNR of pairs that did not teach, by step; seconds."""
-    versions: dict[str, str]
-    """Of mitsim, torch and others."""
