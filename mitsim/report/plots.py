@@ -57,7 +57,7 @@ ROW = 0.27
 """Inches of a row of bars: a line of text, and a third of one between two."""
 _NAME_LETTERS = 34
 """Of a line of the name of a bar: half of the figure is left for bars."""
-_UPRIGHT_LETTERS, _TITLE_LETTERS = 26, 46
+_UPRIGHT_LETTERS, TITLE_LETTERS = 26, 46
 """Of a line along a panel of curves, and above it."""
 LOGARITHMIC = 30.0
 """Largest over least value from which an axis is logarithmic: on a linear one the smaller half of its decades lies
@@ -114,7 +114,7 @@ def curves(
             style = {"marker": "o", "ms": 5.0, "capsize": 3, "lw": 1.8, **line_style(names.index(name))}
             axes.errorbar(points[:, 0], points[:, 1], _bar_errors(points[:, 2]), label=name, **style)
         axes.set_title(panel, fontsize=FONT)
-        label_axes(axes, fill(x, _TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
+        label_axes(axes, fill(x, TITLE_LETTERS) if axes is places[-1, 0] else "", fill(y, _UPRIGHT_LETTERS))
         if log or spans_decades(measured):
             axes.set_xscale("log")
         if spans_decades(levels):
@@ -128,7 +128,7 @@ def curves(
     if labels:
         legend_below(figure, [shown_by_name[name] for name in labels], labels)
     if title:
-        figure.suptitle(fill(title, _TITLE_LETTERS), fontsize=FONT + 1)
+        figure.suptitle(fill(title, TITLE_LETTERS), fontsize=FONT + 1)
     return figure
 
 

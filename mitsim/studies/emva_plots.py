@@ -12,14 +12,12 @@ from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.report.pages import round_to_error, typeset
-from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, VERMILION, figure_of, label_axes
+from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, TITLE_LETTERS, VERMILION, figure_of, label_axes
 from mitsim.sensor.emva import LINEAR, MOST_FITTED, Session
 from mitsim.studies.emva_results import MOST_OFF, Characterisation, Row
 
 _HEIGHT = 3.3
 """Inches of a plot."""
-_LETTERS = 46
-"""Of a line of its title."""
 _CLOSED: dict[str, Any] = {"color": GREY, "lw": 1.5}
 _PAIRS: dict[str, Any] = {"color": BLUE, "lw": 0, "marker": "o", "ms": 5, "label": "pairs of frames"}
 """How what is expected and what was found are drawn."""
@@ -42,7 +40,7 @@ def _chart(
     figure, axes = figure_of(_HEIGHT, COLUMN)
     axes.plot(*points(done.expected), **_CLOSED, label="camera found" if done.real else "closed form")
     axes.plot(*points(done.session), **_PAIRS)
-    axes.set_title(fill(title, _LETTERS), fontsize=FONT)
+    axes.set_title(fill(title, TITLE_LETTERS), fontsize=FONT)
     label_axes(axes, x, y)
     return figure, axes
 
