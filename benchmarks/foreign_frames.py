@@ -1,0 +1,1002 @@
+"""Judge the frame checks of `reconstruct` on frames of another forward model: kinds of faults, severities, families.
+
+    python benchmarks/foreign_frames.py RESULT.json [--kinds ...] [--families ...] [--severities 0 1 2] [--runs 1]
+        [--good 0] [--seed 0] [--old OLD.json]
+
+The forward model below is written in numpy and shares no code with mitsim. Only the stripes of the calibration session
+are taken from mitsim, because its list of frames counts them in mitsim's order. Cameras have 48 to 128 sensor pixels
+and 24 to 48 scene pixels a side, the brightest pixel gets 50 to 20 000 electrons, and there are ten kinds of pictures.
+Frames go through `ms.calibrate_frames` (once for each camera), `ms.import_frames` and `ms.reconstruct`.
+
+Each run has one fault. Its twin is the same run without the fault, with the same random numbers. A run counts as
+
+- ``F`` flagged: refused, or flagged by the import or by the image;
+- ``.`` not flagged, and the rms error against the truth is at most twice the stated rms uncertainty;
+- ``S`` silent: not flagged, and the error is more than twice the stated one, although the twin's is not;
+- ``T`` the same, but the error of the twin is more than twice the stated one, too.
+
+An image that states no uncertainty counts as silent where its error is more than twice that of its twin.
+``--good`` adds runs without a fault. Their false alarms are refusals, warnings of the import, and flags of the misfit;
+flags for other reasons, for example "Lambda takes away more of the image than it leaves", are counted apart. The table
+shows, for each kind and family, one letter for each run, ordered by severity. ``--old`` compares with an earlier
+RESULT.json and lists the runs that were flagged there and are not flagged now. A run takes about 0.5 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.linalg import hadamard
+from scipy.ndimage import gaussian_filter, median_filter
+
+import mitsim as ms
+from mitsim.devices.patterns import stripe_signs
+
+# ---- Forward model: mask, scene, patterns, sensor --------------------------------------------------------------------
+
+SENSOR_MM, MASK_MM, SCENE_MM, WINDOW_MM = 6.0, 5.0, 400.0, 120.0
+"""Width of the sensor, distances of mask and scene, width of the projector's window at the scene."""
+PARTS = 4
+"""Parts of a projector pixel a side, so that a picture can move by part of a pixel."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with a separable mask, and its electronics."""
+
+    n: int
+    pixels: tuple[int, int]
+    seed: int
+    feature_mm: float = 0.06
+    baseline_mm: float = 0.0
+    gain: float = 0.2
+    black: float = 100.0
+    read: float = 4.0
+    dark: float = 30.0
+    bits: int = 13
+
+    def code(self, axis: int, flipped: float = 0.0) -> np.ndarray:
+        """(features,) open and closed features of a side; the part ``flipped`` of them is drawn anew."""
+        rng = np.random.default_rng([self.seed, axis])
+        code = rng.integers(0, 2, 401).astype(float)
+        drawn = rng.random(401) < flipped
+        return np.where(drawn, rng.integers(0, 2, 401), code)
+
+    @lru_cache(maxsize=64)  # noqa: B019 - cameras are few and live as long as the process
+    def side(self, axis: int, moved: float = 0.0, nearer: float = 0.0, mask: float = 0.0, flipped: float = 0.0) -> Any:
+        """(pixels, PARTS n) light of the parts of projector pixels at sensor pixels.
+
+        Parameters
+        ----------
+        axis
+            0 of rows, 1 of columns.
+        moved
+            of the sensor, in its pixels.
+        nearer, mask
+            relative change of the depth of the scene, and of the distance of the mask.
+        flipped
+            part of the mask's features that are drawn anew.
+        """
+        code, size = self.code(axis, flipped), self.pixels[axis]
+        edges = (np.arange(len(code) + 1) - len(code) / 2) * self.feature_mm
+        open_up_to = np.concatenate([[0.0], np.cumsum(code) * self.feature_mm])
+        depth, distance = SCENE_MM * (1 + nearer), MASK_MM * (1 + mask)
+        pitch, cell = SENSOR_MM / size, WINDOW_MM / SCENE_MM / (self.n * PARTS)
+        inside = (np.arange(16) + 0.5) / 16 - 0.5
+        place = (np.arange(size) - (size - 1) / 2 + moved) * pitch
+        tangent = (np.arange(self.n * PARTS) - (self.n * PARTS - 1) / 2) * cell
+        if axis:
+            tangent = tangent + self.baseline_mm * (1 / depth - 1 / SCENE_MM)
+        at = (place[:, None] + inside * pitch)[..., None] * (1 - distance / depth) + tangent * distance
+        half = cell * distance / 2
+        seen = np.interp(at + half, edges, open_up_to) - np.interp(at - half, edges, open_up_to)
+        fall_off = 1 - 0.3 * np.square(2 * place / SENSOR_MM)
+        return seen.mean(axis=1) / (2 * half) * fall_off[:, None] / PARTS
+
+    def factor(self, axis: int) -> np.ndarray:
+        """(pixels, n) light of whole projector pixels."""
+        return np.asarray(self.side(axis).reshape(self.pixels[axis], self.n, PARTS).sum(axis=2))
+
+    def numbers(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Digital numbers of expected photoelectrons ``light``."""
+        charge = rng.poisson(np.maximum(light, 0) + self.dark) + self.read * rng.standard_normal(light.shape)
+        return np.clip(np.rint(self.black + self.gain * charge), 0, 2**self.bits - 1)
+
+
+CAMERAS = (
+    Camera(32, (96, 112), 1),
+    Camera(24, (48, 64), 2, gain=0.25, read=6.0, black=64.0),
+    Camera(48, (128, 128), 3, dark=5.0, baseline_mm=20.0),
+    Camera(40, (112, 96), 4, gain=0.1, bits=12, read=8.0, black=32.0),
+    Camera(32, (72, 72), 15, feature_mm=0.05, gain=0.6, bits=14, read=2.0, black=200.0),
+    Camera(28, (80, 72), 6, dark=80.0, baseline_mm=-15.0),
+)
+SQUARE = CAMERAS[2], CAMERAS[4]
+PEAKS = 2e4, 3e3, 600.0, 150.0, 50.0
+"""Photoelectrons of the brightest pixel."""
+PICTURES = "smooth", "leaves", "text", "noise", "blocks", "even", "stars", "random", "stripes", "checkers"
+
+
+def picture(name: str, n: int, seed: int) -> np.ndarray:
+    """(n, n) reflectances."""
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    y, x = np.mgrid[:n, :n] / n
+    phase = rng.random(4)
+    if name == "smooth":
+        return 0.5 + 0.3 * np.sin(2 * np.pi * (x + phase[0])) * np.cos(2 * np.pi * (1.3 * y + phase[1]))
+    if name == "noise":  # amplitude falls with frequency
+        frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
+        frequency[0, 0] = 1.0
+        values = np.real(np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n))) / frequency))
+        return np.clip(0.5 + 0.18 * (values - values.mean()) / values.std(), 0.02, 1.0)
+    if name == "even":
+        return np.full((n, n), 0.3 + 0.6 * phase[0])
+    if name == "random":
+        return rng.random((n, n))
+    if name == "stripes":
+        return 0.5 + 0.4 * np.sign(np.sin(2 * np.pi * (x * (3 + 5 * phase[0]) + y * 4 * phase[1] + phase[2])))
+    if name == "checkers":
+        size = int(rng.integers(1, 5))
+        return 0.15 + 0.7 * ((np.indices((n, n)) // size).sum(axis=0) % 2)
+    if name == "stars":
+        values = np.full((n, n), 0.02)
+        values[tuple(rng.integers(0, n, (2, n)))] = rng.uniform(0.2, 1.0, n)
+        return values
+    if name == "text":
+        values = np.full((n, n), 0.85)
+        for line in range(2, n - 4, 7):
+            values[line : line + 5][rng.random((5, n)) < 0.4] = 0.08
+        return values
+    values = np.full((n, n), 0.4)
+    for _ in range(60 if name == "leaves" else 12):
+        row, column, size = rng.random(), rng.random(), 0.03 + 0.2 * rng.random() ** 3
+        if name == "leaves":
+            values[np.hypot(y - row, x - column) < size] = rng.uniform(0.05, 0.95)
+        else:
+            height, width = rng.uniform(0.05, 0.5, 2)
+            values[(abs(y - row) < height / 2) & (abs(x - column) < width / 2)] = rng.uniform(0.05, 0.95)
+    return values
+
+
+def family(name: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """P_L and P_R (n, K) of a pattern family; `repeats:K` shows the uniform pattern K x K times."""
+    kind, _, size = name.partition(":")
+    k, pixels = int(size or 1), np.arange(n)
+    if kind == "dots":
+        return (side := (pixels[:, None] % k == np.arange(k)) * 1.0), side
+    if kind == "hadamard":
+        return (side := hadamard(k).astype(float)[pixels % k]), side
+    if kind == "random":
+        rng = np.random.default_rng([seed, n])
+        drawn = [rng.integers(0, 2, (n, k)).astype(float) for _ in range(2)]
+        for side in drawn:
+            side[~side.any(axis=1), int(rng.integers(k))] = 1.0
+        return drawn[0], drawn[1]
+    return np.ones((n, k)), np.ones((n, k))
+
+
+@dataclass
+class Run:
+    """One capture that a fault changes before it is exposed: its light, what is done to its numbers, what is stated."""
+
+    camera: Camera
+    family: str
+    picture: str
+    peak: float
+    seed: int
+    stated: dict[str, float] = field(default_factory=dict)
+    after: list[Callable[[list[np.ndarray]], list[np.ndarray]]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.scene = picture(self.picture, self.camera.n, self.seed)
+        self.sides = family(self.family, self.camera.n, self.seed)
+        self.signed = self.family.startswith("hadamard")
+        signs = (1, -1) if self.signed else (0,)
+        columns = range(self.sides[1].shape[1])
+        self.shots = [(i, j, sign) for i in range(self.sides[0].shape[1]) for j in columns for sign in signs]
+        self.exposure = 1.0
+        light = [self.light_of(shot) for shot in range(len(self.shots))]
+        self.exposure = self.peak / max(float(each.max()) for each in light)
+        self.light = [each * self.exposure for each in light]
+
+    @property
+    def peak_dn(self) -> float:
+        """Digital numbers of the brightest pixel above the black level."""
+        return self.peak * self.camera.gain
+
+    def lamp(self, shot: int) -> np.ndarray:
+        """(n, n) part of full power that each projector pixel emits in a ``shot``."""
+        i, j, sign = self.shots[shot]
+        pattern = np.outer(self.sides[0][:, i], self.sides[1][:, j])
+        return pattern if sign == 0 else (1 + sign * pattern) / 2
+
+    def light_of(
+        self,
+        shot: int,
+        scene: np.ndarray | None = None,
+        steps: tuple[int, int] = (0, 0),
+        lamp: np.ndarray | None = None,
+        **camera: float,
+    ) -> np.ndarray:
+        """Expected photoelectrons of a ``shot``.
+
+        Parameters
+        ----------
+        shot
+            its number.
+        scene, lamp
+            (n, n) reflectances and projector's light; None: those of the run.
+        steps
+            motion of the picture, in parts of a projector pixel, under the same light.
+        **camera
+            of :meth:`Camera.side`.
+        """
+        whole = np.ones((PARTS, PARTS))
+        fine = np.kron(self.scene if scene is None else scene, whole)
+        for axis, step in enumerate(steps):
+            places = np.clip(np.arange(len(fine)) - step, 0, len(fine) - 1)
+            fine = fine.take(places, axis=axis)
+        lit = fine * np.kron(self.lamp(shot) if lamp is None else lamp, whole)
+        left, right = (self.camera.side(axis, **camera) for axis in (0, 1))
+        return np.asarray(left @ lit @ right.T) * self.exposure
+
+    def frames(self) -> list[np.ndarray]:
+        """Digital numbers of all shots."""
+        rngs = (np.random.default_rng([self.seed, 5, shot]) for shot in range(len(self.light)))
+        made = [self.camera.numbers(light, rng) for light, rng in zip(self.light, rngs, strict=True)]
+        for change in self.after:
+            made = change(made)
+        return made
+
+
+# ---- Faults: each changes a run, and returns the numbers of its wrong frames; empty: all, or none in particular ------
+
+Fault = Callable[[Run, Any, np.random.Generator], "set[int] | None"]
+FAULTS: dict[str, tuple[tuple[Any, ...], Fault, str]] = {}
+"""Levels of the three severities, the fault, and what it needs: "frames" that differ, "time", "square" or nothing."""
+
+
+def fault(*levels: Any, needs: str = "") -> Callable[[Fault], Fault]:
+    """Register a fault under the name of its function."""
+
+    def register(function: Fault) -> Fault:
+        FAULTS[function.__name__] = levels, function, needs
+        return function
+
+    return register
+
+
+def _any(run: Run, rng: np.random.Generator, count: int = 1) -> list[int]:
+    """Numbers of shots that have at least a third of the mean light of the brightest."""
+    means = np.array([light.mean() for light in run.light])
+    chosen = rng.choice(np.flatnonzero(means > means.max() / 3), count, replace=False)
+    return sorted(int(shot) for shot in chosen)
+
+
+def _pixelwise(run: Run, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Change the digital numbers of each frame on its own."""
+    run.after.append(lambda frames: [change(frame.copy()) for frame in frames])
+
+
+def _grid(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.indices(run.camera.pixels)
+    return rows, columns
+
+
+# -- What is stated of the camera
+
+
+@fault(0.5, 2.0, 4.0)
+def gain(run: Run, level: float, rng: np.random.Generator) -> None:
+    """True gain over the stated one."""
+    run.stated["gain"] = run.camera.gain / level
+
+
+@fault(0.003, 0.02, 0.1)
+def black_level(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Wrong black level, part of the peak."""
+    step = max(level * run.peak_dn, 0.5) * rng.choice([-1, 1])
+    run.stated["black"] = max(run.camera.black + step, 0.0)
+
+
+@fault(0.3, 2.0, 5.0)
+def read_noise(run: Run, level: float, rng: np.random.Generator) -> None:
+    """True read noise over the stated one."""
+    run.stated["read"] = run.camera.read / level
+
+
+# -- Single frames, and time
+
+
+@fault(0.2, 0.5, 1.0, needs="time")
+def foreign(run: Run, level: float, rng: np.random.Generator) -> set[int]:
+    """Part of another scene in one frame."""
+    other = picture(PICTURES[(PICTURES.index(run.picture) + 1) % 5], run.camera.n, run.seed + 1)
+    (shot,) = _any(run, rng)
+    run.light[shot] = (1 - level) * run.light[shot] + level * run.light_of(shot, other)
+    return {shot}
+
+
+@fault(1, 2, 6, needs="time")
+def rolled(run: Run, level: int, rng: np.random.Generator) -> set[int]:
+    """Pixels by which one frame is rolled."""
+    (shot,) = _any(run, rng)
+    run.light[shot] = np.roll(run.light[shot], level, int(rng.integers(2)))
+    return {shot}
+
+
+@fault(1, 2, 4, needs="frames")
+def repeated(run: Run, level: int, rng: np.random.Generator) -> set[int]:
+    """Frames in place of which the frame before was saved again."""
+    shots = set(_any(run, rng, min(level, len(run.shots) // 3)))
+    run.after.append(lambda frames: [frames[k - 1] if k in shots else frame for k, frame in enumerate(frames)])
+    return shots
+
+
+@fault(1, 2, 4, needs="time")
+def black_frame(run: Run, level: int, rng: np.random.Generator) -> set[int]:
+    """Frames without light."""
+    shots = set(_any(run, rng, min(level, len(run.shots) // 3)))
+    for shot in shots:
+        run.light[shot] = np.zeros(run.camera.pixels)
+    return shots
+
+
+@fault(0.1, 0.3, 0.6, needs="time")
+def half_lost(run: Run, level: float, rng: np.random.Generator) -> set[int]:
+    """Part of the rows that one frame lost."""
+    (shot,) = _any(run, rng)
+    run.light[shot] = run.light[shot] * (_grid(run)[0] < (1 - level) * run.camera.pixels[0])
+    return {shot}
+
+
+@fault(0.97, 0.9, 0.5, needs="time")
+def dimmed(run: Run, level: float, rng: np.random.Generator) -> set[int]:
+    """Light of one frame."""
+    (shot,) = _any(run, rng)
+    run.light[shot] = run.light[shot] * level
+    return {shot}
+
+
+@fault(0.01, 0.03, 0.1, needs="time")
+def flicker(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Standard deviation of the power of frames."""
+    run.light = [light * (1 + level * rng.standard_normal()) for light in run.light]
+
+
+@fault(0.02, 0.05, 0.1, needs="time")
+def drift(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Power that the lamp loses during the run."""
+    run.light = [light * (1 - level * k / (len(run.light) - 1)) for k, light in enumerate(run.light)]
+
+
+def _hand(run: Run, level: float, rng: np.random.Generator, count: int) -> set[int]:
+    first = int(rng.integers(len(run.light) - count + 1))
+    y, x = np.mgrid[: run.camera.n, : run.camera.n] / run.camera.n
+    row, column = rng.uniform(0.2, 0.8, 2)
+    scene = np.where(np.hypot(y - row, x - column) < level, 0.15 * run.scene, run.scene)
+    for shot in range(first, first + count):
+        run.light[shot] = run.light_of(shot, scene)
+    return set(range(first, first + count))
+
+
+@fault(0.1, 0.2, 0.35, needs="time")
+def hand_in_three(run: Run, level: float, rng: np.random.Generator) -> set[int]:
+    """Radius of a dark hand in three frames, part of the scene."""
+    return _hand(run, level, rng, min(3, len(run.light) // 2))
+
+
+@fault(0.1, 0.2, 0.35, needs="time")
+def hand_in_one(run: Run, level: float, rng: np.random.Generator) -> set[int]:
+    """Radius of a dark hand in one frame."""
+    return _hand(run, level, rng, 1)
+
+
+@fault(0.1, 0.5, 1.0, needs="time")
+def camera_moved(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Sensor pixels that the camera moved midway."""
+    for shot in range(len(run.light) // 2, len(run.light)):
+        run.light[shot] = run.light_of(shot, moved=level)
+
+
+@fault(0.1, 0.5, 1.0, needs="time")
+def camera_creeps(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Sensor pixels that the camera moves in all, evenly, in eight steps."""
+    for shot in range(len(run.light)):
+        run.light[shot] = run.light_of(shot, moved=level * (8 * shot // len(run.light)) / 7)
+
+
+@fault(1, 2, 4, needs="time")
+def scene_moved(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Quarters of a scene pixel that the picture moved midway."""
+    for shot in range(len(run.light) // 2, len(run.light)):
+        run.light[shot] = run.light_of(shot, steps=(level, 0))
+
+
+@fault(1, 5, 0, needs="frames")
+def swapped(run: Run, level: int, rng: np.random.Generator) -> set[int]:
+    """Distance of two frames that are exchanged; 0: of three pairs of neighbours."""
+    count = len(run.light)
+    firsts = _any(run, rng, 1) if level else [k for k in (1, count // 2, count - 3)]
+    wrong = set()
+    for first in firsts:
+        other = (first + (level or 1)) % count
+        run.light[first], run.light[other] = run.light[other], run.light[first]
+        wrong |= {first, other}
+    return wrong
+
+
+@fault(0.01, 0.05, 0.2, needs="frames")
+def lag(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Part of the frame before in each frame."""
+    before = [run.light[0], *run.light[:-1]]
+    run.light = [(1 - level) * light + level * last for light, last in zip(run.light, before, strict=True)]
+
+
+@fault("column-major", "reversed", "sequency or halves", needs="frames")
+def order(run: Run, level: str, rng: np.random.Generator) -> None:
+    """Order in which shots were written."""
+    count = len(run.light)
+    if level == "reversed":
+        places = list(range(count))[::-1]
+    elif level == "column-major":
+        places = sorted(range(count), key=lambda k: (run.shots[k][1], run.shots[k][0], -run.shots[k][2]))
+    elif run.signed:
+        changes = [int((np.diff(side) != 0).sum()) for side in hadamard(run.sides[0].shape[1])]
+        sides = (changes.index(0), changes.index(1), changes.index(2), changes.index(3)) if len(changes) == 4 else ()
+        number = {shot: k for k, shot in enumerate(run.shots)}
+        places = [number[sides[i], sides[j], sign] for i, j, sign in run.shots]
+    else:
+        places = [*range(count // 2, count), *range(count // 2)]
+    run.light = [run.light[place] for place in places]
+
+
+@fault(1, 2, -1, needs="frames")
+def late(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Shots by which all frames are late, in a ring."""
+    run.light = [run.light[(k - level) % len(run.light)] for k in range(len(run.light))]
+
+
+# -- Sensor
+
+
+def _spots(run: Run, rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
+    rows, columns = _grid(run)
+    spots = np.zeros(run.camera.pixels, bool)
+    for row, column in rng.uniform(0, 1, (count, 2)) * run.camera.pixels:
+        spots |= np.hypot(rows - row, columns - column) < radius
+    return spots
+
+
+@fault(0.05, 0.2, 0.6)
+def dust(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Light that five spots of dust take away."""
+    run.light = [light * (1 - level * spots) for spots in [_spots(run, rng, 5, 2.5)] for light in run.light]
+
+
+@fault(0.1, 0.4, 0.9)
+def hair(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Light that a hair across the sensor takes away."""
+    rows, columns = _grid(run)
+    angle, place = rng.uniform(0, np.pi), rng.uniform(0.3, 0.7, 2) * run.camera.pixels
+    distance = (rows - place[0]) * np.cos(angle) + (columns - place[1]) * np.sin(angle)
+    run.light = [light * (1 - level * (abs(distance) < 0.8)) for light in run.light]
+
+
+@fault(3, 20, 100)
+def hot_pixels(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Number of hot pixels."""
+    hot = np.zeros(run.camera.pixels)
+    hot.flat[rng.choice(hot.size, level, replace=False)] = rng.uniform(0.2, 1.0, level) * run.peak
+    run.light = [light + hot for light in run.light]
+
+
+@fault(0.02, 0.1, 0.5, needs="time")
+def hot_column(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Charge of a column from the middle of the run on, part of the peak."""
+    column = int(rng.integers(run.camera.pixels[1]))
+    for shot in range(len(run.light) // 2, len(run.light)):
+        run.light[shot] = run.light[shot] + level * run.peak * (_grid(run)[1] == column)
+
+
+@fault(1, 2, 4)
+def dead_row(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Number of rows without light."""
+    dead = rng.choice(run.camera.pixels[0], level, replace=False)
+    run.light = [light * ~np.isin(_grid(run)[0], dead) for light in run.light]
+
+
+@fault(0.15, 0.3, 0.5)
+def region(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Side of a region of the sensor that is shifted by a pixel, part of the sensor."""
+    sizes = [int(level * size) for size in run.camera.pixels]
+    at = [int(rng.integers(size - own + 1)) for size, own in zip(run.camera.pixels, sizes, strict=True)]
+    place = tuple(slice(first, first + own) for first, own in zip(at, sizes, strict=True))
+
+    def shifted(frame: np.ndarray) -> np.ndarray:
+        frame[place] = np.roll(frame[place], 1, axis=1)
+        return frame
+
+    _pixelwise(run, shifted)
+
+
+@fault("one", "half", "all")
+def dropped_line(run: Run, level: str, rng: np.random.Generator) -> set[int]:
+    """Frames that lost a line, so that all lines below moved up."""
+    count = len(run.light)
+    shots = {"one": set(_any(run, rng)), "half": set(range(count // 2, count)), "all": set(range(count))}[level]
+    line = int(rng.integers(run.camera.pixels[0] // 4, 3 * run.camera.pixels[0] // 4))
+    for shot in shots:
+        run.light[shot] = np.concatenate([np.delete(run.light[shot], line, axis=0), run.light[shot][-1:]])
+    return shots if level == "one" and count > 1 else set()
+
+
+@fault(0.002, 0.01, 0.05)
+def bands(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Amplitude of bands that add to rows, part of the peak."""
+    rows, period = _grid(run)[0], rng.uniform(6, 20)
+    phases = rng.uniform(0, 2 * np.pi, len(run.light))
+    waves = [level * run.peak * np.sin(2 * np.pi * rows / period + phase) for phase in phases]
+    run.after.append(
+        lambda frames: [
+            np.clip(np.rint(frame + run.camera.gain * wave), 0, 2**run.camera.bits - 1)
+            for frame, wave in zip(frames, waves, strict=True)
+        ]
+    )
+
+
+@fault(0.01, 0.05, 0.2)
+def row_flicker(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Amplitude of a lamp that flickers while rows are read, part of the light."""
+    rows, period = _grid(run)[0], run.camera.pixels[0] / rng.uniform(1.2, 3.0)
+    phases = rng.uniform(0, 2 * np.pi, len(run.light))
+    lights = zip(run.light, phases, strict=True)
+    run.light = [light * (1 + level * np.sin(2 * np.pi * rows / period + phase)) for light, phase in lights]
+
+
+@fault(0.8, 0.65, 0.5)
+def clipped(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Part of the peak from which numbers are clipped."""
+    top = np.rint(run.camera.black + run.camera.gain * (level * run.peak + run.camera.dark))
+    _pixelwise(run, lambda frame: np.minimum(frame, top))
+
+
+@fault(0.3, 0.7, 1.0)
+def denoised(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Weight of a median of 3 x 3 pixels."""
+    _pixelwise(run, lambda frame: np.rint((1 - level) * frame + level * median_filter(frame, 3)))
+
+
+@fault(0.4, 0.7, 1.5)
+def blurred(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Standard deviation of a blur of frames, in pixels."""
+    _pixelwise(run, lambda frame: np.rint(gaussian_filter(frame, level)))
+
+
+@fault(0.95, 0.8, 1 / 2.2)
+def gamma(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Power of the tone curve."""
+    black, span = run.camera.black, 2**run.camera.bits - 1 - run.camera.black
+    _pixelwise(run, lambda frame: np.rint(black + span * (np.maximum(frame - black, 0) / span) ** level))
+
+
+@fault(0.02, 0.1, 0.3)
+def nonlinear(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Light that the brightest pixel loses to the sensor's curve."""
+    run.light = [light * (1 - level * light / run.peak) for light in run.light]
+
+
+@fault(10, 8, 6)
+def bits(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Bits that are left of numbers, in their old range."""
+    step = 2 ** (run.camera.bits - level)
+    _pixelwise(run, lambda frame: np.floor(frame / step) * step)
+
+
+@fault(2, 4, 8)
+def aligned(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Factor of all numbers, clipped at 16 bits."""
+    _pixelwise(run, lambda frame: np.minimum(frame * level, 65535 // level * level))
+
+
+@fault(95, 75, 40)
+def jpeg(run: Run, level: int, rng: np.random.Generator) -> None:
+    """Quality of JPEG files of 8 bits from which the numbers are read back."""
+
+    def packed(frames: list[np.ndarray]) -> list[np.ndarray]:
+        scale = 255 / max(float(frame.max()) for frame in frames)
+        made = []
+        for frame in frames:
+            with tempfile.TemporaryFile() as file:
+                Image.fromarray(np.rint(frame * scale).astype(np.uint8)).save(file, "JPEG", quality=level)
+                file.seek(0)
+                made.append(np.rint(np.asarray(Image.open(file), float) / scale))
+        return made
+
+    run.after.append(packed)
+
+
+@fault(0.005, 0.02, 0.1)
+def smear(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Part of a column's mean light that each of its pixels gets."""
+    run.light = [light + level * light.mean(axis=0) for light in run.light]
+
+
+@fault("left-right", "up-down", "half turn")
+def turned(run: Run, level: str, rng: np.random.Generator) -> None:
+    """Mirrored or turned frames."""
+    turn = {"left-right": np.fliplr, "up-down": np.flipud}.get(level, lambda light: np.rot90(light, 2))
+    run.light = [np.ascontiguousarray(turn(light)) for light in run.light]
+
+
+@fault("transposed", "quarter turn", "other diagonal", needs="square")
+def transposed(run: Run, level: str, rng: np.random.Generator) -> None:
+    """Frames with rows and columns exchanged."""
+    turns = {"transposed": np.transpose, "quarter turn": np.rot90}
+    turn = turns.get(level, lambda light: np.rot90(light, 2).T)
+    run.light = [np.ascontiguousarray(turn(light)) for light in run.light]
+
+
+# -- Light and optics
+
+
+@fault(0.02, 0.1, 0.3)
+def ambient(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Even ambient light, part of the peak."""
+    run.light = [light + level * run.peak for light in run.light]
+
+
+@fault(0.01, 0.05, 0.2, needs="time")
+def ambient_growing(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Even ambient light at the end of the run, from none at its start, part of the peak."""
+    run.light = [light + level * run.peak * k / (len(run.light) - 1) for k, light in enumerate(run.light)]
+
+
+@fault(0.01, 0.05, 0.2)
+def ambient_tilted(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Ambient light that grows along the columns, part of the peak."""
+    slope = _grid(run)[1] / run.camera.pixels[1]
+    run.light = [light + level * run.peak * slope for light in run.light]
+
+
+@fault(0.02, 0.1, 0.3)
+def glare(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Part of its own mean light that each frame gets everywhere."""
+    run.light = [light + level * light.mean() for light in run.light]
+
+
+@fault(0.01, 0.05, 0.2, needs="frames")
+def leak(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Light of dark projector pixels, part of that of lit ones."""
+    lamps = (run.lamp(shot) for shot in range(len(run.light)))
+    run.light = [run.light_of(shot, lamp=lamp + level * (1 - lamp)) for shot, lamp in enumerate(lamps)]
+
+
+@fault(0.01, 0.03, 0.1)
+def depth(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Relative distance by which the scene is too far or too near."""
+    level *= rng.choice([-1, 1])
+    run.light = [run.light_of(shot, nearer=level) for shot in range(len(run.light))]
+
+
+@fault(0.01, 0.05, 0.2)
+def gloss(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Height of a smooth field over the sensor that multiplies all light."""
+    rows, columns = (grid / size for grid, size in zip(_grid(run), run.camera.pixels, strict=True))
+    row, column = rng.uniform(0.2, 0.8, 2)
+    bump = 1 + level * np.exp(-(np.square(rows - row) + np.square(columns - column)) / 0.08)
+    run.light = [light * bump for light in run.light]
+
+
+@fault(0.05, 0.25, 1.0)
+def another_mask(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Part of the mask's features that are drawn anew."""
+    run.light = [run.light_of(shot, flipped=level) for shot in range(len(run.light))]
+
+
+@fault(0.002, 0.01, 0.03)
+def mask_distance(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Relative change of the mask's distance since the calibration."""
+    run.light = [run.light_of(shot, mask=level) for shot in range(len(run.light))]
+
+
+@fault(0.1, 0.3, 1.0)
+def old_calibration(run: Run, level: float, rng: np.random.Generator) -> None:
+    """Sensor pixels that the mask moved since the calibration."""
+    run.light = [run.light_of(shot, moved=level) for shot in range(len(run.light))]
+
+
+# ---- Frames handed to mitsim -----------------------------------------------------------------------------------------
+
+FAMILIES = "repeats:2", "dots:4", "hadamard:4", "random:5"
+
+
+def write_frames(frames: list[np.ndarray], folder: Path) -> None:
+    """Write frames as numbered files."""
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(frames):
+        np.save(folder / f"f_{number:04d}.npy", frame.astype(np.uint16))
+
+
+class Judge:
+    """Calibrations of all cameras, and what mitsim reports of runs."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self.seed, self.count = folder, seed, 0
+        self.calibrations: dict[Camera, tuple[Path, Any]] = {}
+        self.twin = cache(self._twin)
+
+    def calibration(self, camera: Camera) -> tuple[Path, Any]:
+        """The CAL folder and factors of a session of a ``camera``, 2e4 electrons at its brightest pixel."""
+        if camera not in self.calibrations:
+            place = self.folder / f"camera{len(self.calibrations)}"
+            stripes, ones = stripe_signs(camera.n).astype(float), np.ones(camera.n)
+            left, right = camera.factor(0), camera.factor(1)
+            shown = [np.outer(column, ones) for column in stripes.T] + [np.outer(ones, column) for column in stripes.T]
+            light = [left @ ((1 + sign * pattern) / 2) @ right.T for pattern in shown for sign in (1, -1)]
+            exposure = 2e4 / max(float(each.max()) for each in light)
+            rng = np.random.default_rng([self.seed, camera.seed, 9])
+            write_frames([camera.numbers(exposure * each, rng) for each in light], place / "frames")
+            digital = {
+                "exposure_s": exposure,
+                "gain_dn_per_e": camera.gain,
+                "black_level_dn": camera.black,
+                "dark_current_e_per_s": camera.dark / exposure,
+                "read_noise_e": camera.read,
+                "step_dn": 1.0,
+                "saturation_dn": 2.0**camera.bits - 1,
+            }
+            listed = {"camera": "own", "n": camera.n, "signed_capture": "pair", "digital": digital}
+            (place / "frames" / "session.json").write_text(json.dumps(listed))
+            factors = ms.calibrate_frames(place / "frames", place / "cal")
+            if not factors.ok:
+                raise SystemExit(f"the calibration of camera {camera} is flagged, which hides faults: {factors.status}")
+            self.calibrations[camera] = place / "cal", factors
+        return self.calibrations[camera]
+
+    def report(self, run: Run) -> dict[str, Any]:
+        """What mitsim reports of a run, and its error."""
+        calibration, factors = self.calibration(run.camera)
+        self.count += 1
+        place, camera = self.folder / f"run{self.count}", run.camera
+        write_frames(run.frames(), place / "frames")
+        stated = {"gain": camera.gain, "black": camera.black, "read": camera.read, **run.stated}
+        (place / "camera.toml").write_text(
+            f'name = "own"\npixel_pitch_um = {1000 * SENSOR_MM / camera.pixels[0]}\nfull_well_e = 1e6\n'
+            f"read_noise_e = {stated['read']}\ndark_current_e_per_s = {camera.dark / run.exposure}\n"
+            f"quantum_efficiency = 0.7\ngain_dn_per_e = {stated['gain']}\nblack_level_dn = {stated['black']}\n"
+            f'bits = {camera.bits}\nshutter = "global"\nsource = "own"\n'
+        )
+        patterns = run.family
+        if not run.family.startswith(("dots", "hadamard", "uniform")):
+            patterns = str(place / "patterns.json")
+            shots = [{"row": i, "column": j, "sign": sign} for i, j, sign in run.shots]
+            sides = {"P_L": run.sides[0].tolist(), "P_R": run.sides[1].tolist()}
+            Path(patterns).write_text(json.dumps({"family": run.family, "n": camera.n, **sides, "shots": shots}))
+        try:
+            imported = ms.import_frames(
+                place / "frames",
+                place / "run",
+                patterns=patterns,
+                camera=str(place / "camera.toml"),
+                exposure=run.exposure,
+                calibration=str(calibration),
+            )
+            image = ms.reconstruct(ms.load_run(place / "run"), factors)
+        except ms.MitsimError as error:
+            return {"flagged": True, "refused": True, "misfit": True, "words": str(error), "named": []}
+        finally:
+            for file in sorted(place.rglob("*"), reverse=True):
+                file.rmdir() if file.is_dir() else file.unlink()
+        warnings, found = list(imported["warnings"]), image.misfit.summary() if image.misfit else {}
+        error = image.image - run.scene
+        known = image.uncertainty is not None
+        return {
+            "flagged": bool(warnings) or not image.ok,
+            "refused": False,
+            "misfit": bool(warnings) or bool(found.get("flagged")),
+            "warned": bool(warnings),
+            "words": "; ".join([*warnings, str(image.status), *image.trust]),
+            "chi_square": found.get("chi_square"),
+            "unexplained": found.get("unexplained"),
+            "cause": found.get("cause"),
+            "named": sorted({n for one in found.get("faults") or [] for n in one.get("numbers", [])}),
+            "stated": float(np.sqrt(np.mean(np.square(image.uncertainty)))) if known else None,
+            "error": float(np.sqrt(np.mean(np.square(error)))),
+            "inside": float(np.mean(np.abs(error) < 1.96 * image.uncertainty)) if known else None,
+            "lambda": image.lam,
+            "extrapolated": bool(known and image.uncertainties.extrapolated),
+        }
+
+    def _twin(self, camera: Camera, name: str, shown: str, peak: float, seed: int) -> dict[str, Any]:
+        return self.report(Run(camera, name, shown, peak, seed))
+
+    def judged(self, kind: str, severity: int, name: str, number: int, seed: int) -> dict[str, Any] | None:
+        """One run with a fault beside its twin; None where the family cannot have the fault."""
+        levels, lay, needs = FAULTS[kind]
+        alone = name == "uniform" or name.endswith(":1")
+        if (needs in ("frames", "time") and alone) or (needs == "frames" and name.startswith("repeats")):
+            return None
+        kind_number = list(FAULTS).index(kind)
+        case = base_case(kind_number + 17 * severity + 41 * number, name, seed, needs == "square")
+        begun = time.perf_counter()
+        run = Run(*case)
+        wrong = lay(run, levels[severity], np.random.default_rng([seed, kind_number, severity, number]))
+        found, twin = self.report(run), self.twin(*case)
+        return {
+            "kind": kind,
+            "severity": severity,
+            "level": levels[severity],
+            **described(case),
+            "run": number,
+            **found,
+            "wrong": sorted(wrong or ()),
+            "twin": {key: twin.get(key) for key in ("flagged", "misfit", "stated", "error", "inside", "chi_square")},
+            "verdict": verdict(found, twin),
+            "seconds": time.perf_counter() - begun,
+        }
+
+
+def base_case(index: int, name: str, seed: int, square: bool = False) -> tuple[Camera, str, str, float, int]:
+    """Camera, family, picture, peak and seed of a run, in combinations that differ by index."""
+    place = FAMILIES.index(name) if name in FAMILIES else 1
+    cameras = SQUARE if square else CAMERAS
+    shown = PICTURES[(index + 3 * place) % len(PICTURES)]
+    camera = cameras[(index // 2 + place) % len(cameras)]
+    peak = PEAKS[(index // 3 + 2 * place) % len(PEAKS)]
+    return camera, name, shown, peak, 1000 * seed + index % 40
+
+
+def described(case: tuple[Camera, str, str, float, int]) -> dict[str, Any]:
+    """The case as RESULT.json has it."""
+    camera, name, shown, peak, seed = case
+    return {"family": name, "camera": CAMERAS.index(camera), "picture": shown, "peak": peak, "seed": seed}
+
+
+def is_wrong(found: dict[str, Any], twin: dict[str, Any]) -> bool:
+    """Return True if an image is off by more than twice the uncertainty that it states."""
+    if found["refused"]:
+        return False
+    limit = found["stated"] if found["stated"] is not None else twin.get("error", np.inf)
+    return bool(found["error"] > 2 * limit)
+
+
+def verdict(found: dict[str, Any], twin: dict[str, Any]) -> str:
+    """Letter of a run in the table."""
+    if found["flagged"]:
+        return "F"
+    if not is_wrong(found, twin):
+        return "."
+    return "T" if is_wrong(twin, twin) else "S"
+
+
+# ---- Table -----------------------------------------------------------------------------------------------------------
+
+
+def key_of(one: dict[str, Any]) -> tuple[Any, ...]:
+    """What names a run across results."""
+    return one["kind"], one["severity"], one["family"], one["run"], one["seed"]
+
+
+def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[str]:
+    """Lines of the table, of the silent runs, and of the good runs."""
+    families = list(dict.fromkeys(one["family"] for one in rows))
+    if rows:
+        yield (
+            f"{'kind':16s}"
+            + "".join(f"{name:>14s}" for name in families)
+            + f"{'flagged':>12s}{'silent':>8s}{'named':>9s}"
+        )
+    for kind in (name for name in FAULTS if any(one["kind"] == name for one in rows)):
+        own = [one for one in rows if one["kind"] == kind]
+        letters = []
+        for name in families:
+            runs = sorted((one for one in own if one["family"] == name), key=lambda one: (one["severity"], one["run"]))
+            letters.append("".join(one["verdict"] for one in runs) or "-")
+        flagged, silent = (sum(one["verdict"] == letter for one in own) for letter in "FS")
+        framed = [one for one in own if one["wrong"] and one["flagged"] and not one["refused"]]
+        named = sum(set(one["wrong"]) <= set(one["named"]) for one in framed)
+        yield (
+            f"{kind:16s}"
+            + "".join(f"{each:>14s}" for each in letters)
+            + f"{flagged:>6d} of {len(own):<3d}{silent:>7d}"
+            + (f"{named:>6d}/{len(framed)}" if framed else "")
+        )
+    for name in (*families, "all"):
+        own = [one for one in rows if name in (one["family"], "all")]
+        count = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.ST"}
+        if own:
+            yield (
+                f"{name:16s} {len(own)} runs: {count['F']} flagged ({count['F'] / len(own):.1%}), {count['.']} not "
+                f"flagged and within twice the stated error, {count['S']} silent, {count['T']} silent like their twins"
+            )
+    for one in (one for one in rows if one["verdict"] in "ST"):
+        stated = "none" if one["stated"] is None else f"{one['stated']:.2g}"
+        yield (
+            f"{one['verdict']} {one['kind']} {one['level']} {case_text(one)} run {one['run']}: error {one['error']:.2g}"
+            f", stated {stated}{' (extrapolated)' if one['extrapolated'] else ''}, without the fault "
+            f"{one['twin']['error'] or np.nan:.2g}, chi-square {one['chi_square'] or np.nan:.3f}"
+        )
+    if good:
+        alarms = [one for one in good if one["misfit"]]
+        others = sum(one["flagged"] and not one["misfit"] for one in good)
+        solved = [one for one in good if not one["refused"] and one["stated"]]
+        ratios = np.array([one["error"] / one["stated"] for one in solved])
+        least, median, most = np.quantile(ratios, [0.05, 0.5, 0.95])
+        yield (
+            f"good runs: {len(alarms)} false alarms of {len(good)}; {others} flagged for other reasons; error over "
+            f"stated {least:.2f} {median:.2f} {most:.2f} {ratios.max():.2f} (5 %, median, 95 %, most)"
+        )
+        for one in alarms:
+            yield f"alarm {case_text(one)}: {one['words'][:300]}"
+        for one in (one for one in solved if one["error"] > 2 * one["stated"]):
+            yield f"beyond twice the stated error: {case_text(one)}: {one['error']:.2g}, stated {one['stated']:.2g}" + (
+                " (extrapolated)" if one["extrapolated"] else ""
+            )
+
+
+def case_text(one: dict[str, Any]) -> str:
+    """Name the case of a run."""
+    return f"{one['family']} {one['picture']} camera {one['camera']} peak {one['peak']:g} seed {one['seed']}"
+
+
+def compared(rows: list[dict[str, Any]], old: Path) -> Iterator[str]:
+    """Lines on runs that an ``old`` result flagged and that are not flagged now."""
+    before = {key_of(one): one for one in json.loads(old.read_text())["rows"]}
+    pairs = [(one, before[key_of(one)]) for one in rows if key_of(one) in before]
+    lost = [one for one, earlier in pairs if earlier["flagged"] and not one["flagged"]]
+    yield f"flagged in {old.name} and not now: {len(lost)} of {sum(earlier['flagged'] for _, earlier in pairs)}"
+    for one in lost:
+        within = "within" if one["verdict"] == "." else "beyond"
+        yield f"  {one['kind']} {one['level']} {one['family']} run {one['run']}: error {within} twice the stated one"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("result", type=Path)
+    parser.add_argument("--kinds", nargs="*", default=list(FAULTS), choices=list(FAULTS), metavar="KIND")
+    parser.add_argument("--families", nargs="+", default=FAMILIES)
+    parser.add_argument("--severities", nargs="+", type=int, default=(0, 1, 2))
+    parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--good", type=int, default=0, help="runs without a fault")
+    parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
+    parser.add_argument("--old", type=Path, help="earlier RESULT.json to compare with")
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    good: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        judge = Judge(Path(folder), options.seed)
+        for kind in options.kinds:
+            for name in options.families:
+                for severity in options.severities:
+                    for number in range(options.runs):
+                        if one := judge.judged(kind, severity, name, number, options.seed):
+                            rows.append(one)
+                            if one["verdict"] in "ST":
+                                print(json.dumps(one), flush=True)
+            options.result.write_text(json.dumps({"rows": rows, "good": good}, indent=1), encoding="utf-8")
+        for number in range(options.good):
+            name = options.families[number % len(options.families)]
+            case = base_case(number // len(options.families), name, options.seed + 500 + number)
+            good.append({**described(case), **judge.report(Run(*case))})
+            if good[-1]["misfit"]:
+                print(json.dumps(good[-1]), flush=True)
+    options.result.write_text(json.dumps({"rows": rows, "good": good}, indent=1), encoding="utf-8")
+    print("\n".join(table(rows, good)))
+    if options.old:
+        print("\n".join(compared(rows, options.old)))
+
+
+if __name__ == "__main__":
+    main()
