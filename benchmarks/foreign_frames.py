@@ -111,7 +111,7 @@ class Camera:
     def numbers(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Digital numbers of expected photoelectrons ``light``."""
         charge = rng.poisson(np.maximum(light, 0) + self.dark) + self.read * rng.standard_normal(light.shape)
-        return np.clip(np.rint(self.black + self.gain * charge), 0, 2**self.bits - 1)
+        return np.asarray(np.clip(np.rint(self.black + self.gain * charge), 0, 2**self.bits - 1))
 
 
 CAMERAS = (
@@ -134,21 +134,21 @@ def picture(name: str, n: int, seed: int) -> np.ndarray:
     y, x = np.mgrid[:n, :n] / n
     phase = rng.random(4)
     if name == "smooth":
-        return 0.5 + 0.3 * np.sin(2 * np.pi * (x + phase[0])) * np.cos(2 * np.pi * (1.3 * y + phase[1]))
+        return np.asarray(0.5 + 0.3 * np.sin(2 * np.pi * (x + phase[0])) * np.cos(2 * np.pi * (1.3 * y + phase[1])))
     if name == "noise":  # amplitude falls with frequency
         frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
         frequency[0, 0] = 1.0
         values = np.real(np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n))) / frequency))
-        return np.clip(0.5 + 0.18 * (values - values.mean()) / values.std(), 0.02, 1.0)
+        return np.asarray(np.clip(0.5 + 0.18 * (values - values.mean()) / values.std(), 0.02, 1.0))
     if name == "even":
         return np.full((n, n), 0.3 + 0.6 * phase[0])
     if name == "random":
         return rng.random((n, n))
     if name == "stripes":
-        return 0.5 + 0.4 * np.sign(np.sin(2 * np.pi * (x * (3 + 5 * phase[0]) + y * 4 * phase[1] + phase[2])))
+        bars = np.sin(2 * np.pi * (x * (3 + 5 * phase[0]) + y * 4 * phase[1] + phase[2]))
+        return np.asarray(0.5 + 0.4 * np.sign(bars))
     if name == "checkers":
-        size = int(rng.integers(1, 5))
-        return 0.15 + 0.7 * ((np.indices((n, n)) // size).sum(axis=0) % 2)
+        return np.asarray(0.15 + 0.7 * ((np.indices((n, n)) // rng.integers(1, 5)).sum(axis=0) % 2))
     if name == "stars":
         values = np.full((n, n), 0.02)
         values[tuple(rng.integers(0, n, (2, n)))] = rng.uniform(0.2, 1.0, n)
@@ -636,16 +636,15 @@ def smear(run: Run, level: float, rng: np.random.Generator) -> None:
 @fault("left-right", "up-down", "half turn")
 def turned(run: Run, level: str, rng: np.random.Generator) -> None:
     """Mirrored or turned frames."""
-    turn = {"left-right": np.fliplr, "up-down": np.flipud}.get(level, lambda light: np.rot90(light, 2))
-    run.light = [np.ascontiguousarray(turn(light)) for light in run.light]
+    steps = {"left-right": (1, -1), "up-down": (-1, 1), "half turn": (-1, -1)}[level]
+    run.light = [light[:: steps[0], :: steps[1]].copy() for light in run.light]
 
 
 @fault("transposed", "quarter turn", "other diagonal", needs="square")
 def transposed(run: Run, level: str, rng: np.random.Generator) -> None:
     """Frames with rows and columns exchanged."""
-    turns = {"transposed": np.transpose, "quarter turn": np.rot90}
-    turn = turns.get(level, lambda light: np.rot90(light, 2).T)
-    run.light = [np.ascontiguousarray(turn(light)) for light in run.light]
+    steps = {"transposed": (1, 1), "quarter turn": (-1, 1), "other diagonal": (-1, -1)}[level]
+    run.light = [light.T[:: steps[0], :: steps[1]].copy() for light in run.light]
 
 
 # -- Light and optics
@@ -800,8 +799,7 @@ class Judge:
             for file in sorted(place.rglob("*"), reverse=True):
                 file.rmdir() if file.is_dir() else file.unlink()
         warnings, found = list(imported["warnings"]), image.misfit.summary() if image.misfit else {}
-        error = image.image - run.scene
-        known = image.uncertainty is not None
+        difference, known = image.image - run.scene, image.uncertainties
         return {
             "flagged": bool(warnings) or not image.ok,
             "refused": False,
@@ -811,12 +809,12 @@ class Judge:
             "chi_square": found.get("chi_square"),
             "unexplained": found.get("unexplained"),
             "cause": found.get("cause"),
-            "named": sorted({n for one in found.get("faults") or [] for n in one.get("numbers", [])}),
-            "stated": float(np.sqrt(np.mean(np.square(image.uncertainty)))) if known else None,
-            "error": float(np.sqrt(np.mean(np.square(error)))),
-            "inside": float(np.mean(np.abs(error) < 1.96 * image.uncertainty)) if known else None,
+            "named": sorted({n for one in found.get("faults") or [] for n in one.get("frames", one.get("numbers"))}),
+            "stated": float(np.sqrt(np.mean(np.square(known.total)))) if known else None,
+            "error": float(np.sqrt(np.mean(np.square(difference)))),
+            "inside": float(np.mean(np.abs(difference) < 1.96 * known.total)) if known else None,
             "lambda": image.lam,
-            "extrapolated": bool(known and image.uncertainties.extrapolated),
+            "extrapolated": bool(known and known.extrapolated),
         }
 
     def _twin(self, camera: Camera, name: str, shown: str, peak: float, seed: int) -> dict[str, Any]:

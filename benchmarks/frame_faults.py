@@ -1,16 +1,25 @@
-"""How often frames that are not what they say are named, and how often fitting runs are: by fault, family and light.
+"""Count how often faulty frames are flagged, with the true frames among those named, and how often good runs are.
 
     python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--seed 0] [--sizes 64 128] [--peaks ...]
+        [--old OLD.json]
 
-Runs are of the tests' ideal cameras (tests/ideal_sessions.py): frames of the paper's model with drawn noise, before
-masks of several kinds, of prints that are shipped and of some drawn here. Each round lays one fault of every kind into
-a run of every family, at every size and light level: its frame, place and strength are drawn. A fault counts as named
-where it alone is, with the right frames. One that nothing says counts as missed where it does harm: where the image is
-further from the true one than without the fault, by more than 5 %. "harmless" has the others that nothing says.
-Faults that change nothing, as two frames that are alike exchanged, are no runs. Fitting runs are those without a fault,
-glossy scenes among them, whose misfit may be flagged, but no frame, order or orientation blamed. RESULT.json holds each
-run that went wrong, and rates with their 95 % intervals (Wilson). 4 rounds and 240 fitting runs take 25 minutes on a
-core.
+The runs are of the ideal cameras of the tests (tests/ideal_sessions.py): frames of the paper's model with drawn noise,
+with three kinds of masks and pictures that are shipped or drawn here. Each round lays one fault of every kind into a
+run of every family, at every size and light level. The frame, the place and the strength of the fault are drawn. A run
+is judged by its outcome, not by the name of a cause:
+
+- *flagged*: it is refused, or its image is flagged. Pixels that are wrong in all frames may also be left out: the run
+  counts as flagged where `misfit.summary()` lists such pixels.
+- *named*: of flagged runs whose fault is in some frames, those whose frames are all among the frames that
+  `misfit.summary()["faults"]` lists. A refusal names its frames in words and is not counted here.
+- *missed*: it is not flagged, and the image is further from the true one than without the fault by more than 5 %.
+- *harmless*: it is not flagged, and the image is not.
+
+Faults that change nothing, for example an exchange of two frames that are alike, are no runs. Good runs have no fault.
+A false alarm is a good run that is flagged because of its frames; of glossy scenes, whose misfit may be flagged, one
+that lists frames or pixels, or another reading of its frames. RESULT.json holds all runs, the runs that went wrong and
+the rates with their 95 % intervals (Wilson). ``--old`` lists the runs that an earlier RESULT.json has as flagged and
+that are not flagged now. 4 rounds and 240 good runs take 25 minutes on a core.
 """
 
 from __future__ import annotations
@@ -34,7 +43,6 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 
@@ -52,10 +60,9 @@ SCENES = *PRINTS, "text", "shades", "stars", "highlight", "glossy"
 GLOSSY = "highlight", "glossy"
 MASKS = "mls", "coded", "flatcam"
 HARMLESS = 1.05
-"""Times the image error of the run without the fault, up to which a fault that nothing says does no harm, and counts
-neither as named nor as missed: what is invisible in the image as well as in the residual is no wrong image."""
+"""Image error over that of the run without the fault, up to which a fault that is not flagged does no harm."""
 SINGLE = "repeated", "swapped", "late", "dim"
-"""Faults that the only frame of a run cannot have, or that nothing tells: half the light is half the exposure."""
+"""Faults that the only frame of a run cannot have, or that no data can show: half the light is half the exposure."""
 Frames = list[np.ndarray]
 
 
@@ -76,7 +83,7 @@ class FlatCam(Bench):
 
 @cache
 def camera(mask: str, n: int, other: bool = False) -> Bench:
-    """A camera of so many scene pixels; ``other``: one of another mask feature."""
+    """Return a camera of so many scene pixels; ``other``: one of another mask feature."""
     sensor = centred_edges(PIXELS[n], 6.0 / PIXELS[n])
     code = mls_mask().terms[0][1]
     if mask == "coded":
@@ -98,7 +105,7 @@ def camera(mask: str, n: int, other: bool = False) -> Bench:
 
 @cache
 def scene(name: str, n: int, seed: int) -> np.ndarray:
-    """(n, n) reflectances."""
+    """Return (n, n) reflectances."""
     rng = np.random.default_rng([seed, n])
     if name in PRINTS:
         values = io.imread(ROOT / "scenes" / name / "reflectance.png").astype(np.float64)
@@ -125,7 +132,7 @@ def scene(name: str, n: int, seed: int) -> np.ndarray:
 
 
 def run_of(mask: str, name: str, family: str, n: int, peak: float, seed: int) -> tuple[Capture, Factors]:
-    """A fitting run, and factors of its camera."""
+    """Return a good run, and the factors of its camera."""
     bench = replace(camera(mask, n), peak=peak)
     if name in GLOSSY:
         place = np.linspace(-1, 1, PIXELS[n])
@@ -146,7 +153,7 @@ def _one(change: Callable[[Frames, np.ndarray, np.random.Generator], np.ndarray]
 
 
 def dark(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Numbers of a frame without light."""
+    """Return the numbers of a frame without light."""
     return np.asarray(BLACK + GAIN * (rng.poisson(DARK, shape) + READ * rng.standard_normal(shape)))
 
 
@@ -226,11 +233,14 @@ FAULTS: dict[str, Any] = {
     "scale": aligned,
     "rig": lambda frames, rng, lit: (frames, set()),
 }
-CAUSES = {"orientation": Cause.ORIENTATION, "late": Cause.ORDER, "gamma": Cause.GAMMA, "scale": Cause.SCALE}
+IN_FRAMES = "black", "dim", "half_lost", "shifted", "clipped", "repeated", "swapped"
+"""Faults of single frames, which have to be named."""
+RIGHT = "flagged", "named"
+"""Outcomes of runs whose fault is reported."""
 
 
 def changed(shots: Capture, frames: Frames, codes: float = CODES) -> Capture:
-    """The capture with other frames."""
+    """Return the capture with other frames."""
     files = [shot.file for shot in shots.manifest.patterns.captures]
     numbers = [np.clip(np.rint(frame), 0, codes - 1).astype(np.uint32) for frame in frames]
     digital = shots.manifest.digital.model_copy(update={"saturation_dn": float(codes - 1)})
@@ -239,78 +249,69 @@ def changed(shots: Capture, frames: Frames, codes: float = CODES) -> Capture:
 
 
 def verdict(shots: Capture, factors: Factors, true: np.ndarray) -> dict[str, Any]:
-    """What an image says of its frames, and its error against the ``true`` one."""
+    """Return what an image reports of its frames, and its error against the ``true`` one."""
     try:
         found = reconstruct(shots, factors)
     except MitsimError as error:
-        return {"refused": str(error)}
-    misfit = found.misfit
-    assert misfit is not None
+        return {"refused": str(error), "flagged": True, "named": []}
+    misfit = found.misfit.summary() if found.misfit else {}
+    faults = misfit.get("faults") or []
     return {
-        "ok": found.ok,
-        "cause": misfit.cause.name if misfit.cause else None,
-        "faults": [[fault.fault.name.lower(), sorted(fault.numbers)] for fault in misfit.faults],
-        "defects": misfit.defects.places[:4] if misfit.defects else [],
-        "chi_square": misfit.chi_square,
-        "unexplained": misfit.unexplained,
-        "words": str(found.status),
+        "flagged": not found.ok,
+        "misfit": bool(misfit.get("flagged")),
+        "named": sorted({number for fault in faults for number in fault.get("frames", fault.get("numbers"))}),
+        "pixels": bool(misfit.get("defective_pixels")),
+        "readings": bool(misfit.get("reading") or misfit.get("readings")),
+        "cause": misfit.get("cause"),
+        "chi_square": misfit.get("chi_square"),
+        "unexplained": misfit.get("unexplained"),
+        "words": f"{found.status} {'; '.join(found.trust)}",
         "error": float(np.linalg.norm(found.image - true) / np.linalg.norm(true)),
     }
 
 
-def is_named(fault: str, numbers: set[int], reported: dict[str, Any]) -> bool:
-    """Whether what is ``reported`` is this ``fault`` of the shots of these ``numbers``."""
-    if "refused" in reported:
-        return fault == "black"
-    if fault in CAUSES:
-        return bool(reported["cause"] == CAUSES[fault].name)
-    if fault == "rig":
-        return bool(reported["cause"] == Cause.RIG.name)
-    if fault == "repeated":  # of two frames that are one, it need not be clear which is the other
-        return (
-            len(reported["faults"]) == 1
-            and reported["faults"][0][0] == fault
-            and numbers <= set(reported["faults"][0][1])
-        )
-    if fault == "dead":
-        return len(reported["defects"]) == 1 and set(reported["defects"][0]) == numbers
-    return bool(reported["faults"] == [[fault, sorted(numbers)]])
+def outcome(fault: str, numbers: set[int], reported: dict[str, Any]) -> str:
+    """Return ``flagged``, ``named`` (flagged, with the frames of these ``numbers``), or an empty text."""
+    if not (reported["flagged"] or (fault == "dead" and reported["pixels"])):
+        return ""
+    # Of two frames that are one, it need not be clear which is the other.
+    if fault in IN_FRAMES and numbers <= set(reported["named"]):
+        return "named"
+    return "flagged"
 
 
 def faulty(
     fault: str, mask: str, name: str, family: str, n: int, peak: float, seed: int
-) -> tuple[bool | None, dict[str, Any]]:
-    """Whether a fault that was laid into a run is named, None where it changes nothing; and what is said of it."""
+) -> tuple[str, dict[str, Any]] | None:
+    """Return the outcome of a run with a fault and what is reported of it; None where the fault changes nothing."""
     shots, factors = run_of(mask, name, family, n, peak, seed)
     frames = [np.asarray(each, dtype=np.float64) for each in shots.dn]
     means = np.array([frame.mean() for frame in frames]) - BLACK - GAIN * DARK
     laid, numbers = FAULTS[fault](frames, np.random.default_rng([seed, 3]), means > 0.2 * means.max())
     if fault == "swapped" and _alike(*(frames[number] for number in sorted(numbers))):
-        return None, {}
+        return None
     if fault == "dead" and "hadamard" in family and _is_still(frames, laid):
-        return None, {}
+        return None
     if fault == "rig":
         factors = replace(camera(mask, n, other=True)).calibrated(seed)
     true = scene(name, n, seed)
     reported = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors, true)
-    right: bool | None = is_named(fault, numbers, reported)
-    if fault == "dead" and right and not reported["ok"]:  # left out, it is no reason for a flag
-        right = not verdict(shots, factors, true)["ok"]
-    if not right and reported.get("ok"):
-        reported["harm"] = reported["error"] / verdict(shots, factors, true)["error"]
-        right = None if reported["harm"] < HARMLESS else False
-    return right, {**reported, "laid": sorted(numbers)}
+    found = outcome(fault, numbers, reported)
+    if not found:
+        reported["harm"] = reported["error"] / verdict(shots, factors, true).get("error", np.inf)
+        found = "harmless" if reported["harm"] < HARMLESS else "missed"
+    return found, {**reported, "laid": sorted(numbers)}
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two frames differ by no more than noise: exchanged they are right."""
+    """Return True if two frames differ by no more than noise, so that exchanging them changes nothing."""
     electrons = np.maximum((one + other - 2 * BLACK) / GAIN, 0)
     noise = GAIN**2 * (electrons + 2 * READ**2) + 1 / 6
     return bool(np.square(one - other).sum() < noise.sum() * (1 + 30 * np.sqrt(2 / one.size)))
 
 
 def _is_still(frames: Frames, laid: Frames) -> bool:
-    """Whether differences of pairs show nothing at a pixel that is still: it is right as it is."""
+    """Return True if the differences of pairs show nothing at the pixel that does not change."""
     row, column = np.argwhere(laid[0] != frames[0])[0] if (laid[0] != frames[0]).any() else (0, 0)
     light = np.array([frame[row, column] for frame in frames]) - BLACK
     noise = 2 * GAIN**2 * (max(light.mean() / GAIN, 0) + READ**2) + 1 / 6
@@ -319,7 +320,7 @@ def _is_still(frames: Frames, laid: Frames) -> bool:
 
 
 def interval(right: int, of: int) -> list[float]:
-    """A rate, and its 95 % interval after Wilson (1927)."""
+    """Return a rate and its 95 % interval after Wilson (1927)."""
     z, rate = 1.96, right / of
     middle, half = rate + z * z / 2 / of, z * np.sqrt(rate * (1 - rate) / of + z * z / 4 / of**2)
     return [float(value) for value in (rate, (middle - half) / (1 + z * z / of), (middle + half) / (1 + z * z / of))]
@@ -329,15 +330,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("result", type=Path)
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--fitting", type=int, default=240)
+    parser.add_argument("--fitting", type=int, default=240, help="runs without a fault")
     parser.add_argument("--sizes", nargs="+", type=int, default=tuple(PIXELS))
     parser.add_argument("--peaks", nargs="+", type=float, default=PEAKS)
     parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
     parser.add_argument("--faults", nargs="+", default=tuple(FAULTS))
     parser.add_argument("--families", nargs="+", default=FAMILIES)
+    parser.add_argument("--old", type=Path, help="earlier RESULT.json to compare with")
     options = parser.parse_args()
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-    wrong: list[dict[str, Any]] = []
+    runs: list[dict[str, Any]] = []
+
+    def count(key: str, right: bool) -> None:
+        counts[key][0] += right
+        counts[key][1] += 1
+
     plain = [name for name in SCENES if name not in GLOSSY]
     cases = product(range(options.rounds), options.sizes, options.peaks, options.families, options.faults)
     for number, (turn, n, peak, family, fault) in enumerate(cases):
@@ -348,45 +355,53 @@ def main() -> None:
             plain[number % len(plain)],
             options.seed + 100 * turn + number % 97,
         )
-        right, reported = faulty(fault, mask, name, family, n, peak, seed)
-        if reported:
-            counts["harmless"][0] += right is None
-            counts["harmless"][1] += 1
-        if right is None:
+        judged = faulty(fault, mask, name, family, n, peak, seed)
+        if judged is None:
+            continue
+        found, reported = judged
+        runs.append({"fault": fault, "case": [mask, name, family, n, peak, seed], "outcome": found, **reported})
+        count("harmless", found == "harmless")
+        if found == "harmless":
             continue
         for key in (f"fault {fault}", f"family {family}", f"pixels {n}", f"peak {peak:g}", "all"):
-            counts[key][0] += right
-            counts[key][1] += 1
-        if not right:
-            wrong.append({"fault": fault, "case": [mask, name, family, n, peak, seed], **reported})
-            print(json.dumps(wrong[-1]), flush=True)
-    alarms = 0
+            count(f"{key} flagged", found != "missed")
+        if fault in IN_FRAMES and found != "missed" and "refused" not in reported:
+            count(f"fault {fault} named", found == "named")
+            count("all named", found == "named")
+        if found == "missed":
+            print(json.dumps(runs[-1]), flush=True)
     for number in range(options.fitting):
         family, name = options.families[number % len(options.families)], SCENES[number % len(SCENES)]
         seed = options.seed + 5000 + number
         mask, n = MASKS[number // 5 % len(MASKS)], options.sizes[number // 7 % len(options.sizes)]
         peak = options.peaks[number // 3 % len(options.peaks)]
         reported = verdict(*run_of(mask, name, family, n, peak, seed), scene(name, n, seed))
-        blamed = {Cause.FRAMES, *CAUSES.values(), Cause.RIG}
-        alarm = bool(reported["faults"] or reported["defects"] or reported["cause"] in {cause.name for cause in blamed})
-        alarm |= bool(reported["cause"]) and name not in GLOSSY
-        alarms += alarm
+        alarm = "refused" in reported or bool(reported["named"] or reported["pixels"] or reported["readings"])
+        alarm |= bool(reported.get("misfit")) and name not in GLOSSY
+        count("false alarms", alarm)
+        outcome_of_good = "alarm" if alarm else "good"
+        runs.append(
+            {"fault": None, "case": [mask, name, family, n, peak, seed], "outcome": outcome_of_good, **reported}
+        )
         if alarm:
-            wrong.append({"fault": None, "case": [mask, name, family, n, peak, seed], **reported})
-            print(json.dumps(wrong[-1]), flush=True)
+            print(json.dumps(runs[-1]), flush=True)
     rates: dict[str, dict[str, Any]] = {
-        key: {"named": right, "of": of, "rate": interval(right, of)} for key, (right, of) in counts.items()
+        key: {"right": right, "of": of, "rate": interval(right, of)} for key, (right, of) in sorted(counts.items())
     }
-    if options.fitting:
-        rates["false alarms"] = {
-            "named": alarms,
-            "of": options.fitting,
-            "rate": interval(alarms, options.fitting),
-        }
-    options.result.write_text(json.dumps({"rates": rates, "wrong": wrong}, indent=1), encoding="utf-8")
+    wrong = [run for run in runs if run["outcome"] in ("missed", "alarm")]
+    result = {"rates": rates, "wrong": wrong, "runs": runs}
+    options.result.write_text(json.dumps(result, indent=1), encoding="utf-8")
     for key, one in rates.items():
         rate, low, high = one["rate"]
-        print(f"{key:24s} {one['named']:4d} of {one['of']:4d}: {rate:.1%} ({low:.1%} to {high:.1%})", flush=True)
+        print(f"{key:28s} {one['right']:4d} of {one['of']:4d}: {rate:.1%} ({low:.1%} to {high:.1%})", flush=True)
+    if options.old:
+        before = {(run["fault"], *run["case"]): run for run in json.loads(options.old.read_text())["runs"]}
+        pairs = [(run, before.get((run["fault"], *run["case"]))) for run in runs if run["fault"]]
+        known = [(run, old) for run, old in pairs if old]
+        lost = [run for run, old in known if old["outcome"] in RIGHT and run["outcome"] not in RIGHT]
+        print(f"flagged before and not now: {len(lost)} of {sum(old['outcome'] in RIGHT for _, old in known)}")
+        for run in lost:
+            print(f"  {run['outcome']}: {run['fault']} {run['case']}")
 
 
 if __name__ == "__main__":
