@@ -12,8 +12,10 @@ Each run has one fault. Its twin is the same run without the fault, with the sam
 
 - ``F`` flagged: refused, or flagged by the import or by the image;
 - ``.`` not flagged, and the rms error against the truth is at most twice the stated rms uncertainty;
-- ``S`` silent: not flagged, and the error is more than twice the stated one, although the twin's is not;
-- ``T`` the same, but the error of the twin is more than twice the stated one, too.
+- ``S`` silent: not flagged, the error is more than twice the stated one, and the fault adds to it: it is more than 1.2
+  times that of the twin;
+- ``T`` not flagged, the error is more than twice the stated one, and that of the twin is as large: the uncertainty is
+  too small for other reasons than the fault.
 
 An image that states no uncertainty counts as silent where its error is more than twice that of its twin.
 ``--good`` adds runs without a fault. Their false alarms are refusals, warnings of the import, and flags of the misfit;
@@ -123,7 +125,7 @@ CAMERAS = (
     Camera(28, (80, 72), 6, dark=80.0, baseline_mm=-15.0),
 )
 SQUARE = CAMERAS[2], CAMERAS[4]
-PEAKS = 2e4, 3e3, 600.0, 150.0, 50.0
+PEAKS = 2e4, 8e3, 2e3, 300.0, 50.0
 """Photoelectrons of the brightest pixel."""
 PICTURES = "smooth", "leaves", "text", "noise", "blocks", "even", "stars", "random", "stripes", "checkers"
 
@@ -841,6 +843,7 @@ class Judge:
             **found,
             "wrong": sorted(wrong or ()),
             "twin": {key: twin.get(key) for key in ("flagged", "misfit", "stated", "error", "inside", "chi_square")},
+            "harmful": all(is_harmed(found, twin)),
             "verdict": verdict(found, twin),
             "seconds": time.perf_counter() - begun,
         }
@@ -862,21 +865,27 @@ def described(case: tuple[Camera, str, str, float, int]) -> dict[str, Any]:
     return {"family": name, "camera": CAMERAS.index(camera), "picture": shown, "peak": peak, "seed": seed}
 
 
-def is_wrong(found: dict[str, Any], twin: dict[str, Any]) -> bool:
-    """Return True if an image is off by more than twice the uncertainty that it states."""
+ADDED = 1.2
+"""Error over that of the twin from which the fault, and not the noise or lambda, counts as its cause."""
+
+
+def is_harmed(found: dict[str, Any], twin: dict[str, Any]) -> tuple[bool, bool]:
+    """Return whether an image is off by more than twice what it states, and whether the fault adds to its error."""
     if found["refused"]:
-        return False
-    limit = found["stated"] if found["stated"] is not None else twin.get("error", np.inf)
-    return bool(found["error"] > 2 * limit)
+        return False, False
+    alone = twin.get("error", np.inf)
+    limit = alone if found["stated"] is None else found["stated"]
+    return bool(found["error"] > 2 * limit), bool(found["error"] > ADDED * alone)
 
 
 def verdict(found: dict[str, Any], twin: dict[str, Any]) -> str:
     """Letter of a run in the table."""
     if found["flagged"]:
         return "F"
-    if not is_wrong(found, twin):
+    beyond, added = is_harmed(found, twin)
+    if not beyond:
         return "."
-    return "T" if is_wrong(twin, twin) else "S"
+    return "S" if added else "T"
 
 
 # ---- Table -----------------------------------------------------------------------------------------------------------
@@ -915,9 +924,11 @@ def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[st
         own = [one for one in rows if name in (one["family"], "all")]
         count = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.ST"}
         if own:
+            harmful = [one for one in own if one["harmful"]]
             yield (
                 f"{name:16s} {len(own)} runs: {count['F']} flagged ({count['F'] / len(own):.1%}), {count['.']} not "
-                f"flagged and within twice the stated error, {count['S']} silent, {count['T']} silent like their twins"
+                f"flagged and within twice the stated error, {count['S']} silent, {count['T']} off like their twins; "
+                f"{sum(one['flagged'] for one in harmful)} of {len(harmful)} harmful ones are flagged"
             )
     for one in (one for one in rows if one["verdict"] in "ST"):
         stated = "none" if one["stated"] is None else f"{one['stated']:.2g}"
