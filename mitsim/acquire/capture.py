@@ -22,6 +22,7 @@ from mitsim.acquire.exposure import (
     Totals,
     ambient_shots,
     camera_warnings,
+    frame_channels,
     takes_ambient_frame,
 )
 from mitsim.acquire.spectral import SpectralBench
@@ -32,12 +33,12 @@ from mitsim.core.errors import ArgumentError, check_arguments, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import Patterns, RunHead, RunManifest
+from mitsim.core.manifests import ClosingFile, Patterns, RunHead, RunManifest
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.recorders import AMBIENT, Recorder, claim_run, frame_name
+from mitsim.core.recorders import AMBIENT, CLOSING, Recorder, claim_run, frame_name
 from mitsim.core.runs import Capture, LineTruth, MosaicCapture
 from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
-from mitsim.devices.patterns import Lighting
+from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, trace_light, trace_lines
@@ -46,6 +47,7 @@ from mitsim.light.memory import first_shadow, frame_seconds, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
+from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.explain import known_losses
 
 _FIREFLIES = 0.72
@@ -340,6 +342,7 @@ def _run(
         recorder.write(AMBIENT, channels, {"shots": ambient.shots, "exposure_s": exposure_s, "seed": request.seed})
     shooting = Shooting(family, recorder, exposer, ambient, exposer.electrons(expected.projector_off))
     shooting.shoot(expected, job)
+    closing = _close(light, family, expected, request, exposer, recorder)
     total = light.plan.total(totals.noise)
     manifest = RunManifest(
         configuration=head.configuration,
@@ -348,6 +351,7 @@ def _run(
         digital=digital_of(bench.sensor, exposure_s),
         patterns=patterns,
         ambient_frame=shooting.ambient_file,
+        closing_frame=closing,
         plan=plan.block(),
         mc_error=totals.mc_error,
         total_error=total.value,
@@ -372,6 +376,37 @@ def _run(
     if foreign and not manifest.warnings:  # within the accuracy: said, but no reason to flag the run
         warnings.warn(foreign, stacklevel=5)
     return Capture.from_recorder(recorder, manifest)
+
+
+def _close(
+    light: SampledLight,
+    family: PatternFamily,
+    expected: ExpectedFrames,
+    request: Request,
+    exposer: Exposer,
+    recorder: Recorder,
+) -> ClosingFile | None:
+    """Record the closing frame of a run, if the ``request`` has one, and return what the manifest states of it.
+
+    The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time where
+    it would otherwise be brighter than frames of an automatic exposure.
+    """
+    if request.closing_frame is None:
+        return None
+    names: tuple[str | int, ...] = ("closing",)
+    if request.closing_frame == "first":
+        frame, names = next(iter(expected)), family.shots[0].names
+    else:
+        lit = Lighting(family.lighting.labels, np.ones_like(family.lighting.weights[:1]))
+        (frame,) = light.frames(lit, request.seed)
+        peak, seconds = float(frame.irradiance.max()), exposer.exposure_s
+        if np.isfinite(exposer.devices.sensor.full_well_e) and peak > 0:
+            seconds = min(seconds, replace(request.timing, seconds=None).choose(exposer.devices, peak))
+        exposer = replace(exposer, exposure_s=seconds, speckle=light.speckle())
+    electrons = exposer.shot_electrons(frame, *names)
+    channels = frame_channels(exposer.digital(electrons, "closing"), electrons)
+    recorder.write(CLOSING, channels, {"exposure_s": exposer.exposure_s, "seed": request.seed})
+    return ClosingFile(kind=request.closing_frame, file=CLOSING, exposure_s=exposer.exposure_s)
 
 
 @contextmanager

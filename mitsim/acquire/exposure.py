@@ -452,8 +452,12 @@ class Shooting:
             "rendering_noise_e": exposed.rendering_noise,
             "seed": self.exposer.seed,
         }
-        electrons = exposed.electrons.astype(np.float32)
-        # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
-        whole = exposed.digital.dtype == np.uint32
-        dn: Channel = exposed.digital.astype(np.uint32, copy=False) if whole else exposed.digital.astype(np.float32)
-        self.recorder.write_frame(exposed.index, {"DN": dn, "electrons": electrons}, metadata)
+        self.recorder.write_frame(exposed.index, frame_channels(exposed.digital, exposed.electrons), metadata)
+
+
+def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:
+    """Return the channels of a frame's file, from its ``digital`` numbers and expected ``electrons``."""
+    # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
+    whole = digital.dtype == np.uint32
+    dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)
+    return {"DN": dn, "electrons": electrons.astype(np.float32)}

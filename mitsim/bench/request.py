@@ -222,6 +222,9 @@ class Request(BaseModel):
     ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = Field(
         None, description="shots of that frame; None: by the patterns"
     )
+    closing_frame: Literal["first", "uniform"] | None = Field(
+        None, description="frame at the end that checks lamp, camera and scene: the first one again, or a uniform one"
+    )
 
     def __init__(self, **values: Any) -> None:
         """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
@@ -251,7 +254,9 @@ class Request(BaseModel):
     @property
     def deciding(self) -> dict[str, Any]:
         """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
-        return self.model_dump(mode="json", exclude={"accuracy" if self.seconds is not None else "seconds"})
+        unused = {"accuracy" if self.seconds is not None else "seconds"}
+        # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
+        return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
 
     @field_validator("ambient_frame", mode="before")
     @classmethod

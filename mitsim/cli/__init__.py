@@ -282,6 +282,11 @@ class Capturing(Sampling):
     )
     ambient_frame: str = option("auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no")
     ambient_shots: int | None = option(None, "shots of that frame; by the patterns if not given", metavar="N")
+    closing_frame: str | None = option(
+        None,
+        "frame at the end that checks lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+    )
 
 
 @dataclass(frozen=True)
@@ -449,6 +454,8 @@ def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
             f"{taken['total']:.1f}: accuracy {payload['accuracy']:g}, total error up to "
             f"{payload['total_error_bound']:.1e}"
         )
+    if closing := payload["closing_frame"]:
+        lines.append(f"Closing frame: {closing['kind']}, exposed for {closing['exposure_s']:.3g} s")
     return [*lines, *_ambient_lines(payload)]
 
 

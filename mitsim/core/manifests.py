@@ -281,6 +281,21 @@ class AmbientFile(_Part):
     """Noise of the frames less the ambient frame, over the projector's light; closed form."""
 
 
+ClosingKind = Literal["first", "uniform"]
+"""Light of a closing frame: the first shot again, or all projector pixels at full power."""
+
+
+class ClosingFile(_Part):
+    """The closing frame, which is taken after all others to check that lamp, camera and scene stayed the same."""
+
+    kind: ClosingKind
+    """`first`: the first shot again; `uniform`: all projector pixels at full power."""
+    file: FileName
+    """Name of the frame in the run's folder, without a path."""
+    exposure_s: Positive
+    """Exposure of this frame [s]; shorter than the run's where a uniform frame would saturate."""
+
+
 class RunHead(_Head):
     """What an unfinished run's manifest says, and a finished one's begins with."""
 
@@ -307,6 +322,10 @@ class RunManifest(RunHead):
     """What was projected, and in which file it is seen."""
     ambient_frame: AmbientFile | None = None
     """The frame of ambient light alone; none: nothing is taken off the frames."""
+    closing_frame: ClosingFile | None = None
+    """The closing frame; none: none was taken. It is no measurement."""
+    order: str | None = None
+    """Order in which the imported frames were taken (`mitsim import --order`); none: that of `captures`."""
     checksums: Checksums = {}
     """SHA-256 by file name, where known."""
     plan: Plain | None = None
@@ -341,11 +360,19 @@ class RunManifest(RunHead):
     predicted_memory_bytes: float | None = None
     """Memory that this was predicted to take at most, beyond what the program held before."""
 
+    @property
+    def others(self) -> dict[str, str]:
+        """Files of frames that are no captures: `ambient` and `closing`, where the run has them."""
+        frames = {"ambient": self.ambient_frame, "closing": self.closing_frame}
+        return {name: frame.file for name, frame in frames.items() if frame}
+
     @model_validator(mode="after")
-    def _ambient_frame_is_no_capture(self) -> RunManifest:
-        ambient = self.ambient_frame and self.ambient_frame.file
-        if ambient and any(shot.file == ambient for shot in self.patterns.captures):
-            raise ValueError(f"ambient_frame: names {cut(ambient)!r}, a capture's file; give the frame without light")
+    def _other_frames_are_no_captures(self) -> RunManifest:
+        for name, file in self.others.items():
+            if any(shot.file == file for shot in self.patterns.captures):
+                raise ValueError(f"{name}_frame: names {cut(file)!r}, a capture's file; give the {name} frame's own")
+        if len({*self.others.values()}) < len(self.others):
+            raise ValueError("closing_frame: names the ambient frame's file; give its own")
         return self
 
 

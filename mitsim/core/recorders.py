@@ -26,7 +26,7 @@ from mitsim.core.exr import (
 from mitsim.core.files import output_folder, remove_page, sweep
 from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
 
-TRUTH, AMBIENT = "truth.exr", "ambient.exr"
+TRUTH, AMBIENT, CLOSING = "truth.exr", "ambient.exr", "closing.exr"
 
 
 def frame_name(index: int) -> str:

@@ -28,7 +28,7 @@ from mitsim.core.exr import (
 )
 from mitsim.core.files import output_folder
 from mitsim.core.images import card, from_above, normalise, span
-from mitsim.core.manifests import MANIFEST, Digital, RunManifest, read_manifest
+from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, RunManifest, read_manifest
 from mitsim.core.recorders import TRUTH, Recorder, claim_run, frame_name
 from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
 
@@ -144,6 +144,20 @@ class Capture:
         return Ambient(rate, np.maximum(digital.variance(rate), 0.0) / block.shots, block.shots)
 
     @cached_property
+    def closing(self) -> ClosingFrame | None:
+        """The closing frame; None where none was taken. MitsimError for one that is missing or damaged."""
+        block = self.manifest.closing_frame
+        if block is None:
+            return None
+        digital = self.manifest.digital.model_copy(update={"exposure_s": block.exposure_s})
+        dn = self._channel(block.file, "DN")
+        light = digital.rate(dn)
+        full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
+        signed = any(shot.sign for shot in self.manifest.patterns.captures)
+        own = light if signed else self._projector_part(light)
+        return ClosingFrame(block.kind, own, np.maximum(digital.variance(light), 0.0), full)
+
+    @cached_property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
         """P_L (n, K) and P_R (n', K')."""
         return self.manifest.patterns.matrices
@@ -195,9 +209,9 @@ class Capture:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the capture's files: its shots', the ambient frame's and the truth's, where there are such."""
-        ambient = self.manifest.ambient_frame
-        names = [shot.file for shot in self.manifest.patterns.captures] + ([] if ambient is None else [ambient.file])
+        """Names of the capture's files: its shots', and those of ambient frame, closing frame and truth, if it has
+        them."""
+        names = [*(shot.file for shot in self.manifest.patterns.captures), *self.manifest.others.values()]
         return (*names, TRUTH) if self._has_truth else tuple(names)
 
     @check_arguments
@@ -222,9 +236,10 @@ class Capture:
         digest = hashlib.sha256(manifest.digital.model_dump_json(exclude_defaults=True).encode())
         digest.update(manifest.patterns.model_dump_json().encode() + manifest.configuration_sha256.encode())
         files = [shot.file for shot in manifest.patterns.captures]
-        if manifest.ambient_frame is not None:
-            digest.update(manifest.ambient_frame.model_dump_json().encode())
-            files.append(manifest.ambient_frame.file)
+        for other in (manifest.ambient_frame, manifest.closing_frame):
+            if other is not None:
+                digest.update(other.model_dump_json().encode())
+                files.append(other.file)
         for file in files:
             if self.folder and not (manifest.configuration_sha256 and file in manifest.checksums):
                 verify(self.folder, file, {}, "")  # no link out of it
@@ -253,6 +268,7 @@ class Capture:
                 for name in ("accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour")
             },
             "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
+            "closing_frame": None if manifest.closing_frame is None else manifest.closing_frame.model_dump(),
             **{name: getattr(manifest, name) for name in known},
         }
 
@@ -422,6 +438,30 @@ class Ambient:
     rate: FloatArray
     variance: FloatArray
     shots: int
+
+
+@dataclass(frozen=True, eq=False)
+class ClosingFrame:
+    """A frame that was taken after all others to check that lamp, camera and scene stayed the same.
+
+    Attributes
+    ----------
+    kind
+        ``first``: the first shot again, in signed patterns the first half of the first pair; ``uniform``: all projector
+        pixels at full power.
+    light
+        (rows, columns) [electrons/s] less black level and dark current, and less the ambient frame where measurements
+        lose it; shots of signed patterns do not, because their difference loses ambient light.
+    variance
+        (rows, columns) of its own noise [(electrons/s)^2], as the manifest states the sensor's noise.
+    saturated
+        readings at the full well or the ADC's end.
+    """
+
+    kind: ClosingKind
+    light: FloatArray
+    variance: FloatArray
+    saturated: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from mitsim.core.arrays import FloatArray, Labels
+    from mitsim.core.manifests import Patterns
 
     PatternFactor = npt.NDArray[np.int8]
     """(n, K) of 0/1 or +-1: one side of K separable patterns."""
@@ -456,3 +457,73 @@ def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
         raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
     left = family.factor(PatternAxis(n, periods[0], "left", seed))
     return PatternFamily(text, left, family.factor(PatternAxis(n, periods[-1], "right", seed)))
+
+
+# ---- Orders in which frames may have been taken ----
+
+
+def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the orders in which the frames of a run may have been taken, by name, as permutations p.
+
+    If the frames were taken in that order, shot k of ``patterns.captures`` is frame p[k] of those at hand, counted
+    from 0; frames[p] are then in the order of the shots.
+
+    ``row-major`` is the order that captures have here, ``column-major`` that of a loop over rows inside one over
+    columns, and ``reversed`` is row-major from its end. Sylvester's Hadamard patterns also have ``sequency`` (Walsh)
+    and ``dyadic`` (Paley) order on both axes, and ``natural`` order, a synonym of row-major. Signed pairs are taken
+    + before - unless the order says otherwise: ``halves-exchanged`` is - before + in each pair, ``plus-first`` all +
+    frames before all -, and ``minus-first`` the reverse; the last three also follow another order, as in
+    ``sequency,plus-first``. Two names may have the same permutation, for example where patterns have one row.
+
+    Parameters
+    ----------
+    patterns
+        factors and shots of a run; rows and columns may differ in number.
+    taken
+        order that `mitsim import --order` applied to the frames at hand (``RunManifest.order``). None: the frames at
+        hand are the camera's.
+    """
+    import numpy as np
+
+    row, column, sign = np.array([(shot.row, shot.column, shot.sign) for shot in patterns.captures]).T
+    walks = {"row-major": (row, column), "column-major": (column, row)}
+    changes = [_sign_changes(side) for side in patterns.matrices]
+    if sign.any() and all(map(len, changes)):
+        sequency = changes[0][row], changes[1][column]
+        # The pattern with s sign changes is number s ^ (s >> 1), the Gray code of s, in Paley's order.
+        dyadic = sequency[0] ^ (sequency[0] >> 1), sequency[1] ^ (sequency[1] >> 1)
+        walks |= {"sequency": sequency, "dyadic": dyadic}
+    orders = {name: _places(*walk, -sign) for name, walk in walks.items()}
+    orders["reversed"] = len(row) - 1 - orders["row-major"]
+    if "sequency" in walks:
+        orders["natural"] = orders["row-major"]
+    for name, walk in walks.items() if sign.any() else ():
+        before = "" if name == "row-major" else f"{name},"
+        orders[f"{before}halves-exchanged"] = _places(*walk, sign)
+        orders[f"{before}plus-first"] = _places(-sign, *walk)
+        orders[f"{before}minus-first"] = _places(sign, *walk)
+    if taken is None:
+        return orders
+    frame_of = np.argsort(orders[taken])
+    return {name: frame_of[order] for name, order in orders.items()}
+
+
+def _places(*keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the place of each shot when shots are sorted by the first of the ``keys``, then by the next."""
+    import numpy as np
+
+    return np.argsort(np.lexsort(keys[::-1]))
+
+
+def _sign_changes(side: FloatArray) -> npt.NDArray[np.int64]:
+    """Return how often each column of a +-1 ``side`` of K patterns changes its sign within its first K rows.
+
+    Return nothing unless the rows are Sylvester's matrix, whose columns have 0 to K - 1 changes, each number once.
+    """
+    import numpy as np
+
+    count = side.shape[1]
+    square = side[:count]
+    if count & (count - 1) or not np.array_equal(square, hadamard_matrix(count)):
+        return np.zeros(0, np.int64)
+    return np.array(np.count_nonzero(np.diff(square, axis=0), axis=0))

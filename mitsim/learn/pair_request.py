@@ -95,6 +95,8 @@ class PairsRequest:
             raise ArgumentError("count", f"{self.count}: give 1 to {MOST_PAIRS} pairs")
         if self.capture.seconds is not None or self.capture.noise_fraction is not None:
             raise ArgumentError("seconds", "pairs share their light; give an accuracy")
+        if self.capture.closing_frame is not None:
+            raise ArgumentError("closing_frame", "pairs have none; leave it out")
         if self.folder is not None:
             picture_files(self.folder)
         vary = self.variation

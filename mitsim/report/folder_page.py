@@ -216,12 +216,10 @@ def _run_pictures(shots: Capture) -> Iterator[Picture]:
     yield contact_sheet(read, len(files), first.shape, max(len(files) // left.shape[1], 1))
     if len(files) > 1:
         yield Picture.of("frame", f"One of them, {files[0].file}", first, Scale.of(first, _ABOVE_BLACK, 0.0))
-    if shots.manifest.ambient_frame is not None:
-        name = shots.manifest.ambient_frame.file
-        ambient = np.asarray(shots.read(name)[0]["DN"] - np.float64(black))
-        yield Picture.of(
-            "ambient", "Projector off: what is taken off", ambient, Scale.of(ambient, _ABOVE_BLACK, 0.0), name
-        )
+    titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
+    for kind, name in shots.manifest.others.items():
+        frame = np.asarray(shots.read(name)[0]["DN"] - np.float64(black))
+        yield Picture.of(kind, titles[kind], frame, Scale.of(frame, _ABOVE_BLACK, 0.0), name)
     if shots.truth is not None:
         yield Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH)
     if shots.folder is not None and is_mosaic(shots.folder):
