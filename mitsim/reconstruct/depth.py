@@ -25,12 +25,12 @@ from mitsim.core.errors import ArgumentError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
-from mitsim.reconstruct.causes import Evidence
 from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
-from mitsim.reconstruct.misfit import CHANCE
+from mitsim.reconstruct.residuals import CHANCE
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
+from mitsim.reconstruct.subpixel import LitFrames
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
@@ -296,11 +296,11 @@ class _Search:
         """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
         side of the pixels' centres, so no other depth explains it."""
         there = move_factors(self._factors, self._mm(shift))
-        evidence = Evidence(there.factors, self._all.patterns)
+        lit = LitFrames(there.factors.sides, self._all.patterns)
         for each in there.of(self._shots).pattern_measurements():
             frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
-            evidence.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
-        return float(np.nan_to_num(evidence.print_part()))
+            lit.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
+        return float(np.nan_to_num(lit.print_part()))
 
     def _misfit(self, shift: float, least: float) -> float:
         """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0

@@ -1,62 +1,70 @@
-"""Measurements and the factorised model in; out comes how much of them the model leaves unexplained, and where.
+"""Misfit of a run: what the factorised model leaves of the measurements, held against their noise.
 
-Of data Y the model can explain what lies in its range, U_L W U_R^T, whatever the image: the residual R = Y - U_L W
-U_R^T hangs on no lambda. Its energy is held against what the sensor's stated noise, that of the calibrated factors and
-the error of simulated frames put there; what is more is *unexplained*: light that no flat, matt scene at the calibrated
-distance sends.
+A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the data
+that restore the fit. Four measurements decide, in this order:
+
+1. Noise: second differences of the residuals measure the noise of the frames (:mod:`mitsim.reconstruct.residuals`). Too
+   much and too little are flagged as noise, apart from energy that is unexplained.
+2. Energy: the residuals' energy beyond that of the noise, of the calibration's error, of rendering and of print finer
+   than a scene pixel, for the whole sensor, its tiles, rows, columns and pixels, and in time.
+3. Frames: each frame against what the others predict of it (:mod:`mitsim.reconstruct.frame_check`).
+4. Readings, if one of these is off: turned frames, shots in another order, tone curves, scale, lag, and a light that is
+   the same in all frames (:mod:`mitsim.reconstruct.readings`).
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
 
-from mitsim.core.arrays import FloatArray
-from mitsim.core.runs import Measurement
+from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.causes import Cause, Evidence, Reading, Readings, Signatures, likely_cause, multiple
 from mitsim.reconstruct.defects import Defects, defects_of
 from mitsim.reconstruct.estimate_factors import decibels
-from mitsim.reconstruct.frame_check import FrameCheck
-from mitsim.reconstruct.frame_faults import FrameFault, FrameSums
+from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
+from mitsim.reconstruct.picture_check import PictureCheck
+from mitsim.reconstruct.readings import Reading, find_readings, multiple
+from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, common_energy, common_weights
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Prepared
-from mitsim.reconstruct.subpixel import print_energy
+from mitsim.reconstruct.subpixel import LitFrames, print_energy
 
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
 and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2 (49)."""
 UNEXPLAINED_TILE = 2e-2
-"""The same of a single tile, where print is not averaged: above all that fitting scenes left
-(tests/physics/test_misfit.py)."""
-CHANCE = 6.0
-"""Standard deviations of the noise's own energy that are left to chance: with 64 tiles once in 10^7 images."""
-GROSS = 0.1
-"""Unexplained part from which an image is flagged where the noise was not stated; few photons leave as much, so that
-the part has to be four times the energy of their shot noise, too."""
-_GROSS_CHI_SQUARE = 4.0
-"""The same as a chi-square, of shot noise alone: read noise of as many electrons makes 2."""
+"""The same part of a single tile, where print is not averaged: above all that fitting scenes left."""
+GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
+"""Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated: read
+noise of as many electrons makes 2."""
 _SHOWN = 4
-"""Faults that a sentence holds; result.json has them all."""
+"""Faults that a sentence names; result.json has all of them."""
 _LAMBDA_BESIDE = 1e-3
-"""Lambda, over the largest sigma^2, by which frames are predicted beside an image whose own weight says nothing of it,
-as of total variation: chosen, between those of bright and of dim runs."""
+"""Lambda, over the largest sigma^2, of the image that frames are compared with if the method has no lambda of its own."""
 _MOSTLY = 0.5
-"""Part of the unexplained energy at defective pixels from which frames are not blamed: most of it."""
-_QUIET = 0.03
-"""Of the sensor's noise, beside half of :data:`CHANCE`, that may be missing before tone curves are tried: chosen, gains
-are stated to a few per cent."""
-_TINY = 1e-300
-"""Stands for 0 in a denominator."""
-_TILES = 8
-"""Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
+"""Part of the unexplained energy at defective pixels from which nothing else is blamed."""
+_COMMON_IMAGE = 0.01
+"""Change of the image, rms, by light that is the same in all frames, from which it is reported."""
+_STRUCTURE = 0.5
+"""Energy of structure over that of noise up to which residuals count as white."""
 
 
-# ---- The misfit, and what is said of it ----
+class Cause(Enum):
+    """Measurement that flags an image; the value is its name in words, and the remedy."""
+
+    NOISE = ("the frames' noise", "check the camera file's gain, read noise and black level, and that the numbers are raw")
+    READING = ("another reading of the frames", "see which of the readings is true, and import the frames so")
+    FRAMES = ("frames that do not fit the others", "capture these frames again")
+    PIXELS = ("a part of the sensor or of the session", "look at the map of the misfit, and capture again")
+    LIGHT = ("light that is the same in all frames", "darken the room, or capture with ambient_frame=yes")
+    SATURATION = ("readings at the full well or the ADC's end", "expose for less")
+    MODEL = (
+        "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, gloss, "
+        "indirect light, or another camera",
+        "try `--focus auto`, check that the camera is the calibrated one, and compare the map of the misfit with the scene",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,24 +84,25 @@ class Misfit:
         largest unexplained part of a tile.
     stated
         whether the noise of sensor and calibration were stated; otherwise only gross misfit is flagged.
-    flagged
-        whether more is left than chance and a fitting scene leave.
-    cause
-        the likely one of a flagged image.
-    signatures
-        of a flagged image: the parts of the unexplained energy by which causes are told apart.
+    flagged, cause
+        whether something is off, and the measurement that found it.
+    noise
+        measured over stated noise; None of frames that are too small.
+    gain
+        gain that the camera file states [DN per electron].
     predicted
-        what the calibration predicts of ``unexplained``, print apart, from what its factors lack of the camera; None
-        where it does not know.
-    faults
-        frames that are not what they say; with any the image is flagged.
-    reading
-        of a flagged image: how else its frames fit; None where they do not.
+        part that the calibration predicts of ``unexplained``, because its factors lack it; None where it does not know.
+    faults, places, readings
+        frames and places that do not fit, and readings of the data that restore the fit, the best first.
     defects
         pixels of the sensor whose readings were left out, or are to be; None: there are none.
     detail
-        part of the measurements, rms, that the frames themselves show to be print finer than a scene pixel, where the
-        image would be flagged without; no part of ``unexplained``.
+        part of the measurements, rms, that the frames show to be print finer than a scene pixel; no part of
+        ``unexplained``.
+    picture
+        what the picture decides of frames under shifting dots; None under other patterns.
+    common
+        relative change of the image, rms, by light that is the same in all frames.
     """
 
     chi_square: float
@@ -102,13 +111,17 @@ class Misfit:
     worst_tile: float
     stated: bool
     flagged: bool
-    cause: Cause | None
-    signatures: Signatures | None
+    cause: Cause | None = None
+    noise: NoiseTest | None = None
+    gain: float | None = None
     predicted: float | None = None
     faults: tuple[FrameFault, ...] = ()
-    reading: Reading | None = None
+    places: tuple[Place, ...] = ()
+    readings: tuple[Reading, ...] = ()
     defects: Defects | None = None
     detail: float = 0.0
+    picture: PictureCheck | None = None
+    common: float = 0.0
 
     @property
     def gist(self) -> str:
@@ -117,24 +130,44 @@ class Misfit:
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
-        cause = f"; likely cause: {self.reason}" if self.cause else ""
+        cause = f"; {self.reason}" if self.cause else ""
         defects = f"; {self.defects}" if self.defects else ""
         detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
         return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{detail}{cause}{defects}"
 
     @property
     def reason(self) -> str:
-        """The cause in words; empty where none is known."""
-        if self.reading:
-            return self.reading.words
-        return self.cause.value[0] if self.cause else ""
+        """The finding in words; empty where nothing is off."""
+        if self.cause is None:
+            return ""
+        sentences = {
+            Cause.NOISE: self._noise_sentence,
+            Cause.READING: self._reading_sentence,
+            Cause.FRAMES: "; ".join(map(str, self.faults[:_SHOWN])),
+            Cause.PIXELS: f"the misfit is in {self.places[0].words}" if self.places else "",
+            Cause.LIGHT: f"light that is the same in all frames changes the image by {self.common:.1%}",
+        }
+        return sentences.get(self.cause) or self.cause.value[0]
 
-    def read_as(self, reading: Reading) -> Misfit:
-        """The same of frames that fit when they are taken as another ``reading`` has them."""
-        return replace(self, flagged=True, cause=reading.cause, reading=reading)
+    @property
+    def _noise_sentence(self) -> str:
+        """State measured and stated noise and gain."""
+        if self.noise is None:
+            return ""
+        words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
+        if self.gain and self.noise.gain > 0 and self.noise.gain_error < 0.1 * self.noise.gain:
+            measured, error = self.gain * self.noise.gain, self.gain * self.noise.gain_error
+            words += f"; stated gain {self.gain:.4g} DN per electron, measured {measured:.3g} +- {error:.1g}"
+        return words
+
+    @property
+    def _reading_sentence(self) -> str:
+        ways = "; or ".join(reading.words for reading in self.readings[:_SHOWN])
+        more = "" if len(self.readings) == 1 else f" ({len(self.readings)} readings fit alike: the frames cannot decide)"
+        return f"the frames fit if they are read {ways}{more}"
 
     def summary(self) -> dict[str, Any]:
-        """What result.json and the command line's JSON say of it."""
+        """Return the entry of result.json and of the command line's JSON."""
         return {
             "chi_square": self.chi_square,
             "unexplained": self.unexplained,
@@ -142,239 +175,128 @@ class Misfit:
             "noise_stated": self.stated,
             "flagged": self.flagged,
             "cause": self.cause.name.lower() if self.cause else None,
-            "signatures": asdict(self.signatures) if self.signatures else None,
+            "reason": self.reason or None,
+            "noise_ratio": self.noise.ratio if self.noise else None,
+            "gain_stated": self.gain,
+            "gain_measured": self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None,
             "foretold": self.predicted,
             "detail": self.detail,
             "defective_pixels": self.defects.summary() if self.defects else None,
-            "reading": self.reading.words if self.reading else None,
+            "reading": self.readings[0].words if len(self.readings) == 1 else None,
+            "readings": [reading.summary() for reading in self.readings],
+            "places": [place.words for place in self.places],
             "faults": [fault.summary() for fault in self.faults],
+            "power_error": float(np.median(self.picture.power_error)) if self.picture else None,
             "map": self.tiles.tolist(),
         }
 
     def judge(self, status: Status) -> Status:
-        """The ``status`` of a solution with this misfit."""
+        """Return the ``status`` of a solution with this misfit."""
         if self.cause is None:
             return status
-        if self.faults:
-            more = f"; and {len(self.faults) - _SHOWN} more" if len(self.faults) > _SHOWN else ""
-            named = "; ".join(map(str, self.faults[:_SHOWN]))
-            return self._flag(status, f"Faulty frames: {named}{more}", Cause.FRAMES)
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
-        predicted = ""
+        part = f"{self.unexplained:.1%} of the measurements fit no image{times}"
+        sentences = {
+            Cause.NOISE: f"Noise is not as stated: {self.reason}",
+            Cause.READING: f"Misfit: {part}, but {self.reason}",
+            Cause.FRAMES: f"Faulty frames: {self.reason}",
+        }
+        sentence = sentences.get(self.cause, f"Misfit: {part}; {self.reason}")
         if self.predicted:
-            predicted = f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
-        sentence = (
-            f"{self.unexplained:.1%} of the measurements fit no image{times}{predicted}; likely cause: {self.reason}"
-        )
-        return self._flag(status, f"Misfit: {sentence}", self.cause)
-
-    def _flag(self, status: Status, sentence: str, cause: Cause) -> Status:
-        """The ``status`` of a solution with a ``sentence`` and the remedy of a ``cause``."""
-        remedy = cause.value[1]
+            sentence += f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
+        if len(self.faults) > _SHOWN and self.cause is Cause.FRAMES:
+            sentence += f"; and {len(self.faults) - _SHOWN} more"
+        remedy = self.cause.value[1]
         if not status.verdict.good:
             return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
         return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
 
 
 def chi_square_text(chi_square: float) -> str:
-    """A ``chi_square`` as people read it: fitting images differ in the third decimal, others by orders of magnitude."""
+    """Format a ``chi_square``: fitting images differ in the third decimal, others by orders of magnitude."""
     return f"{chi_square:.3f}" if chi_square < 10 else f"{chi_square:.3g}"
-
-
-# ---- Residuals of all measurements ----
-
-
-class Residuals:
-    """Sums over what the model leaves of every measurement, by tile of the sensor.
-
-    Parameters
-    ----------
-    prepared
-        the factorised model.
-    weights
-        (r, r') W of all measurements.
-    noise
-        of the measurements.
-    evidence
-        empty; gathers what tells causes apart.
-
-    Attributes
-    ----------
-    energy, power
-        (tiles, tiles) sums of the squares of measurements and of shots.
-    pixels
-        (tiles, tiles) pixels of each tile.
-    by_pattern
-        energies by pattern.
-    squares
-        (m, m') sum of the squares of residuals of each sensor pixel.
-    """
-
-    @classmethod
-    def of(cls, data: Accumulation, evidence: Evidence) -> Residuals:
-        """Of all measurements of accumulated ``data``, which are read once more; ``evidence`` is empty."""
-        sums = cls(data.prepared, data.weights, data.noise, evidence)
-        for measurement in data.measurements_again():
-            sums.add(measurement)
-        return sums
-
-    def __init__(self, prepared: Prepared, weights: FloatArray, noise: FrameNoise, evidence: Evidence) -> None:
-        self._prepared, self._weights, self._noise, self.evidence = prepared, weights, noise, evidence
-        sizes = prepared.left.sensor_size, prepared.right.sensor_size
-        edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
-        self._strips = [slice(*ends) for ends in pairwise(edges[0])]
-        self._starts = edges[1][:-1]
-        self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
-        self.squares: FloatArray = np.zeros(sizes)
-        # Of one frame: to make them anew takes longer than to fill them.
-        self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
-        self.by_pattern = FrameSums((prepared.left.pattern_count, prepared.right.pattern_count))
-
-    def add(self, measurement: Measurement) -> None:
-        """Count in one ``measurement``."""
-        frame = self._prepared.as_solved(measurement.frame)
-        left, right = self._prepared.slabs((measurement.row, measurement.column))
-        modelled = left.matrix @ self._weights[left.columns][:, right.columns]
-        residual = np.matmul(modelled, right.matrix.T, out=self._residual)
-        np.subtract(frame, residual, out=residual)
-        flat = residual.ravel()
-        self.squares += np.multiply(residual, residual, out=self._squared)
-        energy = self._squares(frame)
-        power = energy if frame is measurement.light else self._squares(measurement.light)
-        if measurement.shots == 2:  # as Measurement.power has it
-            power = (power + (energy if frame is measurement.frame else self._squares(measurement.frame))) / 2
-        self.energy += energy
-        self.power += power
-        left_over, given = float(np.dot(flat, flat)), float(energy.sum())
-        self.by_pattern.add(measurement, left_over, float(power.sum()), given, self._noise.light)
-        mean = float(self._noise.means[measurement.row, measurement.column])
-        self.evidence.add(measurement, frame, residual, float(self._noise.of(mean, measurement.shots)))
-
-    @cached_property
-    def variance(self) -> FloatArray:
-        """(tiles, tiles) sum of the noise's variance."""
-        # It is linear in the light: that of a tile's mean light is the tile's mean variance.
-        count = self._noise.variance.size
-        light = self._sums(self._noise.light) / self.pixels / count
-        return self._noise.of(light, self._noise.shots) * self.pixels * count
-
-    @property
-    def residual(self) -> FloatArray:
-        """(tiles, tiles) sum of the squares of residuals."""
-        return self._sums(self.squares)
-
-    def defects(self, whole: FloatArray | None) -> Defects | None:
-        """Pixels that are off in all measurements, where the sensor's noise is stated.
-
-        Parameters
-        ----------
-        whole
-            (rows, columns) the halves' sum of signed patterns, as the model has it; None: it has none.
-        """
-        if not self._noise.stated:
-            return None
-        count = self._noise.variance.size
-        mean = self._noise.light / count
-        variance = self._noise.of(mean, self._noise.shots)
-        found = defects_of(self.squares, count * variance, count)
-        if whole is None:
-            return found
-        # Differences of halves tell little of pixels that stand still, their sums all.
-        still = defects_of(np.square(self._prepared.as_solved(mean) - whole), variance / count, 1)
-        return still.with_others(found) if still else found
-
-    def at(self, defects: Defects) -> float:
-        """Energy that is left at pixels that are ``defects``."""
-        return float(self.squares[defects.rows, defects.columns].sum())
-
-    @property
-    def quiet(self) -> bool:
-        """Whether less is left than the sensor's noise alone makes."""
-        noise = float(self.variance.sum()) * self._prepared.spare
-        return float(self.squares.sum()) < noise * (1 - _QUIET - _chance(self._noise, float(self.pixels.sum())) / 2)
-
-    def expected_energy(self, factor_energy: float) -> FloatArray:
-        """(tiles, tiles) energy that is expected of the residual: the sensor's noise less what the fit takes up, the
-        error of simulated frames where the light is, and ``factor_energy`` evenly."""
-        rendering = self._noise.rendering * self.power / max(float(self.power.sum()), _TINY)
-        return np.asarray(
-            self.variance * self._prepared.spare + rendering + factor_energy * self.pixels / self.pixels.sum()
-        )
-
-    def _sums(self, values: FloatArray) -> FloatArray:
-        # Not reduceat along the rows: it takes five times as long.
-        rows = np.stack([values[strip].sum(axis=0) for strip in self._strips])
-        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
-
-    def _squares(self, values: FloatArray) -> FloatArray:
-        rows = np.stack([np.einsum("ij,ij->j", values[strip], values[strip]) for strip in self._strips])
-        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
 
 # ---- Measurements held against the model ----
 
 
 def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = True) -> Misfit | None:
-    """Hold all measurements of accumulated ``data`` against the model; None where there are no more data than unknowns.
+    """Compare all measurements of accumulated ``data`` with the model; None where there are no more data than unknowns.
 
     Parameters
     ----------
     data
         whose frames are read again if they were not kept.
     solution
-        of them, for what print and the factors' noise add to the frames.
+        the image, for the energy that print and the factors' noise add to the frames.
     with_defects
-        whether defective pixels are looked for, and no cause where there are some.
+        whether defective pixels are looked for.
     """
     prepared, noise, image = data.prepared, data.noise, solution.image
     if prepared.spare <= 0:
         return None
-    lack, factor_energy, of_ramps = data.lack(image), data.factor_energy(image), print_energy(data.model, image)
-    evidence = Evidence(data.factors, data.shots.patterns, lack.energy if lack else None)
-    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
-    check, sums = FrameCheck(data, lam), Residuals.of(data, evidence)
-    expected = sums.expected_energy(factor_energy or 0.0)
-    balance = Balance(sums.residual, sums.energy, expected, sums.pixels, factor_energy is not None)
+    factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
+    lack = data.lack(image)
+    common = _common_light(data)
+    sums = Residuals(data, common)
+    change = _change(data, solution, common)
+    stated, energy = float(noise.variance.sum()) * sums.squares.size * prepared.spare, float(sums.energy.sum())
+    beside = noise.rendering + (factor_energy or 0.0)
+    test = sums.noise_test
+    whole = float(sums.squares.sum())
+    white = test is not None and whole < (1 + _STRUCTURE) * max(test.ratio * stated, TINY) + beside
+    off = test is not None and test.off(noise.stated, beside / max(stated, TINY)) and (white or test.ratio < 1)
+    if test and noise.stated and test.ratio < 1 and whole > stated:
+        off = False  # noise that second differences do not see, as of rows, fills the difference
+    ratio = test.ratio if test and (off or not noise.stated) else 1.0
+    balance = Balance(sums.residual, sums.energy, sums.expected(ratio, factor_energy or 0.0), sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, of_ramps)
-    if evidence.predicted is not None:
-        found = replace(found, predicted=float(np.sqrt(evidence.predicted / max(float(sums.energy.sum()), _TINY))))
-    beside_noise = noise.rendering + (factor_energy or 0.0) + of_ramps
-    if reading := multiple(noise, found.chi_square) or check.out_of_step(sums.by_pattern):
-        return found.read_as(reading)
-    defects = sums.defects(check.whole()) if with_defects else None
-    if defects and excess > 0 and sums.at(defects) > _MOSTLY * excess:
+    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
+    if off:  # chi-square is of the stated noise
+        found = replace(found, chi_square=whole / max(float(sums.expected(1.0, factor_energy or 0.0).sum()), TINY))
+    if lack:
+        found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
+    defects = _defects(data, sums, ratio) if with_defects and noise.stated else None
+    if defects and excess > 0 and float(sums.squares[defects.rows, defects.columns].sum()) > _MOSTLY * excess:
         return replace(found, defects=defects)
-    readings = Readings(data)
-    chance = _chance(noise, float(sums.pixels.sum()))
-    hinted = found.flagged or (found.stated and found.unexplained > UNEXPLAINED and found.chi_square > 1 + chance / 2)
-    if hinted:
-        beside = beside_noise / max(float(sums.energy.sum()), _TINY)
-        reading = readings.fitting(found.unexplained, beside, check.all_off(sums.by_pattern, beside_noise))
-    elif noise.stated and sums.quiet:
-        reading = readings.tone_curve()
-    if reading:
-        return found.read_as(reading)
-    faults = check.faults(sums.by_pattern, beside_noise)
-    if faults:
-        return replace(found, flagged=True, cause=Cause.FRAMES, faults=faults)
-    if defects:
+    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
+    check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
+    faults, places = check.faults(), sums.places(ratio) if not defects and noise.stated else []
+    found = replace(found, faults=faults, places=tuple(places), picture=check.picture)
+    scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
+    fitting = not (found.flagged or faults or places or off)
+    if scaled:
+        readings: tuple[Reading, ...] = (scaled,)
+    else:
+        readings = () if fitting else find_readings(data, ratio, beside + of_ramps)
+    found = replace(found, readings=readings)
+    if not readings and not faults and defects:
         return replace(found, defects=defects)
-    if reading := check.negative():
-        return found.read_as(reading)
-    if not found.flagged:
-        return found
-    signatures = evidence.signatures(excess, noise.saturated / max(noise.readings, 1))
-    # Of what is left beyond the sensor's noise, as signatures are.
-    of_print = float(np.nan_to_num(signatures.detail)) * (excess + beside_noise)
-    fine, _ = balance.misfit(noise, max(of_ramps, of_print))
-    if not fine.flagged:
-        return replace(fine, predicted=found.predicted, detail=float(np.sqrt(of_print / sums.energy.sum())))
-    return replace(found, cause=likely_cause(signatures, found.unexplained, evidence.of_factors), signatures=signatures)
+    detail = _detail(data, sums, excess, beside) if found.flagged and not (readings or faults) else 0.0
+    if detail:
+        fine, _ = balance.misfit(noise, max(of_ramps, detail))
+        if not fine.flagged:
+            found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
+            found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
+    saturated = noise.saturated > 1e-5 * noise.readings
+    cause = None
+    if readings:
+        cause = Cause.READING
+    elif faults:
+        cause = Cause.FRAMES
+    elif found.flagged:
+        cause = Cause.SATURATION if saturated else Cause.PIXELS if found.places else Cause.MODEL
+    elif found.places:
+        cause = Cause.PIXELS
+    elif off:
+        cause = Cause.NOISE
+    elif change > _COMMON_IMAGE:
+        cause = Cause.LIGHT
+    return replace(found, flagged=cause is not None, cause=cause)
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
-    """Frames at fault of a scene of several depths, of which the model fits a part.
+    """Return frames at fault of a scene of several depths, of which the model fits a part.
 
     Parameters
     ----------
@@ -384,8 +306,80 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
         (n, n') with a depth for each pixel, and its lambda.
     """
     beside = data.noise.rendering + (data.factor_energy(image) or 0.0) + print_energy(data.model, image)
-    sums = Residuals.of(data, Evidence(data.factors, data.shots.patterns)).by_pattern
-    return FrameCheck(data, lam).faults(sums, beside, fits=False)
+    return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
+
+
+def _common_light(data: Accumulation) -> FloatArray | None:
+    """Return the light (m, m') that is the same in all measurements; None where it is no more than chance.
+
+    The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room: F = f g^T,
+    of which the residuals tell K |F|^2 less the energy in the model's range.
+    """
+    if any(shot.sign for shot in data.shots.manifest.patterns.captures) or data.noise.variance.size < 2:
+        return None
+    left, right = data.factors.sides
+    lit = np.outer(left.sum(axis=1), right.sum(axis=1))
+    shapes = [np.ones(lit.shape), lit / max(float(np.sqrt(np.mean(np.square(lit)))), TINY)]
+    fields = [data.prepared.as_solved(each) for each in shapes]
+    # Light of an even scene may lie in the model's range, and light without contrast is lost by centring.
+    fields = [each for each in fields if common_energy(data, each) > 1e-9 * data.noise.variance.size * each.size]
+    if not fields:
+        return None
+    weights = [common_weights(data, field) for field in fields]
+    count = data.noise.variance.size
+    total = data.prepared.as_solved(sum((each.frame for each in data.measurements_again()), start=np.zeros(())))
+    data_weights = data.weights
+    normal = np.array(
+        [[count * np.vdot(f, g) - np.vdot(v, w) for g, w in zip(fields, weights, strict=True)] for f, v in zip(fields, weights, strict=True)]
+    )
+    side = np.array([np.vdot(f, total) - np.vdot(w, data_weights) for f, w in zip(fields, weights, strict=True)])
+    scale = np.sqrt(np.diag(normal))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-6) / np.outer(scale, scale)
+    found = inverse @ side
+    explained = float(found @ side)
+    variance = float(data.noise.variance.mean())
+    energy = max(float(data.frames.energy), TINY)
+    least = max(2 * CHANCE**2 * variance, (UNEXPLAINED / 4) ** 2 * energy)
+    if explained < least:
+        return None
+    return np.asarray(sum(value * field for value, field in zip(found, fields, strict=True)))
+
+
+def _change(data: Accumulation, solution: Solution, common: FloatArray | None) -> float:
+    """Return the relative change of the image, rms, by a ``common`` light (m, m')."""
+    if common is None or not solution.image.any():
+        return 0.0
+    sigma = data.prepared.sigma
+    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * data.prepared.problem(data.frames).scale
+    gain = np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
+    moved = data.prepared.image(gain * common_weights(data, common))
+    return float(np.sqrt(sum_of_squares(moved) / sum_of_squares(solution.image)))
+
+
+def _defects(data: Accumulation, sums: Residuals, ratio: float) -> Defects | None:
+    """Return pixels that are off in all measurements."""
+    noise, prepared = data.noise, data.prepared
+    count = noise.variance.size
+    mean = noise.light / count
+    variance = ratio * noise.of(mean, noise.shots)
+    found = defects_of(sums.squares, count * variance, count)
+    lit = [np.flatnonzero((side > 0).all(axis=0)) for side in data.shots.patterns]
+    if not any(shot.sign for shot in data.shots.manifest.patterns.captures) or not all(map(len, lit)):
+        return found
+    # Differences of halves show little of pixels that stand still, and their sums show all of it.
+    whole = prepared.frame(data.weights, (int(lit[0][0]), int(lit[1][0])))
+    still = defects_of(np.square(prepared.as_solved(mean) - whole), variance / count, 1)
+    return still.with_others(found) if still else found
+
+
+def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -> float:
+    """Return the energy of print finer than a scene pixel, as the frames show it."""
+    lit = LitFrames(data.factors.sides, data.shots.patterns)
+    for each in data.measurements_again():
+        pattern = each.row, each.column
+        variance = data.noise.of(float(data.noise.means[pattern]), each.shots)
+        lit.collect(each, data.prepared.as_solved(each.frame), float(variance))
+    return float(np.nan_to_num(lit.print_part())) * max(excess + beside, 0.0)
 
 
 # ---- Energies found and expected ----
@@ -398,9 +392,9 @@ class Balance:
     Attributes
     ----------
     residual, energy, expected
-        (rows, columns) of what a model leaves, of the measurements, and of what is expected to be left.
+        (rows, columns) energy that a model leaves, of the measurements, and that is expected to be left.
     pixels
-        (rows, columns) of each tile.
+        (rows, columns) pixels of each tile.
     stated
         whether the noise of the factors was stated.
     """
@@ -412,21 +406,21 @@ class Balance:
     stated: bool
 
     def misfit(self, noise: FrameNoise, print_energy: float) -> tuple[Misfit, float]:
-        """How much is unexplained, of a cause that is not known, and its energy.
+        """Return the misfit, without its cause, and the energy that is unexplained.
 
         Parameters
         ----------
         noise
             of the measurements.
         print_energy
-            what print within a pixel may add.
+            energy that print within a pixel may add.
         """
         beyond = self.residual - self.expected - print_energy * self.pixels / self.pixels.sum()
         energy, excess = float(self.energy.sum()), float(beyond.sum())
-        unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, _TINY)))
-        tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(self.energy, _TINY))
-        chi_square = float(self.residual.sum() / max(float(self.expected.sum()), _TINY))
-        chi_squares = self.residual / np.maximum(self.expected, _TINY)
+        unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, TINY)))
+        tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(self.energy, TINY))
+        chi_square = float(self.residual.sum() / max(float(self.expected.sum()), TINY))
+        chi_squares = self.residual / np.maximum(self.expected, TINY)
         stated = noise.stated and self.stated
         if stated:
             flagged = unexplained > UNEXPLAINED and chi_square > 1 + _chance(noise, float(self.pixels.sum()))
@@ -434,21 +428,14 @@ class Balance:
             flagged = flagged or bool(local.any())
         else:
             flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
-        found = Misfit(
-            chi_square=chi_square,
-            unexplained=unexplained,
-            tiles=chi_squares,
-            worst_tile=float(tiles.max()),
-            stated=stated,
-            flagged=flagged,
-            cause=Cause.UNKNOWN if flagged else None,
-            signatures=None,
-        )
-        return found, excess
+        cause = Cause.MODEL if flagged else None
+        return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess
 
 
 def _chance(noise: FrameNoise, pixels: float) -> float:
-    """What chance may add to the chi-square of that many ``pixels`` in all measurements: the energy of normal noise of
-    variance v in n data varies by sqrt(2 n) v."""
-    total = max(float(noise.variance.sum()), _TINY)
+    """Return what chance may add to the chi-square of that many ``pixels`` in all measurements.
+
+    The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
+    """
+    total = max(float(noise.variance.sum()), TINY)
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total

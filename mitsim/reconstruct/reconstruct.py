@@ -22,13 +22,12 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
 from mitsim.reconstruct.background import Margin
-from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import move_factors
-from mitsim.reconstruct.misfit import Misfit, faulty_frames, find_misfit
+from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
 from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
@@ -291,8 +290,6 @@ their energy each time."""
 _BETTER = 0.5
 """Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
 not fit either."""
-_OF_THE_SCENE = Cause.GLOSS, Cause.INDIRECT, Cause.DETAIL, Cause.UNKNOWN, Cause.RIG
-"""Causes that light of a depth beyond the searched range is taken for."""
 
 
 @check_arguments
@@ -375,6 +372,10 @@ def reconstruct_request(
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
         uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
+        if uncertainties and misfit and misfit.picture and shots.manifest.plan is None:
+            # Of a simulated run the lamp and the place of every frame are known.
+            frames = misfit.picture.uncertainty(solution.image)
+            uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
     status = misfit.judge(solution.status) if misfit else solution.status
     image = solution.image
     if beside:
@@ -441,8 +442,6 @@ def _fit(
         misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
         if misfit and misfit.defects:
             data, solution, misfit = _without_defects(data, lam, misfit)
-        if misfit and misfit.cause in _OF_THE_SCENE and isinstance(depth, Depth) and depth.at_end:
-            misfit = replace(misfit, cause=Cause.DEPTH)
         separable = data.factors.status.verdict is not Verdict.NOT_SEPARABLE
         explained = separable and (misfit is None or not misfit.flagged)
         if data.solver.linear and not by_pixel and lam == "auto" and (data.factors.lacking or not explained):

@@ -21,7 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.arrays import FloatArray
-from mitsim.reconstruct.factorisation import IndexArray, Side
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.factorisation import IndexArray, Side, group_pixels
 from mitsim.reconstruct.regularisation import Halves, half_spread
 from mitsim.reconstruct.solver import Prepared
 
@@ -46,6 +47,8 @@ _BLOCKS = 4
 of their dipoles' energy unexplained by blocks, and each has pixels enough to tell a depth from print."""
 _EDGE = 0.5
 """Scene pixels from the centre of one to its edge."""
+_PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
+"""Groups of lit rows and columns that are looked at, as parts of their number: four that are spread over both."""
 _RANK = 1e-6
 """Relative eigenvalue below which a block's depth is not told: chosen, blocks without light have none."""
 
@@ -167,6 +170,68 @@ class LitFrame:
             moved += [outside(slid[0] @ part @ seen[1].T), outside(seen[0] @ part @ slid[1].T)]
         vectors = np.stack(moved)
         return vectors @ vectors.T, vectors @ outside(wide.T @ self.frame @ wide_)
+
+
+class LitFrames:
+    """Adds measurements up to light of a few groups of scene pixels alone.
+
+    Parameters
+    ----------
+    factors
+        both factors of the model.
+    patterns
+        P_L (n, K) and P_R (n', K').
+    """
+
+    def __init__(self, factors: tuple[FloatArray, FloatArray], patterns: tuple[FloatArray, FloatArray]) -> None:
+        self._factors = factors
+        sides = [_lit_groups(side) for side in patterns]
+        self._apart = all(sides)
+        places = {(int(row * len(sides[0])), int(column * len(sides[1]))) for row, column in _PLACES}
+        self._groups = [(sides[0][row], sides[1][column]) for row, column in sorted(places)] if self._apart else []
+        shape = len(factors[0]), len(factors[1])
+        self._frames: list[FloatArray] = [np.zeros(shape) for _ in self._groups]
+        self._variances = [0.0] * len(self._groups)
+
+    def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
+        """Add a measurement.
+
+        Parameters
+        ----------
+        measurement
+            its pattern.
+        frame
+            (m, m') as the solver takes it.
+        variance
+            mean noise variance of its data.
+        """
+        for k, ((_, rows), (_, columns)) in enumerate(self._groups):
+            weight = rows[measurement.row] * columns[measurement.column]
+            if weight:
+                self._frames[k] += weight * frame
+                self._variances[k] += weight**2 * variance
+
+    def print_part(self) -> float:
+        """Return :func:`print_part` of these frames; NaN where pixels of patterns overlap."""
+        if not self._apart:
+            return float("nan")
+        slopes = [factor_slope(side, spline=True) for side in self._factors]
+        frames = []
+        for ((rows, _), (columns, _)), frame, variance in zip(self._groups, self._frames, self._variances, strict=True):
+            lit = self._factors[0][:, rows], self._factors[1][:, columns]
+            blocks = block_indices(rows, self._factors[0].shape[1]), block_indices(columns, self._factors[1].shape[1])
+            frames.append(LitFrame(frame, variance, lit, (slopes[0][:, rows], slopes[1][:, columns]), blocks))
+        return print_part(frames)
+
+
+def _lit_groups(patterns: FloatArray) -> list[tuple[IndexArray, FloatArray]]:
+    """Return groups of scene pixels of one side, each with the weights (K,) of the measurements that add up to its light;
+    empty where pixels of patterns overlap."""
+    groups = group_pixels(patterns, "block")
+    if any(group.shared is None for group in groups):
+        return []
+    lit = [(group.pixels, group.shared[1]) for group in groups if group.shared and group.shared[1].any()]
+    return [(pixels, psi / np.dot(psi, psi)) for pixels, psi in lit]
 
 
 def print_part(frames: Sequence[LitFrame]) -> float:

@@ -1,0 +1,209 @@
+"""Checks of shifting dots: each frame against the picture that all other frames show.
+
+Under shifting dots every scene pixel is in one frame only, so that a frame of another scene, of another lamp power or of
+a moved camera fits the model as well as a right one. The only redundancy is the picture: neighbouring scene pixels are
+in different frames. A symmetric stencil of neighbours, fitted to the run itself, predicts each pixel from other frames.
+Three measurements follow from the differences r between pixels and predictions:
+
+1. the mean of log(1 + u^2) over a frame, u being r over its robust scale: a foreign frame stands out;
+2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
+   pixels and changes the predictions of its neighbours;
+3. the same mean as in 1 over windows of a few dots and one to four consecutive shots: a hand in a few frames stands out.
+
+What the picture leaves undecided is stated as a standard error of the power and of the place of single frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import uniform_filter
+from scipy.optimize import nnls
+from scipy.sparse import csr_matrix
+
+from mitsim.core.arrays import FloatArray
+
+IntArray = npt.NDArray[np.intp]
+
+_SCALES = 8.0, 4.0, 2.0, 1.0, 1.0
+"""Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
+_WINDOWS = 3, 5
+"""Dots along each side of the windows in which a disturbance is looked for."""
+_MOST = 3.0
+"""Scales at which a single pixel's difference counts in full: edges of a print reach more."""
+_POWER, _SHIFT = 0.1, 0.5
+"""Standard deviations of the power of a frame and of its place [scene pixels] before the picture is seen."""
+_FIXED = 1e12
+"""Weight with which the mean change of all frames is held at zero."""
+_LONGEST = 4
+"""Most consecutive shots in which one disturbance is looked for."""
+_FEWEST = 4
+"""Pixels for each number that is fitted, below which the picture decides nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PictureCheck:
+    """What the picture decides of the frames of a run of shifting dots, in the order of its K shots.
+
+    Attributes
+    ----------
+    power, power_error
+        (K,) relative power of each frame beyond the mean, and its standard error.
+    shift, shift_error
+        (2, K) place of each frame along rows and columns [scene pixels], and its standard error.
+    foreign, disturbed
+        (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
+    frame_of
+        (n, n') number of the shot that lights each pixel.
+    """
+
+    power: FloatArray
+    power_error: FloatArray
+    shift: FloatArray
+    shift_error: FloatArray
+    foreign: FloatArray
+    disturbed: FloatArray
+    frame_of: IntArray
+
+    def uncertainty(self, image: FloatArray) -> FloatArray:
+        """Return (n, n') standard uncertainty of an ``image`` (n, n'), because the picture does not decide the power and
+        the place of single frames: the larger of their errors and of their scatter over the frames."""
+        power = np.maximum(self.power_error, robust_scatter(self.power))[self.frame_of]
+        slopes = np.gradient(image)
+        moves = [np.maximum(error, robust_scatter(own)) for own, error in zip(self.shift, self.shift_error, strict=True)]
+        parts = [image * power, *(slope * move[self.frame_of] for slope, move in zip(slopes, moves, strict=True))]
+        return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
+
+
+def robust_scatter(values: FloatArray) -> float:
+    """Return 1.4826 times the median absolute deviation, which is the standard deviation of normal numbers."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def check_picture(image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray) -> PictureCheck | None:
+    """Compare each frame of shifting dots with the picture of the others; None where the picture is too small.
+
+    Parameters
+    ----------
+    image
+        (n, n') the image, reflectance.
+    frame_of
+        (n, n') number of the shot that lights each pixel.
+    periods
+        scene pixels from one dot to the next along rows and columns.
+    noise
+        (n, n') variance of the image by the frames' noise.
+    """
+    count = int(frame_of.max()) + 1
+    stencil = _Stencil(image, frame_of)
+    if not stencil.offsets or stencil.pixels.size < _FEWEST * (count + len(stencil.offsets)):
+        return None
+    power, power_error, differences = stencil.fit([image], count, noise, _POWER)
+    # A shift is looked for in the picture without the powers, because in even parts these look like a slope.
+    even = image / np.maximum(1 + power, _POWER)[frame_of]
+    shift, shift_error, _ = _Stencil(even, frame_of).fit([*np.gradient(even)], count, noise, _SHIFT)
+    own = frame_of.ravel()[stencil.pixels]
+    lit = np.maximum(np.bincount(own, minlength=count), 1)
+    roughness = np.log1p(np.square(differences))
+    means = np.bincount(own, roughness, count) / lit
+    foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
+    disturbed = _disturbed(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
+    return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed, frame_of)
+
+
+def _disturbed(
+    stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int
+) -> FloatArray:
+    """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later ones.
+
+    ``moved`` are the differences of pixels from their predictions in units of their scale, limited.
+    """
+    places = np.unravel_index(stencil.pixels, stencil.shape)
+    cells = [place // period for place, period in zip(places, periods, strict=True)]
+    shape = count, *(-(-size // period) for size, period in zip(stencil.shape, periods, strict=True))
+    index = np.ravel_multi_index((own, *cells), shape)
+    parts = [np.bincount(index, weights, int(np.prod(shape))).reshape(shape) for weights in (moved, moved**2, None)]
+    found, spread = np.zeros(count), float(np.mean(np.square(moved)))
+    for dots in _WINDOWS:
+        light, power, lit = (uniform_filter(part * 1.0, (0, dots, dots), mode="constant") * dots**2 for part in parts)
+        # Windows over a texture of the print scatter more than others, in all frames.
+        usual = np.maximum(np.median(power / np.maximum(lit, 1), axis=0), spread)
+        for length in range(1, min(_LONGEST, count // 3) + 1):
+            runs = range(count - length + 1)
+            total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
+            scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
+            for k, worst in enumerate(scores.max(axis=(1, 2))):
+                found[k : k + length] = np.maximum(found[k : k + length], worst)
+    return found
+
+
+class _Stencil:
+    """Predicts pixels from the means of pairs of opposite neighbours, none of which is in the pixel's own frame."""
+
+    def __init__(self, image: FloatArray, frame_of: IntArray) -> None:
+        self.shape, self._image, self._frames = image.shape, image.ravel(), frame_of.ravel()
+        reach = [2 if size >= 24 else 1 for size in self.shape]
+        inner = (np.arange(far, size - far) for far, size in zip(reach, self.shape, strict=True))
+        self.pixels: IntArray = np.ravel_multi_index(np.meshgrid(*inner, indexing="ij"), self.shape).ravel()
+        width, own = self.shape[1], self._frames[self.pixels]
+        offsets = [y * width + x for y in range(reach[0] + 1) for x in range(-reach[1], reach[1] + 1) if y or x > 0]
+        self.offsets = [
+            each
+            for each in offsets
+            if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
+        ]
+
+    def fit(
+        self, changes: Sequence[FloatArray], count: int, noise: FloatArray, prior: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fit the stencil together with how far each frame is off by each of the ``changes`` (n, n').
+
+        Returns the parameters of the changes, len(changes) ``count`` of them, their standard errors, and the differences
+        of the pixels from their predictions in units of their scale. Least squares are reweighted by Cauchy's weights;
+        parameters have a normal ``prior``; errors are those of the sandwich estimator (Huber 1967), which does not take
+        differences for normal numbers.
+
+        The stencil has no negative weights, because these imitate a lamp that flickers in the period of the dots. A
+        stencil along the other direction may still do so, and the errors of the parameters then say it.
+        """
+        target = self._image[self.pixels]
+        pairs = [(self._image[self.pixels + each] + self._image[self.pixels - each]) / 2 for each in self.offsets]
+        own, floor = np.stack([*pairs, np.ones(len(target)), -np.ones(len(target))], axis=1), 1e-9 * float(np.abs(target).max()) + 1e-300
+        stencil, found = np.full(own.shape[1], 1.0 / len(pairs)), np.zeros(len(changes) * count)
+        # The same change of all frames is a change of the picture, and is left out.
+        known = np.eye(len(found)) / prior**2 + np.kron(np.eye(len(changes)), np.full((count, count), _FIXED))
+        for wider in _SCALES:
+            design = self._sensitivity(changes, count, stencil[: len(pairs)])
+            left_over = target - own @ stencil - design @ found
+            scale = np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + noise.ravel()[self.pixels]), floor)
+            weights = 1 / (np.square(wider * scale) + np.square(left_over))
+            moved = target - design @ found
+            normal = own.T @ (weights[:, None] * own)
+            normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
+            root = np.linalg.cholesky(normal)
+            stencil = nnls(root.T, np.linalg.solve(root, own.T @ (weights * moved)))[0]
+            design = self._sensitivity(changes, count, stencil[: len(pairs)])
+            weighted = design.multiply(weights[:, None]).tocsr()
+            inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
+            found = inverse @ (weighted.T @ (target - own @ stencil))
+        left_over = target - own @ stencil - design @ found
+        scores = weighted.multiply(left_over[:, None]).tocsr()
+        covariance = inverse @ ((scores.T @ scores).toarray() + known) @ inverse
+        spare = max(len(target) - len(found), 1) / len(target)
+        return found, np.sqrt(np.diag(covariance) / spare), left_over / scale
+
+    def _sensitivity(self, changes: Sequence[FloatArray], count: int, stencil: FloatArray) -> csr_matrix:
+        """Return the change of pixels less their predictions (pixels, len(changes) count) with a ``stencil``."""
+        place, terms = np.arange(len(self.pixels)), [(0, 1.0)]
+        for offset, weight in zip(self.offsets, stencil, strict=True):
+            terms += [(offset, -weight / 2), (-offset, -weight / 2)]
+        parts = [
+            (weight * change.ravel()[self.pixels + offset], place, self._frames[self.pixels + offset] + number * count)
+            for number, change in enumerate(changes)
+            for offset, weight in terms
+        ]
+        values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return csr_matrix((values, (rows, columns)), shape=(len(place), len(changes) * count))

@@ -1,0 +1,270 @@
+"""Other readings of a run's frames: turned frames, shots in another order, numbers with a tone curve, and lag.
+
+Each reading is fitted by the same factorised model, on a part of the sensor that is large enough to decide. Its misfit
+is the energy of numbers that the model leaves, in the numbers as they were read: for light g(y) of numbers y, the model
+H g(y) is mapped back by the inverse of g. All misfits are therefore compared with the same noise.
+
+A reading is offered if it explains nearly all that the frames as they are leave unexplained. All readings that fit as
+well as the best one within noise are offered, because a symmetric camera cannot decide between them: with equal masks on
+both sides, transposed frames and shots of a loop over columns leave the same misfit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.devices.patterns import shot_orders
+from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.residuals import CHANCE, TINY
+from mitsim.reconstruct.solver import Prepared, prepare
+
+_FITS, _AT_MOST = 0.05, 2e-2
+"""Part of the unexplained energy, and of the measurements, rms, that a reading may leave."""
+_ALIKE = 0.02
+"""Relative difference of misfits up to which two readings fit alike."""
+_ROWS = 2.0
+"""Sensor rows for each scene row, at least, of the part of the sensor that decides."""
+_EXPONENTS, _LAGS = (0.3, 3.0), (0.0, 0.5)
+"""Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before."""
+_LINEAR, _NO_LAG = 0.05, 2e-3
+"""Differences from an exponent of one, and lag, that are no readings of their own."""
+_MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
+"""Chi-square of multiplied numbers over their factor, and at least: their shot noise is that many times too large, and
+0.3 of it if the black level was multiplied, too."""
+
+_TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "as they are": lambda frame: frame,
+    "upside down, their rows reversed": lambda frame: frame[::-1],
+    "mirrored, their columns reversed": lambda frame: frame[:, ::-1],
+    "turned by 180 degrees": lambda frame: frame[::-1, ::-1],
+    "transposed, their rows and columns exchanged": lambda frame: frame.T,
+    "turned by 90 degrees counter-clockwise": lambda frame: np.rot90(frame, -1),
+    "turned by 90 degrees clockwise": lambda frame: np.rot90(frame),
+    "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
+}
+"""States of frames, and the turns that bring them back."""
+_KEPT, _TAKEN = "as they are", "row-major"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading that restores the fit: ``words`` for people, ``order`` for `mitsim import --order` where it is one, and
+    the part of the measurements, rms, that it ``left``."""
+
+    words: str
+    left: float = 0.0
+    order: str | None = None
+
+    def summary(self) -> dict[str, object]:
+        """Return the entry of result.json."""
+        return {"words": self.words, "order": self.order, "unexplained": self.left}
+
+
+def multiple(factor: int, chi_square: float) -> Reading | None:
+    """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its ``chi_square``."""
+    if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
+        return None
+    words = f"divided by {factor}, because all numbers are multiples of it"
+    return Reading(words if factor & (factor - 1) else f"{words}: few bits were moved up by {factor.bit_length() - 1}")
+
+
+def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
+    """Return the readings that restore the fit of a run, the best first; empty if none does.
+
+    Parameters
+    ----------
+    data
+        the run.
+    ratio
+        measured over stated variance of the noise.
+    beside
+        energy of all measurements that rendering, calibration and print add.
+    """
+    run = _Part(data)
+    if run.prepared.spare <= 0:
+        return ()
+    noise = ratio * float(data.noise.variance.sum()) * run.size * run.prepared.spare
+    whole = max(run.energy, TINY)
+    allowed = noise + beside * run.energy / max(float(data.frames.energy), TINY)
+    chance = CHANCE * noise * float(np.sqrt(2 / max(run.size * data.noise.variance.size * run.prepared.spare, 1)))
+    now = run.misfit(_KEPT, _TAKEN)
+    unexplained = max(now - allowed, 0.0)
+    if unexplained <= chance:
+        return ()
+    found = [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.candidates()]
+    most = allowed + max(_FITS * unexplained, min(chance, unexplained / 2))
+
+    def fits(misfit: float) -> bool:
+        return misfit < most and max(misfit - allowed, 0.0) < _AT_MOST**2 * whole
+
+    if not any(fits(misfit) for _, misfit in found):
+        found += [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.combinations()]
+    if not any(fits(misfit) for _, misfit in found):
+        found += run.curves()
+    good = sorted((each for each in found if fits(each[1])), key=lambda each: each[1])
+    if not good:
+        return ()
+    limit = good[0][1] * (1 + _ALIKE) + chance
+    seen: dict[str, Reading] = {}
+    for (words, order), misfit in good:
+        if misfit <= limit:
+            left = float(np.sqrt(max(misfit - allowed, 0.0) / whole))
+            seen.setdefault(words, Reading(words, left, order))
+    return tuple(seen.values())
+
+
+def _describe(turn: str, order: str) -> tuple[str, str | None]:
+    """Return the words of a reading, and the order where it is one."""
+    parts = [] if turn == _KEPT else [f"with frames that are {turn}"]
+    parts += [] if order == _TAKEN else [f"taken in the order {order}"]
+    return " and ".join(parts), None if order == _TAKEN else order
+
+
+class _Part:
+    """A run's shots on a part of the sensor, with the model of this part."""
+
+    def __init__(self, data: Accumulation) -> None:
+        manifest = data.shots.manifest
+        left, right = (np.asarray(side) for side in (data.factors.left, data.factors.right))
+        steps = [max(int(len(side) / (_ROWS * side.shape[1])), 1) for side in (left, right)]
+        self._part = tuple(slice(None, None, step) for step in steps)
+        patterns = data.shots.patterns
+        self.prepared: Prepared = prepare(
+            left[self._part[0]], right[self._part[1]], *patterns, centre=data.prepared.centre
+        )
+        self._captures = manifest.patterns.captures
+        self._signed = any(shot.sign for shot in self._captures)
+        self._dark = data.digital.dark_current_e_per_s
+        number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._captures)}
+        frames: list[FloatArray] = [np.zeros(())] * len(self._captures)
+        for each in data.measurements_again():
+            halves = [(0, each.frame)]
+            if each.shots == 2:
+                halves = [(1, (each.light + each.frame) / 2), (-1, (each.light - each.frame) / 2)]
+            for sign, light in halves:
+                frames[number[each.row, each.column, sign]] = light.astype(np.float32)
+        self._turned: dict[str, list[FloatArray]] = {}
+        self._frames, shape = frames, frames[0].shape
+        self._turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape]
+        self.orders = shot_orders(manifest.patterns, getattr(manifest, "order", None))
+        self.orders.setdefault(_TAKEN, np.arange(len(frames)))
+        self.orders |= {
+            "one step late (each shot shows the pattern of the shot before)": np.roll(np.arange(len(frames)), -1),
+            "one step early (each shot shows the pattern of the next)": np.roll(np.arange(len(frames)), 1),
+        }
+        self.size = len(range(*self._part[0].indices(shape[0]))) * len(range(*self._part[1].indices(shape[1])))
+        self.energy = sum(sum_of_squares(frame) for _, frame in self._measured(self._shots(_KEPT, _TAKEN)))
+
+    def candidates(self) -> Iterator[tuple[str, str]]:
+        """Yield turns alone and orders alone."""
+        yield from ((turn, _TAKEN) for turn in self._turns if turn != _KEPT)
+        yield from ((_KEPT, order) for order in self._distinct())
+
+    def combinations(self) -> Iterator[tuple[str, str]]:
+        """Yield turns with orders."""
+        yield from product([turn for turn in self._turns if turn != _KEPT], self._distinct())
+
+    def _distinct(self) -> list[str]:
+        """Return orders that differ from each other, and from the one that was taken."""
+        seen, found = {tuple(self.orders[_TAKEN])}, []
+        for name, order in self.orders.items():
+            if tuple(order) not in seen:
+                seen.add(tuple(order))
+                found.append(name)
+        return found
+
+    def curves(self) -> list[tuple[tuple[str, str | None], float]]:
+        """Return the best tone curve and the best lag, with their misfits."""
+        shots = self._shots(_KEPT, _TAKEN)
+
+        def bent(exponent: float) -> float:
+            return self._bent_misfit(shots, exponent)
+
+        def lagging(part: float) -> float:
+            earlier = [np.zeros_like(shots[0]), *shots[:-1]]
+            now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
+            return self._misfit(now) * (1 - part) ** 2
+
+        found = []
+        if not self.prepared.centre:  # without means of rows and columns, no number is known
+            best = minimize_scalar(lambda log: bent(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded")
+            if abs(best.x) > _LINEAR:
+                words = f"with a tone curve: the numbers are the light to the power of {np.exp(-best.x):.2g}"
+                found.append(((words, None), float(best.fun)))
+        if not self._signed:
+            best = minimize_scalar(lagging, bounds=_LAGS, method="bounded")
+            if best.x > _NO_LAG:
+                found.append(((f"with lag: each frame holds {best.x:.1%} of the frame before", None), best.fun))
+        return found
+
+    def misfit(self, turn: str, order: str) -> float:
+        """Return the energy that the model leaves; infinite where the image would be negative in the mean."""
+        return self._misfit(self._shots(turn, order))
+
+    def _shots(self, turn: str, order: str) -> list[FloatArray]:
+        if turn not in self._turned:
+            bring_back = _TURNS[turn]
+            self._turned[turn] = [
+                np.ascontiguousarray(bring_back(frame)[self._part]).astype(np.float64) for frame in self._frames
+            ]
+        shots = self._turned[turn]
+        return [shots[index] for index in self.orders[order]]
+
+    def _measured(self, shots: Sequence[FloatArray]) -> Iterator[tuple[tuple[int, int], FloatArray]]:
+        """Yield pattern and frame of every measurement: the difference of a signed pattern's halves."""
+        waiting: dict[tuple[int, int], FloatArray] = {}
+        for capture, light in zip(self._captures, shots, strict=True):
+            pattern = capture.row, capture.column
+            if not capture.sign:
+                yield pattern, self.prepared.as_solved(light)
+            elif pattern in waiting:
+                yield pattern, self.prepared.as_solved(waiting.pop(pattern) + capture.sign * light)
+            else:
+                waiting[pattern] = capture.sign * light
+
+    def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+        weights = np.zeros_like(self.prepared.sigma)
+        energy = 0.0
+        for pattern, frame in self._measured(shots):
+            weights[self.prepared.places(pattern)] += self.prepared.weights(frame, pattern)
+            energy += sum_of_squares(frame)
+        return np.where(self.prepared.sigma > 0, weights, 0.0), energy
+
+    def _misfit(self, shots: Sequence[FloatArray]) -> float:
+        weights, energy = self._weights(shots)
+        sigma = self.prepared.sigma
+        gain = sigma / (np.square(sigma) + 1e-4 * float(sigma.max()) ** 2)
+        if self.prepared.image(gain * weights).mean() <= 0:
+            return float("inf")
+        return energy - sum_of_squares(weights)
+
+    def _bent_misfit(self, shots: Sequence[FloatArray], exponent: float) -> float:
+        """Return the misfit, in numbers as they were read, of light that is their power ``exponent``."""
+        top = max(float(shot.max()) for shot in shots) + self._dark or 1.0
+
+        def bend(values: FloatArray, power: float) -> FloatArray:
+            return np.asarray(np.sign(values) * np.abs(values) ** power)
+
+        bent = [bend((shot + self._dark) / top, exponent) for shot in shots]
+        even = bend(np.array(self._dark / top), exponent)
+        linear = [shot - even for shot in bent]
+        weights, _ = self._weights(linear)
+        total = 0.0
+        if self._signed:  # the halves of a pair are known by their sum, which is the same for all pairs
+            mean = 2 * np.mean(linear, axis=0)
+            frames = {pattern: self.prepared.frame(weights, pattern) for pattern, _ in self._measured(linear)}
+            for capture, shot in zip(self._captures, shots, strict=True):
+                model = (mean + capture.sign * frames[capture.row, capture.column]) / 2
+                total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
+            spare = self.prepared.spare
+            return total * 2 * spare / (1 + spare)
+        for capture, shot in zip(self._captures, shots, strict=True):
+            model = self.prepared.frame(weights, (capture.row, capture.column))
+            total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
+        return total

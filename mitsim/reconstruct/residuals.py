@@ -1,0 +1,367 @@
+"""Residuals of all measurements against the factorised model, and the tests that need nothing else.
+
+Of data Y the model explains what lies in its range, H Y = U_L U_L^T Y U_R U_R^T, whatever the image. The residual e = Y -
+H Y therefore depends on no lambda. With noise of variance v in all data, its mean square at a datum is v (1 - h), h
+being the diagonal of H, which is a product of the two sides.
+
+*Noise.* Second differences along rows and along columns hardly see what is smooth, such as light that the model lacks.
+Their mean square over 36 v, less the part that H takes, is the ratio of measured to stated noise. It is taken by tiles of
+single frames, of which the median is not moved by a few frames or places that are wrong. Numbers that were divided by a
+gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope of the
+noise over the light is rho times the stated one, whatever the read noise is.
+
+*Map.* Energies by tile, row and column, of the first half of the shots beside the second, and for each pixel the sum of
+residuals and their slope over the light. Each is divided by its own robust scatter, so that a fault that is everywhere
+does not hide behind one that is in one place, and sensors of uneven response raise no alarm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.core.runs import Measurement
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
+from mitsim.reconstruct.picture_check import robust_scatter
+
+CHANCE = 6.0
+"""Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
+TINY = 1e-300
+"""Replaces 0 in a denominator."""
+_TILES = 8
+"""Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
+_NOISE_TILE, _NOISE_ROWS = 16, 160
+"""Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
+_NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
+"""Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
+are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
+_CORRELATED = (70 / 36) ** 2
+"""Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
+_ALIKE = 1e-3
+"""Squared sine between sum and difference of a pair's halves, below which one of them is as good as black."""
+_PLACE, _PLACE_ENERGY = 7.0, 0.02
+"""Robust deviations from which a place stands out, and the part of the expected energy that its residual must exceed."""
+
+
+@dataclass(frozen=True)
+class NoiseTest:
+    """Noise of the frames as they show it, over what is stated.
+
+    Attributes
+    ----------
+    ratio, error
+        measured variance over the stated one, and its standard error.
+    gain, gain_error
+        gain that the noise shows over the stated one; NaN where brightness hardly differs.
+    """
+
+    ratio: float
+    error: float
+    gain: float
+    gain_error: float
+
+    def off(self, stated: bool, beside: float) -> bool:
+        """Return True if the noise is not what is stated.
+
+        Parameters
+        ----------
+        stated
+            whether read noise is stated; otherwise only the slope over the light is compared.
+        beside
+            energy that calibration and rendering add, over that of the noise.
+        """
+        if not stated:
+            known = self.gain_error < _SLOPE_KNOWN
+            return bool(known and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error)
+        chance = CHANCE * self.error
+        return self.ratio < 1 - _NOISE_OFF - chance or self.ratio > (1 + beside) * (1 + _NOISE_OFF) + chance
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How the sum of a signed pattern's halves differs from those of all other pairs, which are the same light.
+
+    Attributes
+    ----------
+    common, apart
+        relative power of both halves beyond the mean, and of the first beyond the second.
+    error
+        standard error of either, for noise of variance 1.
+    rest
+        energy that no power of the halves explains.
+    side
+        correlation of the rest with the residual of the difference: 1 if the first half is wrong, -1 if the second is.
+    cost
+        energy that the powers put into the difference.
+    """
+
+    common: float
+    apart: float
+    error: float
+    rest: float
+    side: float
+    cost: float
+
+    @classmethod
+    def of(cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray) -> Pair:
+        """Fit ``beyond`` = common ``total`` + apart ``difference`` by least squares; all (m, m')."""
+        whole, apart, shared = sum_of_squares(total), sum_of_squares(difference), float(np.vdot(total, difference))
+        square = whole * apart - shared**2
+        powers, error = np.zeros(2), 0.0
+        if square > _ALIKE * whole * apart:  # one half is black otherwise
+            normal = np.array([[whole, shared], [shared, apart]])
+            powers = np.linalg.solve(normal, [float(np.vdot(beyond, total)), float(np.vdot(beyond, difference))])
+            error = float(np.sqrt(np.linalg.inv(normal).trace() / 2))
+        rest = beyond - powers[0] * total - powers[1] * difference
+        energies = sum_of_squares(rest), sum_of_squares(residual)
+        side = float(np.vdot(rest, residual)) / max(float(np.sqrt(energies[0] * energies[1])), TINY)
+        cost = float(powers[0] ** 2 * apart + powers[1] ** 2 * whole)
+        return cls(float(powers[0]), float(powers[1]), error, energies[0], side, cost)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Part of the sensor or of the session where frames do not fit: its ``words``, and its unexplained ``energy``."""
+
+    words: str
+    energy: float
+
+
+class Residuals:
+    """Sums over what the model leaves of every measurement; made by one reading of all frames.
+
+    Attributes
+    ----------
+    energy, power
+        (tiles, tiles) sums of the squares of measurements and of shots.
+    pixels
+        (tiles, tiles) pixels of each tile.
+    squares
+        (m, m') sum of the squares of residuals of each sensor pixel.
+    left, leave_out
+        (K, K') energy of a pattern's residual, and e^T (I - H_kk)^-1 e, what is left of it when the others predict it.
+    shots
+        (K, K') energy of a pattern's shots.
+    free
+        (K, K') data of a pattern that others predict too.
+    fitted
+        (K, K') product of a pattern's residual and of what the model has of it.
+    pairs
+        by signed pattern, what the sum of its halves differs by from the sums of all other pairs.
+    same, clipped
+        patterns and halves by a number that equal frames share, and readings at the largest number of such a frame.
+    """
+
+    def __init__(self, data: Accumulation, light: FloatArray | None = None) -> None:
+        """Read all measurements of ``data``, less a ``light`` (m, m') that was in every one of them."""
+        prepared, self.noise = data.prepared, data.noise
+        self._prepared, self._light = prepared, light
+        sizes = prepared.left.sensor_size, prepared.right.sensor_size
+        edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
+        self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
+        self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
+        counts = prepared.left.pattern_count, prepared.right.pattern_count
+        self.left, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
+        self.pairs: dict[tuple[int, int], Pair] = {}
+        self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
+        self.clipped: dict[tuple[tuple[int, int], int], int] = {}
+        self.squares, self._sum, self._slope, self._slope_weight = (np.zeros(sizes) for _ in range(4))
+        self.halves = np.zeros((2, *sizes))
+        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
+        self.weights = data.weights if light is None else data.weights - common_weights(data, light)
+        self._grams = [[_gram(slab.matrix) for slab in side.slabs] for side in (prepared.left, prepared.right)]
+        self._rough = [
+            [float(np.square(np.diff(slab.matrix, 2, axis=0)).sum()) for slab in side.slabs]
+            for side in (prepared.left, prepared.right)
+        ]
+        self._noises: list[FloatArray] = []
+        total = max(counts[0] * counts[1], 1)
+        for number, measurement in enumerate(data.measurements_again()):
+            self._add(measurement, 2 * number >= total)
+
+    def _add(self, measurement: Measurement, late: bool) -> None:
+        pattern, prepared = (measurement.row, measurement.column), self._prepared
+        frame = prepared.as_solved(measurement.frame if self._light is None else measurement.frame - self._light)
+        left, right = prepared.slabs(pattern)
+        modelled = left.matrix @ self.weights[left.columns][:, right.columns] @ right.matrix.T
+        residual = frame - modelled
+        squared = np.square(residual)
+        self.squares += squared
+        self.halves[int(late)] += squared
+        self._sum += residual
+        self._slope += residual * modelled
+        self._slope_weight += np.square(modelled)
+        energy = self._tiles(np.square(frame))
+        light = energy if frame is measurement.light else self._tiles(np.square(measurement.light))
+        if measurement.shots == 2:  # as Measurement.power has it
+            light = (light + energy) / 2
+        self.energy += energy
+        self.power += light
+        self.shots[pattern], self.left[pattern] = float(light.sum()), float(squared.sum())
+        (turn, own), (other_turn, other) = (self._grams[side][index] for side, index in enumerate(pattern))
+        known = np.outer(own, other)
+        alone = known > 1 - 1e-6
+        self.free[pattern] = residual.size - np.count_nonzero(alone)
+        self.leave_out[pattern] = self.left[pattern]
+        if not alone.all():
+            seen = turn.T @ (left.matrix.T @ residual @ right.matrix) @ other_turn
+            self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
+        self.fitted[pattern] = float(np.vdot(residual, modelled))
+        self._noises.append(self._noise_tiles(measurement, residual, pattern))
+        for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
+            self.same.setdefault(digest, []).append((pattern, half))
+            if cut:
+                self.clipped[pattern, half] = cut
+        others = self.noise.variance.size - 1
+        if measurement.shots == 2 and others:
+            beyond = (measurement.light * (1 + others) - self.noise.light) / others
+            self.pairs[pattern] = Pair.of(beyond, measurement.light, measurement.frame, residual)
+
+    def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
+        """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
+        rows = slice(0, min(len(residual), _NOISE_ROWS))
+        rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1))
+        light = measurement.light[rows][1:-1, 1:-1]
+        size = 36 * (len(residual) - 2) * (residual.shape[1] - 2)
+        spare = 1 - self._rough[0][pattern[0]] * self._rough[1][pattern[1]] / max(size, 1)
+        if min(rough.shape) < 1 or spare <= 0.1:
+            return np.zeros((3, 0))
+        starts = [np.arange(max(length // _NOISE_TILE, 1)) * _NOISE_TILE for length in rough.shape]
+        sums = [np.add.reduceat(np.add.reduceat(each, starts[0], 0), starts[1], 1).ravel() for each in (rough, light)]
+        counts = np.outer(*(np.diff([*start, length]) for start, length in zip(starts, rough.shape, strict=True)))
+        pixels = counts.ravel().astype(np.float64)
+        return np.stack([sums[0] / (36 * spare * pixels), sums[1] / pixels, pixels])
+
+    @cached_property
+    def noise_test(self) -> NoiseTest | None:
+        """The measured noise; None of frames that are too small."""
+        found, light, pixels = np.concatenate(self._noises, axis=1)
+        if not found.size or not found.any():
+            return None
+        freedom = pixels / _CORRELATED
+        stated = np.maximum(self.noise.of(light, self.noise.shots), TINY)
+        ratios = found / stated / (1 - 2 / (9 * freedom)) ** 3
+        ratio = float(np.median(ratios))
+        spread = np.sqrt(2 / freedom)
+        error = float(ratio * np.sqrt(np.pi / 2) * spread.mean() / np.sqrt(len(found)))
+        kept = np.abs(found / stated / ratio - 1) < 5 * spread
+        weights = 1 / np.square(ratio * stated * spread)[kept]
+        columns = np.stack([light[kept], np.ones(int(kept.sum()))], axis=1)
+        normal = columns.T @ (weights[:, None] * columns)
+        if kept.sum() < 8 or np.linalg.cond(normal / np.sqrt(np.outer(*2 * [np.diag(normal)]))) > 1e6:
+            return NoiseTest(ratio, error, float("nan"), float("inf"))
+        slope, _ = np.linalg.solve(normal, columns.T @ (weights * found[kept]))
+        own = float(self.noise.of(1.0, self.noise.shots) - self.noise.of(0.0, self.noise.shots))
+        return NoiseTest(ratio, error, float(slope) / own, float(np.sqrt(np.linalg.inv(normal)[0, 0])) / own)
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(tiles, tiles) sum of the stated variance of the noise."""
+        # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
+        count = self.noise.variance.size
+        light = self._tiles(self.noise.light) / self.pixels / count
+        return self.noise.of(light, self.noise.shots) * self.pixels * count
+
+    @property
+    def residual(self) -> FloatArray:
+        """(tiles, tiles) sum of the squares of residuals."""
+        return self._tiles(self.squares)
+
+    def expected(self, ratio: float, beside: float) -> FloatArray:
+        """Return (tiles, tiles) the energy that residuals should have.
+
+        Parameters
+        ----------
+        ratio
+            measured over stated variance of the noise.
+        beside
+            energy that the factors' noise adds, evenly.
+        """
+        rendering = self.noise.rendering * self.power / max(float(self.power.sum()), TINY)
+        noise = ratio * self.variance * self._prepared.spare
+        return np.asarray(noise + rendering + beside * self.pixels / self.pixels.sum())
+
+    @cached_property
+    def _freedom(self) -> FloatArray:
+        """(m, m') degrees of freedom of the residuals of each pixel: K (1 - h)."""
+        sides = (self._prepared.left, self._prepared.right)
+        left, right = (sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides)
+        return np.asarray(np.maximum(self.noise.variance.size - np.outer(left, right), 1e-3))
+
+    def places(self, ratio: float) -> list[Place]:
+        """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first.
+
+        ``ratio`` is that of measured to stated noise.
+        """
+        count = self.noise.variance.size
+        variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
+        expected = variance * self._freedom
+        least = _PLACE_ENERGY * float(expected.sum())
+        found = []
+        late, early = (self._tiles(half) for half in self.halves[::-1])
+        groups = {
+            "tile": (self._tiles(self.squares), self._tiles(expected), self._tiles(self._freedom)),
+            "row": tuple(each.sum(axis=1) for each in (self.squares, expected, self._freedom)),
+            "column": tuple(each.sum(axis=0) for each in (self.squares, expected, self._freedom)),
+            "late": (late - early, self._tiles(expected), self._tiles(self._freedom)),
+        }
+        for name, (squares, own, freedom) in groups.items():
+            off = (squares / own - (name != "late")) / np.sqrt(2 / freedom)
+            away = (off - np.median(off)) / max(robust_scatter(off), 1.0)
+            beyond = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
+            if name == "late":
+                beyond += np.where(away < -_PLACE, -squares, 0.0)
+            if beyond.sum() > least:
+                found.append(Place(_words(name, beyond), float(beyond.sum())))
+        mean = {"offset": self._sum / np.sqrt(expected), "gain": self._slope / np.sqrt(variance * self._slope_weight + TINY)}
+        for off in mean.values():
+            away = np.abs(off - np.median(off)) / max(robust_scatter(off), 1.0)
+            beyond = np.where(away > _PLACE, np.maximum(self.squares - expected, 0.0), 0.0)
+            if beyond.sum() > least:
+                found.append(Place(_words("pixel", beyond), float(beyond.sum())))
+        return sorted(found, key=lambda place: -place.energy)
+
+    def _tiles(self, values: FloatArray) -> FloatArray:
+        # Not reduceat along the rows: it takes five times as long.
+        rows = np.stack([values[strip].sum(axis=0) for strip in self._strips])
+        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
+
+
+def common_weights(data: Accumulation, light: FloatArray) -> FloatArray:
+    """Return what one ``light`` (m, m') in every measurement adds to the coefficients W (r, r') of all."""
+    left, right = data.prepared.left.common, data.prepared.right.common
+    return np.asarray(left.T @ data.prepared.as_solved(light) @ right)
+
+
+def common_energy(data: Accumulation, light: FloatArray) -> float:
+    """Return the energy outside the model's range of one ``light`` (m, m') in every measurement."""
+    whole = data.noise.variance.size * sum_of_squares(data.prepared.as_solved(light))
+    return max(whole - sum_of_squares(common_weights(data, light)), 0.0)
+
+
+def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return eigenvectors and eigenvalues, 0 to 1, of U^T U of a ``slab`` U (m, c)."""
+    values, vectors = np.linalg.eigh(slab.T @ slab)
+    return vectors, np.clip(values, 0.0, 1.0)
+
+
+def _words(name: str, beyond: FloatArray) -> str:
+    """Return where the energy ``beyond`` is: by rows and columns of the sensor, or tiles of it."""
+    if name in ("row", "column"):
+        lines = np.flatnonzero(beyond)
+        return f"sensor {name}{'s' if len(lines) > 1 else ''} {_span(lines)}"
+    rows, columns = (_span(np.unique(each)) for each in np.nonzero(beyond))
+    if name == "pixel":
+        return f"{np.count_nonzero(beyond)} pixels in rows {rows}, columns {columns}"
+    of = f" of {beyond.shape[0]} x {beyond.shape[1]} tiles"
+    when = " in one half of the session" if name == "late" else ""
+    return f"tile rows {rows}, columns {columns}{of}{when}"
+
+
+def _span(numbers: FloatArray) -> str:
+    first, last = int(numbers[0]), int(numbers[-1])
+    return f"{first}" if first == last else f"{first} to {last}"
