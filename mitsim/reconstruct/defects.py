@@ -135,8 +135,8 @@ class LeftOut(DerivedCapture):
         for each in self._data.measurements_again():
             frame, light = each.frame.copy(), each.light.copy()
             frame[places] += self.moved[each.row, each.column]
-            # Of a pair's sum nothing is told but that it is no less than the difference.
-            light[places] = np.abs(frame[places])
+            # The sum of a pair's halves is that of all pairs.
+            light[places] = frame[places] if each.shots == 1 else self._data.noise.light[places] / len(self.moved)
             yield replace(each, frame=frame, light=light)
 
 

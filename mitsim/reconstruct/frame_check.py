@@ -9,7 +9,7 @@ at the end of the session and is compared with the frames before it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ Pattern = tuple[int, int]
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
-_MORE, _LEADING, _MOST_BAD = 4.0, 0.1, 0.25
+_MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 """Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
 does not fit as a whole, and no single frames are named."""
 _FOREIGN, _DISTURBED = 6.5, 8.5
@@ -35,19 +35,24 @@ print of a regular texture imitates smaller ones; all are part of the uncertaint
 _COSTS, _FEWEST_PAIRS, _MEDIAN_SQUARE = 0.5, 4, 0.455
 """Energy of a flicker over that of noise from which it is reported; pairs that are needed; and the median of the square
 of a normal number."""
+_SCATTERS = 4.0
+"""Scatters of the power up to which the difference of a single frame is that of a flicker."""
+_OUTLIER, _DIMMED = 6.5, 0.02
+"""Robust deviations, and change, from which the power of a single frame is reported."""
 _MOST_NUMBERS = 3e7
 """Numbers that the joint fit of all powers may keep in memory."""
 
 
 @dataclass(frozen=True)
 class FrameFault:
-    """Shots that do not fit the others: ``kind`` of the test, ``numbers`` from 0 in the manifest's order, ``files``, and
-    ``words`` for people."""
+    """Shots that do not fit the others: ``kind`` of the test, ``numbers`` from 0 in the manifest's order, ``files``,
+    ``words`` for people, and the part of their light, rms, by which they differ."""
 
     kind: str
     numbers: tuple[int, ...]
     files: tuple[str, ...]
     words: str
+    part: float = 0.0
 
     def __str__(self) -> str:
         return self.words
@@ -80,17 +85,36 @@ class FrameCheck:
         self._signed = any(shot.sign for shot in self._shots)
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
         self._exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
+        self._numbers = [self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*self._variance.shape)]
         self.picture = self._check_picture(lam) if self._exclusive else None
         self.power = self._joint_powers() if not (self._signed or self._exclusive) else None
 
     def faults(self, by_model: bool = True) -> tuple[FrameFault, ...]:
         """Return all frames that do not fit; ``by_model`` False for a scene that the model fits in part only."""
-        found = [*self._equal(), *self._clipped()]
-        found += [*self._unlike_model()] if by_model else []
-        found += [*self._unlike_picture(), *self._flicker(), *self._closing()]
-        return tuple(found)
+        found = [*self._dark(), *self._equal(), *self._clipped()]
+        by_others = [*self._unlike_model()] if by_model else []
+        powers = [*self._unlike_picture(), *self._flicker()]
+        # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
+        flicker = max((fault.part for fault in powers if len(fault.numbers) > 1 and fault.kind == "power"), default=0.0)
+        if by_others and by_others[0].part < _SCATTERS * flicker:
+            by_others = []
+        found += by_others
+        named = {self._pattern(number) for fault in found for number in fault.numbers}
+        for fault in powers:
+            own = {self._pattern(number) for number in fault.numbers}
+            if fault.kind != "power" or not (named & own):
+                found.append(fault)
+        return (*found, *self._closing())
 
     # ---- Tests of single frames
+
+    def _dark(self) -> Iterator[FrameFault]:
+        """Report a run without light: with several frames, the others predict a dark one."""
+        noise = self._data.noise
+        least = CHANCE * float(np.sqrt(noise.variance.sum() / self._sums.squares.size))
+        if abs(float(noise.means.sum())) < least:
+            words = "holds no light" if len(self._shots) == 1 else "hold no light"
+            yield self._fault("dark", range(len(self._shots)), words)
 
     def _equal(self) -> Iterator[FrameFault]:
         if not self._data.noise.variance.any():
@@ -121,11 +145,11 @@ class FrameCheck:
             bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
             off = np.maximum(off, np.where(bad, part, 0.0))
         if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
-            for row, column in np.argwhere(off):
+            for row, column in sorted(map(tuple, np.argwhere(off)), key=lambda each: -off[each]):
                 part = float(np.sqrt(off[row, column]))
                 words = f"differ by {part:.1%} from what the other frames predict"
                 numbers = self._halves((int(row), int(column)))
-                yield self._fault("model", numbers, words if len(numbers) > 1 else words.replace("differ", "differs"))
+                yield self._fault("model", numbers, words if len(numbers) > 1 else words.replace("differ", "differs"), part)
 
     def _rows(self) -> Iterator[tuple[int, int]]:
         rows, columns = self._sums.left.shape
@@ -147,7 +171,7 @@ class FrameCheck:
         variance = float(self._variance.mean()) * np.square(gain)
         bases = [np.square(side.basis) for side in (prepared.left, prepared.right)]
         rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
-        numbers = np.array([[self._number[i, j, 0] for j in range(self._variance.shape[1])] for i in range(len(self._variance))])
+        numbers = np.reshape(self._numbers, self._variance.shape)
         image = prepared.image(gain * self._sums.weights)
         return check_picture(image, numbers[np.ix_(rows, columns)], self._variance.shape, bases[0] @ variance @ bases[1].T)
 
@@ -162,9 +186,32 @@ class FrameCheck:
         if len(disturbed) and not len(foreign):
             strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]
             yield self._fault("picture", strongest, "show a part of the scene otherwise than the frames around")
-        scatter = robust_scatter(found.power)
-        if scatter > max(_POWER, _FLICKERS * float(np.median(found.power_error))):
-            yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power")
+        yield from self._powers(found.power, found.power_error, range(len(self._shots)), _FLICKERS)
+
+    def _powers(
+        self, power: FloatArray, error: FloatArray, numbers: Sequence[int], most: float
+    ) -> Iterator[FrameFault]:
+        """Name shots of another power than the rest, or all of them if the powers of most differ.
+
+        Parameters
+        ----------
+        power, error
+            (shots,) relative powers and their standard errors.
+        numbers
+            of the shots.
+        most
+            scatter over error from which all differ.
+        """
+        scatter, usual = robust_scatter(power), float(np.median(error))
+        known = np.isfinite(error)
+        away = np.where(known, np.abs(power - np.median(power[known])) if known.any() else 0.0, 0.0)
+        single = (away > _OUTLIER * np.maximum(error, scatter)) & (away > _DIMMED)
+        if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
+            for index in np.flatnonzero(single):
+                words = f"has {1 + power[index] - np.median(power):.2f} times the light that the others predict"
+                yield self._fault("power", [numbers[index]], words)
+        elif scatter > max(_POWER, most * usual):
+            yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power", scatter)
 
     # ---- The power of frames that overlap
 
@@ -200,22 +247,22 @@ class FrameCheck:
         """Report a lamp whose power differs from shot to shot by what costs more than part of the noise."""
         everything = range(len(self._shots))
         if self.power is not None:
-            power, error = self.power
-            scatter = float(np.std(power))
-            if scatter > max(_POWER / 2, CHANCE * float(np.median(error))):
-                yield self._fault("power", everything, f"differ by {scatter:.1%} in their power")
+            yield from self._powers(*self.power, self._numbers, CHANCE)
         pairs = self._sums.pairs
         if len(pairs) < _FEWEST_PAIRS or not self._data.noise.stated:
             return
         noise = np.array([self._variance[pattern] for pattern in pairs])
         cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * self._sums.squares.size, TINY)
         times = float(np.median(cost)) / _MEDIAN_SQUARE
-        powers = np.array([(pair.common, pair.apart) for pair in pairs.values()])
-        error = np.median([pair.error for pair in pairs.values()]) * np.sqrt(float(noise.mean()))
-        differ = float(np.sqrt(np.square(powers).sum(axis=1).mean()))
-        if times > _COSTS and differ > CHANCE * error:
+        powers = np.array([power for pair in pairs.values() for power in pair.powers])
+        errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(2 * np.repeat(noise, 2))
+        numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
+        single = [fault for fault in self._powers(powers, errors, numbers, np.inf)]
+        yield from single
+        differ = float(np.std(powers))
+        if times > _COSTS and differ > CHANCE * float(np.median(errors)) and not single:
             words = f"differ by {differ:.2%} in their power, which costs {times:.2g} times as much as their noise"
-            yield self._fault("power", everything, words)
+            yield self._fault("power", everything, words, differ)
 
     # ---- A closing frame
 
@@ -261,15 +308,18 @@ class FrameCheck:
 
     # ---- Words
 
+    def _pattern(self, number: int) -> Pattern:
+        return self._shots[number].row, self._shots[number].column
+
     def _of(self, pattern: Pattern, half: int) -> int:
         return self._number[(*pattern, (1 - 2 * half) if self._signed else 0)]
 
-    def _fault(self, kind: str, numbers: Iterable[int], words: str) -> FrameFault:
+    def _fault(self, kind: str, numbers: Iterable[int], words: str, part: float = 0.0) -> FrameFault:
         """Make a fault of some shots, of which the words name the first few with their files."""
         numbers = tuple(sorted(int(number) for number in numbers))
         files = tuple(self._shots[number].file for number in numbers)
         if len(numbers) == len(self._shots) and len(numbers) > 1:
-            return FrameFault(kind, numbers, files, f"all frames {words}")
+            return FrameFault(kind, numbers, files, f"all frames {words}", part)
         shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
         more = f" and {len(numbers) - 4} more" if len(numbers) > 4 else ""
-        return FrameFault(kind, numbers, files, f"frame{'s' if len(numbers) > 1 else ''} {shown}{more} {words}")
+        return FrameFault(kind, numbers, files, f"frame{'s' if len(numbers) > 1 else ''} {shown}{more} {words}", part)

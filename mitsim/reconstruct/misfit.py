@@ -256,12 +256,13 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         found = replace(found, chi_square=whole / max(float(sums.expected(1.0, factor_energy or 0.0).sum()), TINY))
     if lack:
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
-    defects = _defects(data, sums, ratio) if with_defects and noise.stated else None
-    if defects and excess > 0 and float(sums.squares[defects.rows, defects.columns].sum()) > _MOSTLY * excess:
-        return replace(found, defects=defects)
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
-    faults, places = check.faults(), sums.places(ratio) if not defects and noise.stated else []
+    faults = check.faults()
+    defects = _defects(data, sums, ratio) if with_defects and noise.stated and not sums.clipped else None
+    if defects and excess > 0 and float(sums.squares[defects.rows, defects.columns].sum()) > _MOSTLY * excess:
+        return replace(found, defects=defects)
+    places = sums.places(ratio) if noise.stated and not (defects or off) else []
     found = replace(found, faults=faults, places=tuple(places), picture=check.picture)
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
     fitting = not (found.flagged or faults or places or off)

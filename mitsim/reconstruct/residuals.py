@@ -42,7 +42,7 @@ are flagged, because published gains are good to some per cent; and the error up
 _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
 _ALIKE = 1e-3
-"""Squared sine between sum and difference of a pair's halves, below which one of them is as good as black."""
+"""Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as black."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
 """Robust deviations from which a place stands out, and the part of the expected energy that its residual must exceed."""
 
@@ -87,10 +87,9 @@ class Pair:
 
     Attributes
     ----------
-    common, apart
-        relative power of both halves beyond the mean, and of the first beyond the second.
-    error
-        standard error of either, for noise of variance 1.
+    powers, errors
+        relative power of the first and of the second half beyond that of the other pairs, and their standard errors for
+        noise of variance 1; infinite where a half is as good as black.
     rest
         energy that no power of the halves explains.
     side
@@ -99,28 +98,27 @@ class Pair:
         energy that the powers put into the difference.
     """
 
-    common: float
-    apart: float
-    error: float
+    powers: tuple[float, float]
+    errors: tuple[float, float]
     rest: float
     side: float
     cost: float
 
     @classmethod
     def of(cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray) -> Pair:
-        """Fit ``beyond`` = common ``total`` + apart ``difference`` by least squares; all (m, m')."""
-        whole, apart, shared = sum_of_squares(total), sum_of_squares(difference), float(np.vdot(total, difference))
-        square = whole * apart - shared**2
-        powers, error = np.zeros(2), 0.0
-        if square > _ALIKE * whole * apart:  # one half is black otherwise
-            normal = np.array([[whole, shared], [shared, apart]])
-            powers = np.linalg.solve(normal, [float(np.vdot(beyond, total)), float(np.vdot(beyond, difference))])
-            error = float(np.sqrt(np.linalg.inv(normal).trace() / 2))
-        rest = beyond - powers[0] * total - powers[1] * difference
+        """Fit ``beyond`` to the two halves, (total +- difference) / 2, by least squares; all (m, m')."""
+        halves = (total + difference) / 2, (total - difference) / 2
+        normal = np.array([[float(np.vdot(one, other)) for other in halves] for one in halves])
+        powers, errors = np.zeros(2), np.full(2, np.inf)
+        if np.linalg.det(normal) > _ALIKE * float(np.diag(normal).max()) ** 2:
+            inverse = np.linalg.inv(normal)
+            powers = inverse @ [float(np.vdot(beyond, half)) for half in halves]
+            errors = np.sqrt(np.diag(inverse))
+        rest = beyond - powers[0] * halves[0] - powers[1] * halves[1]
         energies = sum_of_squares(rest), sum_of_squares(residual)
         side = float(np.vdot(rest, residual)) / max(float(np.sqrt(energies[0] * energies[1])), TINY)
-        cost = float(powers[0] ** 2 * apart + powers[1] ** 2 * whole)
-        return cls(float(powers[0]), float(powers[1]), error, energies[0], side, cost)
+        cost = sum_of_squares(powers[0] * halves[0] - powers[1] * halves[1])
+        return cls((powers[0], powers[1]), (errors[0], errors[1]), energies[0], side, cost)
 
 
 @dataclass(frozen=True)
@@ -201,7 +199,9 @@ class Residuals:
             light = (light + energy) / 2
         self.energy += energy
         self.power += light
-        self.shots[pattern], self.left[pattern] = float(light.sum()), float(squared.sum())
+        # Behind a mask with a constant term most of the light contributes nothing to the image.
+        self.shots[pattern] = float((energy if prepared.centre else light).sum())
+        self.left[pattern] = float(squared.sum())
         (turn, own), (other_turn, other) = (self._grams[side][index] for side, index in enumerate(pattern))
         known = np.outer(own, other)
         alone = known > 1 - 1e-6
