@@ -811,7 +811,7 @@ class Judge:
             "chi_square": found.get("chi_square"),
             "unexplained": found.get("unexplained"),
             "cause": found.get("cause"),
-            "named": sorted({n for one in found.get("faults") or [] for n in one.get("frames", one.get("numbers"))}),
+            "named": sorted({n for one in found.get("faults") or [] for n in one["frames"]}),
             "stated": float(np.sqrt(np.mean(np.square(known.total)))) if known else None,
             "error": float(np.sqrt(np.mean(np.square(difference)))),
             "inside": float(np.mean(np.abs(difference) < 1.96 * known.total)) if known else None,
