@@ -1,7 +1,7 @@
 """Judge the frame checks of `reconstruct` on frames of another forward model: kinds of faults, severities, families.
 
     python benchmarks/foreign_frames.py RESULT.json [--kinds ...] [--families ...] [--severities 0 1 2] [--runs 1]
-        [--good 0] [--seed 0] [--old OLD.json]
+        [--good 0] [--seed 0] [--peaks 20000 ...] [--old OLD.json]
 
 The forward model below is written in numpy and shares no code with mitsim. Only the stripes of the calibration session
 are taken from mitsim, because its list of frames counts them in mitsim's order. Cameras have 48 to 128 sensor pixels
@@ -31,7 +31,7 @@ import json
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -733,8 +733,8 @@ def write_frames(frames: list[np.ndarray], folder: Path) -> None:
 class Judge:
     """Calibrations of all cameras, and what mitsim reports of runs."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
-        self.folder, self.seed, self.count = folder, seed, 0
+    def __init__(self, folder: Path, seed: int, peaks: Sequence[float] = PEAKS) -> None:
+        self.folder, self.seed, self.peaks, self.count = folder, seed, peaks, 0
         self.calibrations: dict[Camera, tuple[Path, Any]] = {}
         self.twin = cache(self._twin)
 
@@ -811,7 +811,7 @@ class Judge:
             "chi_square": found.get("chi_square"),
             "unexplained": found.get("unexplained"),
             "cause": found.get("cause"),
-            "named": sorted({n for one in found.get("faults") or [] for n in one.get("frames", one.get("numbers"))}),
+            "named": sorted({n for one in found.get("faults") or [] for n in one["frames"]}),
             "stated": float(np.sqrt(np.mean(np.square(known.total)))) if known else None,
             "error": float(np.sqrt(np.mean(np.square(difference)))),
             "inside": float(np.mean(np.abs(difference) < 1.96 * known.total)) if known else None,
@@ -822,17 +822,26 @@ class Judge:
     def _twin(self, camera: Camera, name: str, shown: str, peak: float, seed: int) -> dict[str, Any]:
         return self.report(Run(camera, name, shown, peak, seed))
 
-    def judged(self, kind: str, severity: int, name: str, number: int, seed: int) -> dict[str, Any] | None:
+    def case(self, index: int, name: str, seed: int, square: bool = False) -> tuple[Camera, str, str, float, int]:
+        """Camera, family, picture, peak and seed of a run, in combinations that differ by index."""
+        place = FAMILIES.index(name) if name in FAMILIES else 1
+        cameras = SQUARE if square else CAMERAS
+        shown = PICTURES[(index + 3 * place) % len(PICTURES)]
+        camera = cameras[(index // 2 + place) % len(cameras)]
+        peak = self.peaks[(index // 3 + 2 * place) % len(self.peaks)]
+        return camera, name, shown, peak, 1000 * seed + index % 40
+
+    def judged(self, kind: str, severity: int, name: str, number: int) -> dict[str, Any] | None:
         """One run with a fault beside its twin; None where the family cannot have the fault."""
         levels, lay, needs = FAULTS[kind]
         alone = name == "uniform" or name.endswith(":1")
         if (needs in ("frames", "time") and alone) or (needs == "frames" and name.startswith("repeats")):
             return None
         kind_number = list(FAULTS).index(kind)
-        case = base_case(kind_number + 17 * severity + 41 * number, name, seed, needs == "square")
+        case = self.case(kind_number + 17 * severity + 41 * number, name, self.seed, needs == "square")
         begun = time.perf_counter()
         run = Run(*case)
-        wrong = lay(run, levels[severity], np.random.default_rng([seed, kind_number, severity, number]))
+        wrong = lay(run, levels[severity], np.random.default_rng([self.seed, kind_number, severity, number]))
         found, twin = self.report(run), self.twin(*case)
         return {
             "kind": kind,
@@ -847,16 +856,6 @@ class Judge:
             "verdict": verdict(found, twin),
             "seconds": time.perf_counter() - begun,
         }
-
-
-def base_case(index: int, name: str, seed: int, square: bool = False) -> tuple[Camera, str, str, float, int]:
-    """Camera, family, picture, peak and seed of a run, in combinations that differ by index."""
-    place = FAMILIES.index(name) if name in FAMILIES else 1
-    cameras = SQUARE if square else CAMERAS
-    shown = PICTURES[(index + 3 * place) % len(PICTURES)]
-    camera = cameras[(index // 2 + place) % len(cameras)]
-    peak = PEAKS[(index // 3 + 2 * place) % len(PEAKS)]
-    return camera, name, shown, peak, 1000 * seed + index % 40
 
 
 def described(case: tuple[Camera, str, str, float, int]) -> dict[str, Any]:
@@ -893,7 +892,7 @@ def verdict(found: dict[str, Any], twin: dict[str, Any]) -> str:
 
 def key_of(one: dict[str, Any]) -> tuple[Any, ...]:
     """What names a run across results."""
-    return one["kind"], one["severity"], one["family"], one["run"], one["seed"]
+    return one["kind"], one["severity"], one["family"], one["run"], one["seed"], one["peak"]
 
 
 def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[str]:
@@ -980,24 +979,25 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--good", type=int, default=0, help="runs without a fault")
     parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
+    parser.add_argument("--peaks", nargs="+", type=float, default=PEAKS, help="photoelectrons of the brightest pixel")
     parser.add_argument("--old", type=Path, help="earlier RESULT.json to compare with")
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     good: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        judge = Judge(Path(folder), options.seed)
+        judge = Judge(Path(folder), options.seed, options.peaks)
         for kind in options.kinds:
             for name in options.families:
                 for severity in options.severities:
                     for number in range(options.runs):
-                        if one := judge.judged(kind, severity, name, number, options.seed):
+                        if one := judge.judged(kind, severity, name, number):
                             rows.append(one)
                             if one["verdict"] in "ST":
                                 print(json.dumps(one), flush=True)
             options.result.write_text(json.dumps({"rows": rows, "good": good}, indent=1), encoding="utf-8")
         for number in range(options.good):
             name = options.families[number % len(options.families)]
-            case = base_case(number // len(options.families), name, options.seed + 500 + number)
+            case = judge.case(number // len(options.families), name, options.seed + 500 + number)
             good.append({**described(case), **judge.report(Run(*case))})
             if good[-1]["misfit"]:
                 print(json.dumps(good[-1]), flush=True)

@@ -259,7 +259,7 @@ def verdict(shots: Capture, factors: Factors, true: np.ndarray) -> dict[str, Any
     return {
         "flagged": not found.ok,
         "misfit": bool(misfit.get("flagged")),
-        "named": sorted({number for fault in faults for number in fault.get("frames", fault.get("numbers"))}),
+        "named": sorted({number for fault in faults for number in fault["frames"]}),
         "pixels": bool(misfit.get("defective_pixels")),
         "readings": bool(misfit.get("reading") or misfit.get("readings")),
         "cause": misfit.get("cause"),
