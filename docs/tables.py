@@ -19,6 +19,7 @@ from mitsim.core.imagelist import Crop, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
+    ClosingFile,
     Digital,
     FactorNoise,
     Parallax,
@@ -46,7 +47,8 @@ MODELS = (
     *(CameraGeometry, MaskProfile, ProjectorModel, Coherence),
     *(SensorModel, EfficiencyCurve),
     *(SessionRecipe, BoardShape, Drift),
-    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, CalibrationManifest, FactorNoise, Parallax),
+    *(RunManifest, Digital, Patterns, ShotFile, AmbientFile, ClosingFile),
+    *(CalibrationManifest, FactorNoise, Parallax),
     *(FrameList, StripeFile, DarkFile, Raw, Preparation, Crop),
     *(CaptureList, KnownList, KnownCapture),
     *(ColourManifest, Line, ChartPlace),

@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from mitsim.core.manifests import AmbientFile, CalibrationManifest, Digital, Patterns, RunHead, RunManifest, ShotFile
-from mitsim.core.recorders import AMBIENT, claim_run, frame_name
+from mitsim.core.manifests import (
+    AmbientFile,
+    CalibrationManifest,
+    ClosingFile,
+    Digital,
+    Patterns,
+    RunHead,
+    RunManifest,
+    ShotFile,
+)
+from mitsim.core.recorders import AMBIENT, CLOSING, claim_run, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.solution import Status, Verdict
 
@@ -39,10 +48,15 @@ def stripes(pixels: int, period: int, signed: bool) -> np.ndarray:
 
 
 def made(
-    folder: Path, signed: bool = False, ambient: bool = False, real_output: bool = False, scale: float = 1.0
+    folder: Path,
+    signed: bool = False,
+    ambient: bool = False,
+    real_output: bool = False,
+    scale: float = 1.0,
+    closing: str = "",
 ) -> Made:
     """Frames of a separable camera with noise, recorded as `mitsim capture` does, with truth and expected electrons;
-    its factors times ``scale``."""
+    its factors times ``scale``. A frame that is ``closing`` is exposed as the others."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(17)
     left, right = (rng.random((side, n)) * 300 * scale for side, n in zip((ROWS, COLUMNS), SCENE, strict=True))
@@ -78,6 +92,10 @@ def made(
         if ambient:
             mean = np.mean([exposed(0 * lamp)["DN"] for _ in range(5)], axis=0)
             run.write(AMBIENT, {"DN": mean.astype(np.float32)}, {"shots": 5, "seed": 3})
+        if closing:
+            lit = np.outer(p_left[:, 0], p_right[:, 0]) if closing == "first" else np.ones(SCENE)
+            lit = (1 + signs[0] * lit) / 2 if closing == "first" and signed else lit
+            run.write(CLOSING, exposed(left @ (scene * lit) @ right.T), {"exposure_s": DIGITAL.exposure_s})
         captures = tuple(
             ShotFile(file=frame_name(index), row=i, column=j, sign=sign) for index, (i, j, sign) in enumerate(shots)
         )
@@ -90,6 +108,9 @@ def made(
                 digital=DIGITAL,
                 patterns=patterns,
                 ambient_frame=AmbientFile(file=AMBIENT, shots=5) if ambient else None,
+                closing_frame=ClosingFile(kind=closing, file=CLOSING, exposure_s=DIGITAL.exposure_s)
+                if closing
+                else None,
                 plan={"effects": [], "wert": "ä"},
                 mc_error=0.1 + 0.2,
             )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import validate
@@ -258,11 +258,13 @@ class Request(BaseModel):
         # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
 
-    @field_validator("ambient_frame", mode="before")
+    @field_validator("ambient_frame", "closing_frame", mode="before")
     @classmethod
-    def _a_choice(cls, choice: object) -> object:
-        if choice not in ("auto", "yes", "no"):
-            raise ArgumentError("ambient_frame", f"{choice!r}: use auto, yes or no")
+    def _a_choice(cls, choice: object, info: ValidationInfo) -> object:
+        allowed = {"ambient_frame": ("auto", "yes", "no"), "closing_frame": ("first", "uniform")}
+        *most, last = allowed[str(info.field_name)]
+        if choice not in (*most, last) and not (choice is None and info.field_name == "closing_frame"):
+            raise ArgumentError(str(info.field_name), f"{choice!r}: use {', '.join(most)} or {last}")
         return choice
 
     def model_post_init(self, _: object) -> None:

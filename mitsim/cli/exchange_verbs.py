@@ -101,6 +101,15 @@ class Frames:
     black_level: float | None = option(None, "of frames: number of a pixel without charge; the camera's if not given")
     ambient_frame: Path | None = option(None, "frame, or folder of frames, with the projector off", metavar="PATH")
     ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
+    closing_frame: str | None = option(
+        None,
+        "the last frame checks lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+    )
+    closing_exposure: float | None = option(None, "seconds of that frame; those of all if not given", metavar="SECONDS")
+    order: str | None = option(
+        None, "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
+    )
     shape: str | None = option(None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
     bits: int | None = option(None, "of a number in such a file", metavar="N")
     byte_order: str = option("little", "of such a file: little or big", metavar="ORDER")
@@ -169,7 +178,7 @@ def import_(
 
 @dataclass(frozen=True)
 class Screen:
-    """A projector that patterns are drawn for."""
+    """A projector that patterns are drawn for, and its last picture."""
 
     PANEL = DEVICES
 
@@ -180,6 +189,12 @@ class Screen:
         autocompletion=complete_projector,
     )
     projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=4096, metavar="N")
+    closing_frame: str | None = option(
+        None,
+        "last picture, to check lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+        rich_help_panel=WHAT,
+    )
 
 
 @dataclass(frozen=True)
@@ -220,7 +235,7 @@ def patterns(
     $ mitsim patterns dots:7 -o pictures
     $ mitsim patterns stripes -o stripes --camera imx249 --exposure 0.02
     """
-    asked = given_of(context, {**vars(stripes), "seed": seed})
+    asked, last = given_of(context, {**vars(stripes), "seed": seed}), screen.closing_frame
     payload = mitsim.pattern_pictures(family, output, **vars(screen), **asked)
     if payload["session"]:
         after = (
@@ -229,7 +244,7 @@ def patterns(
     else:
         after = (
             f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} --camera NAME "
-            "--exposure SECONDS --calibration CAL -o RUN"
+            f"--exposure SECONDS --calibration CAL -o RUN{f' --closing-frame {last}' if last else ''}"
         )
     from mitsim.exchange.png_files import describe_cells
 

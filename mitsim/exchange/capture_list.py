@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import Configuration, locate, read_table, validate
+from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import ArgumentError, MitsimError, checked_fields
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import (
@@ -22,7 +22,7 @@ from mitsim.core.imagelist import (
     check_channel,
     image_files,
 )
-from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, Digital, read_manifest
+from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
@@ -59,6 +59,13 @@ class CaptureList(Configuration):
     """Frame with the projector off, or a folder of such; a path from the list's folder."""
     ambient_shots: int | None = Field(default=None, ge=1)
     """Shots that a single such frame is the mean of."""
+    closing_frame: ClosingKind | None = None
+    """`first` or `uniform`: the last frame checks lamp, camera and scene, and shows the first shot again, or all pixels
+    of the projector lit; none: there is no such frame."""
+    closing_exposure_s: Positive | None = None
+    """Exposure of the closing frame [s]; none: that of all frames."""
+    order: str | None = None
+    """Order in which the shots were taken, such as `column-major`; none: row-major, of signed ones + before -."""
     raw: Raw | None = None
     """How files without a header are read; none: there are none."""
     centre: bool | None = None
@@ -76,6 +83,8 @@ class CaptureList(Configuration):
             raise ValueError("bits are of digital's numbers; give digital too, or leave both to --camera")
         if self.ambient_shots is not None and self.ambient is None:
             raise ValueError("ambient_shots are of an ambient frame; give ambient too")
+        if self.closing_exposure_s is not None and self.closing_frame is None:
+            raise ValueError("closing_exposure_s is of a closing frame; give closing_frame too")
         return self
 
 
@@ -217,6 +226,13 @@ class RealCapture:
         """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
         listed = self.listed
         check_root(listed.seed)
+        if listed.closing_exposure_s is not None:
+            check_exposure(listed.closing_exposure_s)
+            if listed.closing_frame is None or self.prepare.dark is not None:
+                why = "without a closing frame" if listed.closing_frame is None else "beside dark frames of another"
+                raise ArgumentError(
+                    "closing_exposure", f"{listed.closing_exposure_s:g}: is of no use {why}; leave it out"
+                )
         if listed.n is not None and listed.n < 1:
             raise ArgumentError("projector_pixels", f"{listed.n}: give 1 or more, those a side")
         if listed.ambient_shots is not None and (listed.ambient is None or listed.ambient_shots < 1):
@@ -287,6 +303,11 @@ class FrameFacts:
         digital number of a pixel without charge.
     ambient_frame, ambient_shots
         frame, or folder of frames, with the projector off; shots that a single one is the mean of.
+    closing_frame, closing_exposure
+        ``first`` or ``uniform``: the last frame checks lamp, camera and scene, and shows the first shot again or all
+        pixels lit; its exposure [s], where that differs from the others'.
+    order
+        in which the shots were taken, one of :func:`mitsim.devices.patterns.shot_orders`.
     shape, bits, byte_order
         of files without a header: rows and columns, or "ROWSxCOLUMNS"; bits of a number; little or big.
     channel, mosaic
@@ -311,6 +332,9 @@ class FrameFacts:
     black_level: float | None = None
     ambient_frame: Path | str | None = None
     ambient_shots: int | None = None
+    closing_frame: Literal["first", "uniform"] | None = None
+    closing_exposure: float | None = None
+    order: str | None = None
     shape: str | tuple[int, int] | None = None
     bits: int | None = None
     byte_order: str | None = None
@@ -339,6 +363,8 @@ class FrameFacts:
             said |= {"ambient": str(self.ambient_frame), "ambient_shots": self.ambient_shots}
         elif listed.ambient_shots is None:
             said["ambient_shots"] = self.ambient_shots
+        last = {"closing_frame": self.closing_frame, "closing_exposure_s": self.closing_exposure, "order": self.order}
+        said |= {name: value for name, value in last.items() if value is not None}
         if self.projector_pixels is not None or self.calibration is not None:
             said["n"] = self.projector_pixels
         if self.shape is not None:

@@ -308,6 +308,7 @@ def pattern_pictures(
     projector: Path | str = "mp_cl1",
     projector_pixels: int = 128,
     seed: int | None = None,
+    closing_frame: Literal["first", "uniform"] | None = None,
     **session: Any,
 ) -> dict[str, Any]:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector.
@@ -324,6 +325,9 @@ def pattern_pictures(
         of the patterns, a side.
     seed
         of patterns that are drawn at random; None: 0.
+    closing_frame
+        light of a last picture, for a frame that checks lamp, camera and scene: ``first`` shows the first one again,
+        ``uniform`` all pixels lit; None: there is none.
     **session
         of stripes: ``camera``, name or TOML file of its electronics; ``exposure`` of each frame [s];
         ``signed_capture``, ``pair`` or ``uniform``: both halves of each, or one and a uniform frame.
@@ -348,6 +352,8 @@ def pattern_pictures(
     if seed is not None and not drawn_at_random:
         raise ArgumentError("seed", "has no effect on patterns that are not drawn at random; leave it out")
     if patterns == STRIPES:
+        if closing_frame is not None:
+            raise ArgumentError("closing_frame", "has no effect on stripes, whose pairs check the lamp; leave it out")
         if facts.camera is None or facts.exposure is None:
             missing = "camera" if facts.camera is None else "exposure"
             raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
@@ -366,7 +372,8 @@ def pattern_pictures(
             raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
     from mitsim.exchange.png_files import draw_family
 
-    return {**draw_family(folder, patterns, projector_pixels, str(projector), seed or 0), "session": None}
+    drawn = draw_family(folder, patterns, projector_pixels, str(projector), seed or 0, closing_frame)
+    return {**drawn, "session": None}
 
 
 @checked_fields

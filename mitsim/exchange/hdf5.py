@@ -230,9 +230,7 @@ class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
 def _write_run(place: h5py.Group, run: Packed[RunManifest]) -> None:
     group = _begin(place, "run", run)
     _write_shots(group, run)
-    ambient = run.manifest.ambient_frame
-    named = {} if ambient is None else {"ambient": ambient.file}
-    for name, source in {**named, "truth": TRUTH}.items():
+    for name, source in {**run.manifest.others, "truth": TRUTH}.items():
         if source in run.names:
             _write_frame(group.create_group(name), *run.read(source))
 
@@ -319,7 +317,7 @@ def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
     group = _group(file, "run", path)
     text = _text_in(group, "manifest", path)
     manifest = unpack_run(text, path)
-    captures, ambient = manifest.patterns.captures, manifest.ambient_frame
+    captures = manifest.patterns.captures
     stacks = _group(group, "shots", path)
     channels = {name: _dataset(stacks, name, path) for name in stacks}
     shapes = {values.shape for values in channels.values()}
@@ -330,7 +328,7 @@ def _run(file: h5py.Group, path: Path) -> Packed[RunManifest]:
         )
     metadata = _dataset(group, "metadata", path)
     index = {shot.file: number for number, shot in enumerate(captures)}
-    others = ({ambient.file: "ambient"} if ambient else {}) | ({TRUTH: "truth"} if "truth" in group else {})
+    others = {file: name for name, file in manifest.others.items()} | ({TRUTH: "truth"} if "truth" in group else {})
 
     def read(name: str) -> tuple[Channels, Metadata]:
         with hdf5_errors(path):

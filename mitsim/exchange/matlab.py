@@ -250,9 +250,7 @@ def _folder_variables(run: Packed[RunManifest], calibration: Packed[CalibrationM
     variables: Variables = {"run_manifest": run.text}
     variables["PL"], variables["PR"] = run.manifest.patterns.matrices
     variables.update(_calibration_variables(calibration, run.manifest.digital))
-    ambient = run.manifest.ambient_frame
-    if ambient is not None:
-        variables["ambient"] = run.read(ambient.file)[0]["DN"]
+    variables.update({name: run.read(file)[0]["DN"] for name, file in run.manifest.others.items()})
     return {**variables, **_truth_variables(*run.read(TRUTH))} if TRUTH in run.names else variables
 
 
@@ -446,7 +444,7 @@ def _run_part(own: MatFile, meas: npt.NDArray[Any] | None) -> Packed[RunManifest
     """The run of the variables ``own``, its frames in ``meas`` (rows, columns, shots), or, without it, `data_coded`."""
     text = own.text("run_manifest")
     manifest = unpack_run(text, own.path)
-    captures, ambient = manifest.patterns.captures, manifest.ambient_frame
+    captures, ambient, closing = manifest.patterns.captures, manifest.ambient_frame, manifest.closing_frame
     frame = _frames_of_patterns(own, manifest) if meas is None else _frames_of_shots(own, meas, manifest)
     shots = {shot.file: shot for shot in captures}
     kind = np.float32 if own.text("dn_class") == "float32" else np.uint32
@@ -459,9 +457,11 @@ def _run_part(own: MatFile, meas: npt.NDArray[Any] | None) -> Packed[RunManifest
             return {"DN": _digital(frame(shot), kind, name, own.path)}, {**place, **known}
         if ambient is not None and name == ambient.file:
             return {"DN": own.image("ambient")}, {"shots": ambient.shots, **known}
+        if closing is not None and name == closing.file:
+            return {"DN": _digital(own.matrix("closing"), kind, name, own.path)}, {"exposure_s": closing.exposure_s}
         return _truth_in(own)
 
-    names = (*shots, *([ambient.file] if ambient else ()), *((TRUTH,) if "truth" in own else ()))
+    names = (*shots, *manifest.others.values(), *((TRUTH,) if "truth" in own else ()))
     return Packed(manifest, text, names, read, own.path)
 
 

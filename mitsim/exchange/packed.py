@@ -172,8 +172,7 @@ def unpack_run(text: str, place: Path) -> RunManifest:
     """The manifest of a run in the ``text`` that an exchanged file holds, found at ``place``; with names of frames that
     a folder can have. MitsimError as for :func:`unpack`."""
     manifest = unpack(text, RunManifest, place)
-    ambient = manifest.ambient_frame
-    for name in (*(shot.file for shot in manifest.patterns.captures), *([ambient.file] if ambient else [])):
+    for name in (*(shot.file for shot in manifest.patterns.captures), *manifest.others.values()):
         if name in _OWN or not name.isprintable():
             raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
     return manifest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from mitsim.core.configuration import load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import Patterns, RunManifest
+from mitsim.core.manifests import ClosingKind, Patterns, RunManifest
 from mitsim.core.spectral_manifests import COLOUR
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs
@@ -76,7 +77,9 @@ class Raster:
 # ---- Folders of pictures: of a family, and of a calibration session ----
 
 
-def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) -> dict[str, Any]:
+def draw_family(
+    folder: Path, name: str, n: int, projector: str, seed: int = 0, closing: ClosingKind | None = None
+) -> dict[str, Any]:
     """Draw every shot of a family of patterns to a new folder, whole or not at all.
 
     Parameters
@@ -91,6 +94,8 @@ def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) 
         name or TOML file, of known rows and columns.
     seed
         of patterns of a `random` family.
+    closing
+        light of a last picture, for the closing frame; None: there is none.
 
     Returns
     -------
@@ -105,12 +110,13 @@ def draw_family(folder: Path, name: str, n: int, projector: str, seed: int = 0) 
     family = parse_patterns(name, n, seed)
     names = [frame_name(index) for index in range(len(family.shots))]
     patterns, raster = Patterns.of(family, names), Raster.of(projector)
-    light = pictures_of(patterns, f"patterns {name}")
-    _check_cost(raster, len(names))
+    light = with_closing(pictures_of(patterns, f"patterns {name}"), closing)
+    count = len(names) + (closing is not None)
+    _check_cost(raster, count)
     with whole_folder(folder) as place:
         where = draw(place, light, raster, (n, n), f"projector {projector}")
         write_json(place / PATTERNS, describe(patterns, names, where))
-    return {"patterns": name, "n": n, "pictures": len(names), "projector": where, "output": str(folder)}
+    return {"patterns": name, "n": n, "pictures": count, "projector": where, "output": str(folder)}
 
 
 def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, Any]:
@@ -344,6 +350,16 @@ def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
         yield light
 
 
+def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | None) -> Iterator[npt.NDArray[Any]]:
+    """Yield the ``pictures`` of all shots, and for a ``closing`` frame the first one again or a uniform one."""
+    first = None
+    for picture in pictures:
+        first = picture if first is None else first
+        yield picture
+    if closing is not None and first is not None:
+        yield first if closing == "first" else np.ones_like(first)
+
+
 # ---- What patterns.json says ----
 
 
@@ -431,23 +447,25 @@ def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, An
     """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
     manifest = run.manifest
     sides = tuple(len(matrix) for matrix in manifest.patterns.matrices)
-    pictures = pictures_of(manifest.patterns, str(run.place))
+    closing = manifest.closing_frame
+    pictures = with_closing(pictures_of(manifest.patterns, str(run.place)), closing.kind if closing else None)
     where = draw(place, pictures, raster, (sides[0], sides[1]), str(run.place))
     (place / "frames").mkdir()
     names = []
-    for index, (shot, channels, _) in enumerate(shots_of(run)):
-        dn = channels["DN"]
+    frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(run))
+    last = [(closing.file, run.read(closing.file)[0]["DN"])] if closing else []
+    for index, (file, dn) in enumerate(chain(frames, last)):
         if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
             raise MitsimError(
-                f"{run.place / shot.file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up to "
+                f"{run.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up to "
                 f"{_LARGEST}; use the format hdf5"
             )
         names.append(frame_name(index))
         write_png(place / "frames" / names[-1], dn.astype(np.uint16))
     if manifest.ambient_frame is not None:
-        with whole_file(place / "ambient.npy") as part, part.open("wb") as file:
-            np.save(file, run.read(manifest.ambient_frame.file)[0]["DN"])
-    write_json(place / PATTERNS, describe(manifest.patterns, names, where))
+        with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
+            np.save(stream, run.read(manifest.ambient_frame.file)[0]["DN"])
+    write_json(place / PATTERNS, describe(manifest.patterns, names[: len(manifest.patterns.captures)], where))
     return where
 
 
@@ -456,6 +474,8 @@ def _read_again(folder: Path, line: str, manifest: RunManifest) -> str:
     again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
     if manifest.ambient_frame is not None:
         again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
+    if (closing := manifest.closing_frame) is not None:
+        again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
     frames, run, calibration = folder / "frames", Path("RUN", line), Path("CAL", line)
     return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
 

@@ -19,16 +19,16 @@ import numpy.typing as npt
 
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum
 from mitsim.core.files import read_json, whole_folder
 from mitsim.core.imagelist import CORRECTIONS, Preparation, image_files
 from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import AmbientFile, CalibrationManifest, Patterns, RunHead, RunManifest
+from mitsim.core.manifests import AmbientFile, CalibrationManifest, ClosingFile, Patterns, RunHead, RunManifest
 from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
-from mitsim.core.recorders import AMBIENT, frame_name
-from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.core.recorders import AMBIENT, CLOSING, frame_name
+from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE
 from mitsim.exchange.capture_list import Electronics, RealCapture
 from mitsim.exchange.packed import FACTORS, Content, Packed, pack_calibration
@@ -75,12 +75,17 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     for fit in fits.values():
         fit.check_pixels(camera)
     patterns = {name: _patterns(known, fit.scene) for name, fit in fits.items()}
-    count = len(next(iter(patterns.values())).captures)
+    shown, order, closing = next(iter(patterns.values())), known.listed.order, known.listed.closing_frame
+    orders, count = shot_orders(shown), len(shown.captures)
+    if order is not None and order not in orders:
+        raise ArgumentError("order", f"{cut(repr(order))}: give {', '.join(orders)}")
     pages = [image_pages(path, known.wanted) for path in files]
-    if (held := sum(number for number, _ in pages)) != count:
+    if (held := sum(number for number, _ in pages)) != count + bool(closing):
+        last = " and a closing frame" if closing else ""
+        hint = " (is the last a closing frame? say so)" if held == count + 1 else ""
         raise MitsimError(
-            f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}, in the order "
-            f"(row, column), of signed ones + before -; give all of them and no others{_many_pages(files, pages)}"
+            f"{source}: holds {held} frames, but patterns {known.patterns!r} take {count}{last}, in the order "
+            f"(row, column), of signed ones + before -; give all of them and no others{hint}{_many_pages(files, pages)}"
         )
     pixels = sum(number * math.prod(size) for number, size in pages)
     cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
@@ -89,6 +94,8 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     factor, notes, warnings = scan.factor(prepare.divide_by)
     prepare = prepare.model_copy(update={"divide_by": factor})
     scan.check(factor)
+    if order is not None:
+        scan.places[:count] = [scan.places[frame] for frame in orders[order]]
     runs = {}
     for name, fit in fits.items():
         how = prepare.model_copy(update={"channel": name}) if name else prepare
@@ -148,7 +155,10 @@ def _run_of(
     shots = _Shots(known, preparer, fit, scan.places, camera.largest is not None)
     shape = shots.frame(scan.places[0][0], scan.first).shape
     ambient = None if known.ambient is None else _ambient(known, camera, preparer, fit, shape)
-    names = (*(shot.file for shot in patterns.captures), *((AMBIENT,) if ambient else ()))
+    kind, last_s = known.listed.closing_frame, known.listed.closing_exposure_s or camera.digital.exposure_s
+    closing = None if kind is None else ClosingFile(kind=kind, file=CLOSING, exposure_s=last_s)
+    others = *((AMBIENT,) if ambient else ()), *((CLOSING,) if closing else ())
+    names = (*(shot.file for shot in patterns.captures), *others)
     head = RunHead.of(_configuration(known, camera, how, scan.files))
     identity = camera.identity if known.prepare.channel == how.channel else {**camera.identity, "channel": how.channel}
     manifest = RunManifest(
@@ -159,12 +169,18 @@ def _run_of(
         patterns=patterns,
         sensor_noise=None,
         ambient_frame=None if ambient is None else AmbientFile(file=AMBIENT, shots=ambient[1]),
+        closing_frame=closing,
+        order=known.listed.order,
         checksums=dict.fromkeys(names, ""),  # worked out as the files are written
         versions=versions(),
     )
     index = {shot.file: number for number, shot in enumerate(patterns.captures)}
 
     def read(name: str) -> tuple[Channels, Metadata]:
+        if name == CLOSING:
+            digital = preparer.digital.model_copy(update={"exposure_s": last_s})  # the dark level depends on it
+            last = _Shots(known, replace(preparer, digital=digital), fit, scan.places, camera.largest is not None)
+            return {"DN": last.read(len(index))}, {"source": scan.places[-1][0].name, "exposure_s": last_s}
         if name not in index and ambient is not None:
             return {"DN": ambient[0]}, {"shots": ambient[1], "exposure_s": camera.digital.exposure_s}
         shot, (path, _) = patterns.captures[index[name]], scan.places[index[name]]
@@ -183,6 +199,9 @@ def _run_of(
 def _many_pages(files: tuple[Path, ...], pages: list[tuple[int, tuple[int, int]]]) -> str:
     several = [f"{path.name} has {number}" for path, (number, _) in zip(files, pages, strict=True) if number > 1]
     return f" (each page is a frame: {several[0]})" if several else ""
+
+
+# ---- What is known of the frames, and their numbers ----
 
 
 @dataclass(frozen=True)
@@ -334,6 +353,9 @@ class _Scan:
             each.check(self._camera, factor)
 
 
+# ---- The parts of a run ----
+
+
 class _Shots:
     """Every frame of the ``places``, read again when it is asked for, and prepared."""
 
@@ -427,6 +449,7 @@ def _configuration(
         "channel": how.channel,
         "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
         "seed": known.listed.seed,
+        **known.listed.model_dump(include={"closing_frame", "closing_exposure_s", "order"}, exclude_none=True),
     }
 
 

@@ -30,11 +30,17 @@ def exported(bench: Made, tmp_path: Path) -> Path:
     return tmp_path / "all.h5"
 
 
-@pytest.mark.parametrize("case", ["dots", "signed", "real output", "ambient"])
+@pytest.mark.parametrize("case", ["dots", "signed", "real output", "ambient", "closing"])
 def test_folders_come_back_to_the_byte(case: str, tmp_path: Path) -> None:
     """Frames, truth, ambient frame, metadata and manifests. (Planted: metadata of frames left out; the manifest written
     from its model, which puts `null` where a field is not stated.)"""
-    bench = made(tmp_path, signed=case == "signed", ambient=case == "ambient", real_output=case == "real output")
+    bench = made(
+        tmp_path,
+        signed=case == "signed",
+        ambient=case == "ambient",
+        real_output=case == "real output",
+        closing="uniform" if case == "closing" else "",
+    )
     # As other programs write it: what comes back is the file, not what its model says.
     manifest = json.loads((bench.calibration / "manifest.json").read_text())
     (bench.calibration / "manifest.json").write_text(json.dumps({key: manifest[key] for key in sorted(manifest)}))

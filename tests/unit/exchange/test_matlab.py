@@ -21,11 +21,17 @@ from mitsim.exchange import matlab
 from mitsim.exchange.formats import export, import_file
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
 
-CASES = ["dots", "signed", "real output", "ambient"]
+CASES = ["dots", "signed", "real output", "ambient", "closing"]
 
 
 def bench_of(case: str, tmp_path: Path) -> Made:
-    return made(tmp_path, signed=case == "signed", ambient=case == "ambient", real_output=case == "real output")
+    return made(
+        tmp_path,
+        signed=case == "signed",
+        ambient=case == "ambient",
+        real_output=case == "real output",
+        closing="uniform" if case == "closing" else "",
+    )
 
 
 @pytest.mark.parametrize("format", ["mat", "flatcam"])
@@ -42,6 +48,10 @@ def test_folders_come_back_without_the_expected_electrons(format: str, case: str
     assert np.array_equal(again.truth, first.truth) and again.truth_board == first.truth_board
     assert np.array_equal(again.truth_standard_error, first.truth_standard_error)
     assert (again.ambient is None) == (first.ambient is None)
+    if first.closing:
+        assert again.read("closing.exr")[1]["exposure_s"] == DIGITAL.exposure_s
+        found, expected = (each.read("closing.exr")[0]["DN"] for each in (again, first))
+        assert found.dtype == expected.dtype and np.array_equal(found, expected)
     if first.ambient and again.ambient:
         assert np.array_equal(again.ambient.rate, first.ambient.rate)
     assert again.manifest.model_copy(update={"checksums": {}}) == first.manifest.model_copy(update={"checksums": {}})
