@@ -93,7 +93,11 @@ class Defects:
                 change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        return LeftOut(data, self, moved)
+        lit = [np.flatnonzero((side > 0).all(axis=0)) for side in data.shots.patterns]
+        total = np.zeros(len(self.rows))
+        if all(map(len, lit)):
+            total = prepared.frame(weights, (int(lit[0][0]), int(lit[1][0])))[self.rows, self.columns]
+        return LeftOut(data, self, moved, total)
 
     def beyond_chance(self, rest: LeftOut, noise: FrameNoise) -> Defects | None:
         """Those of them whose readings differ by more than noise from what all others tell; None where none does.
@@ -121,13 +125,15 @@ class LeftOut(DerivedCapture):
     ----------
     data
         the capture added up.
-    defects, moved
-        the pixels, and by pattern what is added to their readings.
+    defects, moved, total
+        the pixels, by pattern what is added to their readings, and for signed patterns the sum of a pair's halves there.
     """
 
-    def __init__(self, data: Accumulation, defects: Defects, moved: dict[tuple[int, int], FloatArray]) -> None:
+    def __init__(
+        self, data: Accumulation, defects: Defects, moved: dict[tuple[int, int], FloatArray], total: FloatArray
+    ) -> None:
         super().__init__(data.shots)
-        self._data, self._defects, self.moved = data, defects, moved
+        self._data, self._defects, self.moved, self._total = data, defects, moved, total
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
         """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""
@@ -136,7 +142,7 @@ class LeftOut(DerivedCapture):
             frame, light = each.frame.copy(), each.light.copy()
             frame[places] += self.moved[each.row, each.column]
             # The sum of a pair's halves is that of all pairs.
-            light[places] = frame[places] if each.shots == 1 else self._data.noise.light[places] / len(self.moved)
+            light[places] = frame[places] if each.shots == 1 else np.maximum(np.abs(frame[places]), self._total)
             yield replace(each, frame=frame, light=light)
 
 

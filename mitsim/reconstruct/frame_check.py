@@ -35,6 +35,8 @@ print of a regular texture imitates smaller ones; all are part of the uncertaint
 _COSTS, _FEWEST_PAIRS, _MEDIAN_SQUARE = 0.5, 4, 0.455
 """Energy of a flicker over that of noise from which it is reported; pairs that are needed; and the median of the square
 of a normal number."""
+_RESTORED = 0.9
+"""Part of the unexplained energy by which the residual must fall without frames that are at fault."""
 _SCATTERS = 4.0
 """Scatters of the power up to which the difference of a single frame is that of a flicker."""
 _OUTLIER, _DIMMED = 6.5, 0.02
@@ -132,17 +134,24 @@ class FrameCheck:
         """Compare each frame with the prediction of the others by the model, and signed pairs by their sums."""
         sums, count = self._sums, self._variance.size
         share = self._beside * sums.shots / max(float(sums.shots.sum()), TINY)
+        # Single frames are at fault only if the rest fits without them.
         tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
         if self._signed and sums.pairs:
             size = sums.squares.size
             rest = np.array([[sums.pairs[row, column].rest for column in range(count_)] for row, count_ in self._rows()])
             noise = self._variance + self._variance.mean() / max(count - 1, 1)
             tests.append((rest - noise * size - share, 2 * noise * np.sqrt(2 * size)))
+        excess = float(sums.left.sum() - (self._variance * sums.squares.size).sum() * self._data.prepared.spare) - self._beside
         off = np.zeros(sums.left.shape)
         for beyond, chance in tests:
             part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
             usual = float(np.median(part)) if count > 2 else float(part.max())
             bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
+            if beyond is tests[0][0] and 0 < np.count_nonzero(bad) <= max(1, _MOST_BAD * count):
+                named = [(int(row), int(column)) for row, column in np.argwhere(bad)]
+                noise = (self._variance * sums.free + share)[bad].sum()
+                if sums.without(named) - noise < _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum())):
+                    continue
             off = np.maximum(off, np.where(bad, part, 0.0))
         if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
             for row, column in sorted(map(tuple, np.argwhere(off)), key=lambda each: -off[each]):
@@ -268,7 +277,7 @@ class FrameCheck:
 
     def _closing(self) -> Iterator[FrameFault]:
         """Compare the closing frame with the frames before it."""
-        closing = getattr(self._data.shots, "closing", None)
+        closing = self._data.shots.closing
         if closing is None:
             return
         predicted, variance = self._predicted(closing.kind)
@@ -277,7 +286,7 @@ class FrameCheck:
         noise = self._data.noise
         power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
         away = closing.light - predicted
-        own = variance + np.maximum(noise.of(closing.light, 1), 0.0)
+        own = variance + closing.variance
         beyond = sum_of_squares(away) - float(own.sum())
         chance = CHANCE * float(np.sqrt(2 * np.square(own).sum()))
         part = float(np.sqrt(max(beyond, 0.0) / max(sum_of_squares(predicted), TINY)))

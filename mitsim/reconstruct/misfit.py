@@ -26,7 +26,7 @@ from mitsim.reconstruct.defects import Defects, defects_of
 from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
-from mitsim.reconstruct.readings import Reading, find_readings, multiple
+from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, common_energy, common_weights
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
@@ -162,9 +162,9 @@ class Misfit:
 
     @property
     def _reading_sentence(self) -> str:
-        ways = "; or ".join(reading.words for reading in self.readings[:_SHOWN])
-        more = "" if len(self.readings) == 1 else f" ({len(self.readings)} readings fit alike: the frames cannot decide)"
-        return f"the frames fit if they are read {ways}{more}"
+        ways = "; or if ".join(reading.words for reading in self.readings[:_SHOWN])
+        more = "" if len(self.readings) == 1 else f" ({len(self.readings)} readings fit alike, and the frames cannot decide)"
+        return f"the frames fit if {ways}{more}"
 
     def summary(self) -> dict[str, Any]:
         """Return the entry of result.json and of the command line's JSON."""
@@ -237,11 +237,11 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         return None
     factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
     lack = data.lack(image)
-    common = _common_light(data)
-    sums = Residuals(data, common)
-    change = _change(data, solution, common)
-    stated, energy = float(noise.variance.sum()) * sums.squares.size * prepared.spare, float(sums.energy.sum())
     beside = noise.rendering + (factor_energy or 0.0)
+    stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
+    common = _common_light(data, stated + beside)
+    sums = Residuals(data, common)
+    change, energy = _change(data, solution, common), float(sums.energy.sum())
     test = sums.noise_test
     whole = float(sums.squares.sum())
     white = test is not None and whole < (1 + _STRUCTURE) * max(test.ratio * stated, TINY) + beside
@@ -257,22 +257,21 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     if lack:
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
+    if with_defects and noise.stated and not sums.clipped and (defects := _defects(data, sums, ratio)):
+        return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
     faults = check.faults()
-    defects = _defects(data, sums, ratio) if with_defects and noise.stated and not sums.clipped else None
-    if defects and excess > 0 and float(sums.squares[defects.rows, defects.columns].sum()) > _MOSTLY * excess:
-        return replace(found, defects=defects)
-    places = sums.places(ratio) if noise.stated and not (defects or off) else []
+    places = sums.places(ratio) if noise.stated and not off else []
     found = replace(found, faults=faults, places=tuple(places), picture=check.picture)
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
-    fitting = not (found.flagged or faults or places or off)
+    signed = any(shot.sign for shot in data.shots.manifest.patterns.captures)
+    turned = signed and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
+    fitting = not (found.flagged or faults or places or off or turned)
     if scaled:
         readings: tuple[Reading, ...] = (scaled,)
     else:
         readings = () if fitting else find_readings(data, ratio, beside + of_ramps)
     found = replace(found, readings=readings)
-    if not readings and not faults and defects:
-        return replace(found, defects=defects)
     detail = _detail(data, sums, excess, beside) if found.flagged and not (readings or faults) else 0.0
     if detail:
         fine, _ = balance.misfit(noise, max(of_ramps, detail))
@@ -289,6 +288,8 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         cause = Cause.SATURATION if saturated else Cause.PIXELS if found.places else Cause.MODEL
     elif found.places:
         cause = Cause.PIXELS
+    elif turned:
+        cause = Cause.MODEL
     elif off:
         cause = Cause.NOISE
     elif change > _COMMON_IMAGE:
@@ -310,8 +311,9 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
 
 
-def _common_light(data: Accumulation) -> FloatArray | None:
-    """Return the light (m, m') that is the same in all measurements; None where it is no more than chance.
+def _common_light(data: Accumulation, expected: float) -> FloatArray | None:
+    """Return the light (m, m') that is the same in all measurements; None where it is no more than chance, or explains
+    less than most of the residual beyond the ``expected`` energy.
 
     The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room: F = f g^T,
     of which the residuals tell K |F|^2 less the energy in the model's range.
@@ -341,7 +343,8 @@ def _common_light(data: Accumulation) -> FloatArray | None:
     variance = float(data.noise.variance.mean())
     energy = max(float(data.frames.energy), TINY)
     least = max(2 * CHANCE**2 * variance, (UNEXPLAINED / 4) ** 2 * energy)
-    if explained < least:
+    excess = energy - sum_of_squares(data_weights) - expected
+    if explained < max(least, _MOSTLY * excess):
         return None
     return np.asarray(sum(value * field for value, field in zip(found, fields, strict=True)))
 

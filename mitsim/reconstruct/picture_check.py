@@ -56,8 +56,6 @@ class PictureCheck:
         (2, K) place of each frame along rows and columns [scene pixels], and its standard error.
     foreign, disturbed
         (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
-    frame_of
-        (n, n') number of the shot that lights each pixel.
     """
 
     power: FloatArray
@@ -66,15 +64,15 @@ class PictureCheck:
     shift_error: FloatArray
     foreign: FloatArray
     disturbed: FloatArray
-    frame_of: IntArray
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n'), because the picture does not decide the power and
-        the place of single frames: the larger of their errors and of their scatter over the frames."""
-        power = np.maximum(self.power_error, robust_scatter(self.power))[self.frame_of]
-        slopes = np.gradient(image)
-        moves = [np.maximum(error, robust_scatter(own)) for own, error in zip(self.shift, self.shift_error, strict=True)]
-        parts = [image * power, *(slope * move[self.frame_of] for slope, move in zip(slopes, moves, strict=True))]
+        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames: their
+        scatter over the frames, beyond what the picture makes of it, which may be twice the errors."""
+        power, *moves = (
+            np.sqrt(max(robust_scatter(own) ** 2 - float(np.median(2 * error)) ** 2, 0.0))
+            for own, error in ((self.power, self.power_error), *zip(self.shift, self.shift_error, strict=True))
+        )
+        parts = [image * power, *(slope * move for slope, move in zip(np.gradient(image), moves, strict=True))]
         return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
 
 
@@ -111,7 +109,7 @@ def check_picture(image: FloatArray, frame_of: IntArray, periods: Sequence[int],
     means = np.bincount(own, roughness, count) / lit
     foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
     disturbed = _disturbed(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
-    return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed, frame_of)
+    return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed)
 
 
 def _disturbed(

@@ -21,6 +21,7 @@ from scipy.optimize import minimize_scalar
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.devices.patterns import shot_orders
 from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.factorisation import group_pixels
 from mitsim.reconstruct.residuals import CHANCE, TINY
 from mitsim.reconstruct.solver import Prepared, prepare
 
@@ -34,6 +35,9 @@ _EXPONENTS, _LAGS = (0.3, 3.0), (0.0, 0.5)
 """Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before."""
 _LINEAR, _NO_LAG = 0.05, 2e-3
 """Differences from an exponent of one, and lag, that are no readings of their own."""
+_LAMBDA, _NEGATIVE = 1e-3, 0.5
+"""Lambda, over the largest sigma^2, of the image whose mean is looked at; and the part of its largest mean by which an
+image is negative: noise of no picture that shows anything is as large."""
 _MULTIPLIED, _LEAST_MULTIPLIED = 0.15, 1.5
 """Chi-square of multiplied numbers over their factor, and at least: their shot noise is that many times too large, and
 0.3 of it if the black level was multiplied, too."""
@@ -50,6 +54,10 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 """States of frames, and the turns that bring them back."""
 _KEPT, _TAKEN = "as they are", "row-major"
+_STEPS = {
+    "late": "the frames are one step late: each shot shows the pattern of the shot before",
+    "early": "the frames are one step early: each shot shows the pattern of the next",
+}
 
 
 @dataclass(frozen=True)
@@ -70,8 +78,30 @@ def multiple(factor: int, chi_square: float) -> Reading | None:
     """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its ``chi_square``."""
     if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
         return None
-    words = f"divided by {factor}, because all numbers are multiples of it"
-    return Reading(words if factor & (factor - 1) else f"{words}: few bits were moved up by {factor.bit_length() - 1}")
+    words = f"the numbers are divided by {factor}, because all of them are multiples of {factor}"
+    return Reading(words if factor & (factor - 1) else f"{words}, as of fewer bits that were moved up by {factor.bit_length() - 1}")
+
+
+def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[FloatArray]]:
+    """Return the scene rows and the scene columns that are lit alike, group by group, of ``patterns`` P_L and P_R."""
+    return [[group.pixels for group in group_pixels(side, "block")] for side in patterns]
+
+
+def negative(prepared: Prepared, groups: list[list[FloatArray]], weights: FloatArray) -> bool:
+    """Return True if pixels that are lit alike have a negative reflectance in the mean, where noise is averaged.
+
+    Parameters
+    ----------
+    prepared, weights
+        the model, and W (r, r') of all frames.
+    groups
+        of :func:`pixel_groups`.
+    """
+    sigma = prepared.sigma
+    gain = np.divide(sigma, np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2, out=np.zeros_like(sigma), where=sigma > 0)
+    image = prepared.image(gain * weights)
+    means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
+    return bool(means.min() < -_NEGATIVE * np.abs(means).max())
 
 
 def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Reading, ...]:
@@ -93,8 +123,8 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     whole = max(run.energy, TINY)
     allowed = noise + beside * run.energy / max(float(data.frames.energy), TINY)
     chance = CHANCE * noise * float(np.sqrt(2 / max(run.size * data.noise.variance.size * run.prepared.spare, 1)))
-    now = run.misfit(_KEPT, _TAKEN)
-    unexplained = max(now - allowed, 0.0)
+    now = run.misfit(_KEPT, _TAKEN)  # infinite if the image is negative
+    unexplained = min(max(now - allowed, 0.0), whole)
     if unexplained <= chance:
         return ()
     found = [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.candidates()]
@@ -120,10 +150,10 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
 
 
 def _describe(turn: str, order: str) -> tuple[str, str | None]:
-    """Return the words of a reading, and the order where it is one."""
-    parts = [] if turn == _KEPT else [f"with frames that are {turn}"]
-    parts += [] if order == _TAKEN else [f"taken in the order {order}"]
-    return " and ".join(parts), None if order == _TAKEN else order
+    """Return the words of a reading, and the order where `mitsim import --order` knows it."""
+    parts = [] if turn == _KEPT else [f"the frames are {turn}"]
+    parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
+    return " and ".join(parts), None if order == _TAKEN or order in _STEPS else order
 
 
 class _Part:
@@ -138,6 +168,7 @@ class _Part:
         self.prepared: Prepared = prepare(
             left[self._part[0]], right[self._part[1]], *patterns, centre=data.prepared.centre
         )
+        self._groups = pixel_groups(patterns)
         self._captures = manifest.patterns.captures
         self._signed = any(shot.sign for shot in self._captures)
         self._dark = data.digital.dark_current_e_per_s
@@ -152,12 +183,9 @@ class _Part:
         self._turned: dict[str, list[FloatArray]] = {}
         self._frames, shape = frames, frames[0].shape
         self._turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape]
-        self.orders = shot_orders(manifest.patterns, getattr(manifest, "order", None))
+        self.orders = shot_orders(manifest.patterns, manifest.order)
         self.orders.setdefault(_TAKEN, np.arange(len(frames)))
-        self.orders |= {
-            "one step late (each shot shows the pattern of the shot before)": np.roll(np.arange(len(frames)), -1),
-            "one step early (each shot shows the pattern of the next)": np.roll(np.arange(len(frames)), 1),
-        }
+        self.orders |= {name: np.roll(np.arange(len(frames)), step) for name, step in (("late", -1), ("early", 1))}
         self.size = len(range(*self._part[0].indices(shape[0]))) * len(range(*self._part[1].indices(shape[1])))
         self.energy = sum(sum_of_squares(frame) for _, frame in self._measured(self._shots(_KEPT, _TAKEN)))
 
@@ -195,12 +223,12 @@ class _Part:
         if not self.prepared.centre:  # without means of rows and columns, no number is known
             best = minimize_scalar(lambda log: bent(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded")
             if abs(best.x) > _LINEAR:
-                words = f"with a tone curve: the numbers are the light to the power of {np.exp(-best.x):.2g}"
+                words = f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
                 found.append(((words, None), float(best.fun)))
         if not self._signed:
             best = minimize_scalar(lagging, bounds=_LAGS, method="bounded")
             if best.x > _NO_LAG:
-                found.append(((f"with lag: each frame holds {best.x:.1%} of the frame before", None), best.fun))
+                found.append(((f"the sensor lags: each frame holds {best.x:.1%} of the frame before", None), best.fun))
         return found
 
     def misfit(self, turn: str, order: str) -> float:
@@ -238,11 +266,7 @@ class _Part:
 
     def _misfit(self, shots: Sequence[FloatArray]) -> float:
         weights, energy = self._weights(shots)
-        sigma = self.prepared.sigma
-        gain = sigma / (np.square(sigma) + 1e-4 * float(sigma.max()) ** 2)
-        if self.prepared.image(gain * weights).mean() <= 0:
-            return float("inf")
-        return energy - sum_of_squares(weights)
+        return float("inf") if negative(self.prepared, self._groups, weights) else energy - sum_of_squares(weights)
 
     def _bent_misfit(self, shots: Sequence[FloatArray], exponent: float) -> float:
         """Return the misfit, in numbers as they were read, of light that is their power ``exponent``."""

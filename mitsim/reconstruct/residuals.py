@@ -17,6 +17,7 @@ does not hide behind one that is in one place, and sensors of uneven response ra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -41,6 +42,10 @@ _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
 _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
+_BRIGHT = 50.0
+"""Energy of a half over that of its noise from which its power is known."""
+_STEPS = 50
+"""Steps of conjugate gradients at most; patterns that share little need a few."""
 _ALIKE = 1e-3
 """Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as black."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
@@ -105,12 +110,18 @@ class Pair:
     cost: float
 
     @classmethod
-    def of(cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray) -> Pair:
-        """Fit ``beyond`` to the two halves, (total +- difference) / 2, by least squares; all (m, m')."""
+    def of(
+        cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray, noise: float
+    ) -> Pair:
+        """Fit ``beyond`` to the two halves, (total +- difference) / 2, by least squares; all (m, m').
+
+        A half with less than some times the energy of its ``noise`` would be fitted to its own noise.
+        """
         halves = (total + difference) / 2, (total - difference) / 2
         normal = np.array([[float(np.vdot(one, other)) for other in halves] for one in halves])
         powers, errors = np.zeros(2), np.full(2, np.inf)
-        if np.linalg.det(normal) > _ALIKE * float(np.diag(normal).max()) ** 2:
+        known = float(np.diag(normal).min()) > _BRIGHT * noise
+        if known and np.linalg.det(normal) > _ALIKE * float(np.diag(normal).max()) ** 2:
             inverse = np.linalg.inv(normal)
             powers = inverse @ [float(np.vdot(beyond, half)) for half in halves]
             errors = np.sqrt(np.diag(inverse))
@@ -165,6 +176,7 @@ class Residuals:
         counts = prepared.left.pattern_count, prepared.right.pattern_count
         self.left, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
         self.pairs: dict[tuple[int, int], Pair] = {}
+        self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
         self.squares, self._sum, self._slope, self._slope_weight = (np.zeros(sizes) for _ in range(4))
@@ -208,7 +220,8 @@ class Residuals:
         self.free[pattern] = residual.size - np.count_nonzero(alone)
         self.leave_out[pattern] = self.left[pattern]
         if not alone.all():
-            seen = turn.T @ (left.matrix.T @ residual @ right.matrix) @ other_turn
+            self._seen[pattern] = left.matrix.T @ residual @ right.matrix
+            seen = turn.T @ self._seen[pattern] @ other_turn
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self.fitted[pattern] = float(np.vdot(residual, modelled))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
@@ -219,7 +232,41 @@ class Residuals:
         others = self.noise.variance.size - 1
         if measurement.shots == 2 and others:
             beyond = (measurement.light * (1 + others) - self.noise.light) / others
-            self.pairs[pattern] = Pair.of(beyond, measurement.light, measurement.frame, residual)
+            self.pairs[pattern] = Pair.of(
+                beyond, measurement.light, measurement.frame, residual, float(self.noise.variance[pattern]) * residual.size / 2
+            )
+
+    def without(self, patterns: Sequence[tuple[int, int]]) -> float:
+        """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
+
+        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2 +
+        <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
+        """
+        grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
+
+        def apart(values: FloatArray) -> FloatArray:
+            found = values.copy()
+            for each, (left, right) in grams.items():
+                places = self._prepared.places(each)
+                found[places] -= left @ values[places] @ right
+            return found
+
+        rest = np.zeros_like(self.weights)
+        for each in patterns:
+            if each in self._seen:
+                rest[self._prepared.places(each)] += self._seen[each]
+        found, step, seen = np.zeros_like(rest), rest.copy(), rest.copy()
+        squared = sum_of_squares(rest)
+        for _ in range(_STEPS):
+            moved = apart(step)
+            curvature = float(np.vdot(step, moved))
+            if curvature <= 1e-9 * sum_of_squares(step):
+                break
+            found += squared / curvature * step
+            rest = rest - squared / curvature * moved
+            before, squared = squared, sum_of_squares(rest)
+            step = rest + squared / max(before, TINY) * step
+        return sum(float(self.left[each]) for each in patterns) + float(np.vdot(seen, found))
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""

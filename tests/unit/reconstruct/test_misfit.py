@@ -12,7 +12,7 @@ import pytest
 
 from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.causes import Cause
+
 from mitsim.reconstruct.misfit import CHANCE, UNEXPLAINED, Misfit, chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Status, Verdict

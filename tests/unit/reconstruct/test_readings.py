@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.causes import _SHAPES, Cause, Readings, light_around
+
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import BLACK, CODES, READ, Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
