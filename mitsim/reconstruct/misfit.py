@@ -27,7 +27,7 @@ from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
-from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, common_energy, common_weights
+from mitsim.reconstruct.residuals import CHANCE, NOISE_OFF, TINY, NoiseTest, Place, Residuals, common_energy, common_weights
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
 
@@ -244,10 +244,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     change, energy = _change(data, solution, common), float(sums.energy.sum())
     test = sums.noise_test
     whole = float(sums.squares.sum())
-    white = test is not None and whole < (1 + _STRUCTURE) * max(test.ratio * stated, TINY) + beside
-    off = test is not None and test.off(noise.stated, beside / max(stated, TINY)) and (white or test.ratio < 1)
-    if test and noise.stated and test.ratio < 1 and whole > stated:
-        off = False  # noise that second differences do not see, as of rows, fills the difference
+    off = test is not None and _noise_is_off(test, noise, whole - beside, stated, beside)
     ratio = test.ratio if test and (off or not noise.stated) else 1.0
     balance = Balance(sums.residual, sums.energy, sums.expected(ratio, factor_energy or 0.0), sums.pixels, factor_energy is not None)
     found, excess = balance.misfit(noise, of_ramps)
@@ -266,7 +263,10 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
     signed = any(shot.sign for shot in data.shots.manifest.patterns.captures)
     turned = signed and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
-    fitting = not (found.flagged or faults or places or off or turned)
+    # A reading is looked for in dim light, too, where chance hides half of what is off.
+    hint = 1 + _chance(noise, float(sums.pixels.sum())) / 2
+    hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
+    fitting = not (found.flagged or faults or places or off or turned or hinted)
     if scaled:
         readings: tuple[Reading, ...] = (scaled,)
     else:
@@ -295,6 +295,30 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     elif change > _COMMON_IMAGE:
         cause = Cause.LIGHT
     return replace(found, flagged=cause is not None, cause=cause)
+
+
+def _noise_is_off(test: NoiseTest, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
+    """Return True if the residuals' noise is not what is stated.
+
+    Too little energy is too little noise, because structure only adds to it. Too much is noise only if second differences
+    see it, too.
+
+    Parameters
+    ----------
+    test
+        second differences of the residuals.
+    noise
+        as it is stated.
+    whole, stated, beside
+        energy of all residuals, of their stated noise, and of what calibration and rendering add.
+    """
+    if not noise.stated:
+        return test.off(False, 0.0)
+    chance = _chance(noise, float(noise.light.size))
+    if whole < (1 - NOISE_OFF - chance) * stated:
+        return True
+    structure = whole > (1 + _STRUCTURE) * test.ratio * stated + beside
+    return not structure and whole > (1 + NOISE_OFF + chance) * stated + beside and test.off(True, beside / max(stated, TINY))
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:

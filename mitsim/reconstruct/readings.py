@@ -29,7 +29,7 @@ _FITS, _AT_MOST = 0.05, 2e-2
 """Part of the unexplained energy, and of the measurements, rms, that a reading may leave."""
 _ALIKE = 0.02
 """Relative difference of misfits up to which two readings fit alike."""
-_ROWS = 2.0
+_ROWS = 4.0
 """Sensor rows for each scene row, at least, of the part of the sensor that decides."""
 _EXPONENTS, _LAGS = (0.3, 3.0), (0.0, 0.5)
 """Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before."""
@@ -125,7 +125,7 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     chance = CHANCE * noise * float(np.sqrt(2 / max(run.size * data.noise.variance.size * run.prepared.spare, 1)))
     now = run.misfit(_KEPT, _TAKEN)  # infinite if the image is negative
     unexplained = min(max(now - allowed, 0.0), whole)
-    if unexplained <= chance:
+    if unexplained <= chance / 2:
         return ()
     found = [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.candidates()]
     most = allowed + max(_FITS * unexplained, min(chance, unexplained / 2))

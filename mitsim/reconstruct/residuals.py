@@ -37,7 +37,7 @@ _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
 _NOISE_TILE, _NOISE_ROWS = 16, 160
 """Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
-_NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
+NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
 _CORRELATED = (70 / 36) ** 2
@@ -70,20 +70,19 @@ class NoiseTest:
     gain_error: float
 
     def off(self, stated: bool, beside: float) -> bool:
-        """Return True if the noise is not what is stated.
+        """Return True if the noise is more than what is stated.
 
         Parameters
         ----------
         stated
-            whether read noise is stated; otherwise only the slope over the light is compared.
+            whether read noise is stated; otherwise only the slope over the light is compared, in both directions.
         beside
             energy that calibration and rendering add, over that of the noise.
         """
         if not stated:
             known = self.gain_error < _SLOPE_KNOWN
             return bool(known and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error)
-        chance = CHANCE * self.error
-        return self.ratio < 1 - _NOISE_OFF - chance or self.ratio > (1 + beside) * (1 + _NOISE_OFF) + chance
+        return self.ratio > (1 + beside) * (1 + NOISE_OFF) + CHANCE / 2 * self.error
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulation import accumulate
+from mitsim.devices.patterns import shot_orders
 
+from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import reconstruct
-from tests.ideal_sessions import BLACK, CODES, READ, Bench, bench, picture, shadow
+from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import Frames, with_frames
 
 CAMERA = Bench(shadow(), shadow(1.3))
@@ -29,129 +30,85 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def reported(patterns: str, change: Callable[[Frames], Frames]) -> tuple[Cause | None, str]:
-    shots = with_frames(CAMERA.run(patterns, picture(1), 1), change)
-    misfit = reconstruct(shots, CAMERA.calibrated(1)).misfit
+def reported(patterns: str, change: Callable[[Frames], Frames], camera: Bench = CAMERA) -> tuple[Cause | None, list[str]]:
+    shots = with_frames(camera.run(patterns, picture(1), 1), change)
+    misfit = reconstruct(shots, camera.calibrated(1)).misfit
     assert misfit is not None
-    return misfit.cause, misfit.reason
+    return misfit.cause, [reading.words for reading in misfit.readings]
 
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
 @pytest.mark.parametrize("turn", TURNS)
 def test_turned_frames(patterns: str, turn: str) -> None:
-    """As what they are; a good run says nothing."""
-    cause, words = reported(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
-    assert cause is Cause.ORIENTATION and turn in words
+    """(Planted: the turn itself in place of the one that brings frames back.)"""
+    cause, (words,) = reported(patterns, lambda frames: [TURNS[turn](frame) for frame in frames])
+    assert cause is Cause.READING and turn in words
 
 
 @pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
 def test_another_order(patterns: str) -> None:
-    assert reported(patterns, lambda frames: [frames[-1], *frames[:-1]])[1].startswith("the frames are one step late")
-    assert reported(patterns, lambda frames: [*frames[1:], frames[0]])[1].startswith("the frames are one step early")
-    cause, words = reported(patterns, lambda frames: frames[::-1])
-    # Signed patterns in the reverse order are others of the family, of a scene with negative pixels.
-    assert cause is Cause.ORDER and ("negative" if patterns == "hadamard:4" else "reverse order") in words
+    assert "one step late" in reported(patterns, lambda frames: [frames[-1], *frames[:-1]])[1][0]
+    assert "one step early" in reported(patterns, lambda frames: [*frames[1:], frames[0]])[1][0]
+    cause, (words,) = reported(patterns, lambda frames: frames[::-1])
+    assert cause is Cause.READING and words == "the shots were taken in the order reversed"
 
 
-def test_all_halves_exchanged() -> None:
+@pytest.mark.parametrize("name", ["column-major", "sequency", "dyadic", "halves-exchanged", "plus-first"])
+def test_orders_that_import_knows(name: str) -> None:
+    """Frames in another order are restored by the permutation of that name, and by no other of this camera."""
+    shots = CAMERA.run("hadamard:4", picture(1), 1)
+    order = np.argsort(shot_orders(shots.manifest.patterns)[name])
+    misfit = reconstruct(with_frames(shots, lambda frames: [frames[k] for k in order]), CAMERA.calibrated(1)).misfit
+    assert misfit is not None and [reading.order for reading in misfit.readings] == [name]
+
+
+def test_readings_that_fit_alike_are_all_listed() -> None:
+    """With equal masks on both sides transposed frames and shots of a loop over columns cannot be told apart."""
+    cause, words = reported("dots:4", lambda frames: [frames[4 * (k % 4) + k // 4] for k in range(16)], bench())
+    assert cause is Cause.READING and len(words) == 2
+    assert any("transposed" in each for each in words) and any("column-major" in each for each in words)
+
+
+def test_exchanged_halves_of_all_pairs() -> None:
     cause, words = reported("hadamard:4", lambda frames: [frames[number ^ 1] for number in range(len(frames))])
-    assert cause is Cause.ORDER and "negative" in words
+    assert cause is Cause.READING and "halves-exchanged" in words[0]
 
 
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
-def test_a_tone_curve(patterns: str) -> None:
+@pytest.mark.parametrize("exponent", [1.8, 2.2])
+def test_a_tone_curve(patterns: str, exponent: float) -> None:
+    """Its exponent is found to a tenth. (Planted: the misfit in curved numbers, by which any crushing curve wins.)"""
     span = CODES - 1 - BLACK
-    cause, _ = reported(
-        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames]
+    cause, words = reported(
+        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / exponent) for f in frames]
     )
-    assert cause is Cause.GAMMA
+    assert cause is Cause.READING and float(words[0].split()[-1]) == pytest.approx(1 / exponent, rel=0.1)
 
 
-def test_the_tone_curve_of_displays() -> None:
-    """Linear in the dark, which no power is."""
-    span = CODES - 1 - BLACK
+def test_lag() -> None:
+    """Each frame holds a tenth of the frame before."""
 
-    def encoded(frame: np.ndarray) -> np.ndarray:
-        light = np.maximum(frame - BLACK, 0) / span
-        return BLACK + span * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    def lagging(frames: Frames) -> Frames:
+        earlier = [np.full_like(frames[0], BLACK), *frames[:-1]]
+        return [0.9 * own + 0.1 * before for own, before in zip(frames, earlier, strict=True)]
 
-    assert reported("dots:4", lambda frames: [encoded(frame) for frame in frames])[1].endswith("the curve of sRGB")
-
-
-@pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
-@pytest.mark.parametrize(
-    ("bits", "light", "words"), [(12, 12, "over 12 bits"), (10, 13, "over 10 bits instead of its own")]
-)
-def test_a_tone_curve_over_fewer_bits(patterns: str, bits: int, light: int, words: str) -> None:
-    """In a file of 13 bits numbers of 10 or 12, of light of as many or of all 13."""
-    span, of_light = 2.0**bits - 1 - BLACK, 2.0**light - 1 - BLACK
-    shots, factors = replace(CAMERA, peak=8e3).run(patterns, picture(1), 1), CAMERA.calibrated(1)
-    curved = with_frames(
-        shots, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / of_light) ** (1 / 1.8) for f in frames]
-    )
-    misfit = reconstruct(curved, factors).misfit
-    assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
-    assert misfit.reason == f"the numbers are the light to the power of 1/1.8 {words}"
+    cause, words = reported("dots:4", lagging)
+    found = float(words[0].split("holds ")[1].split("%")[0])
+    assert cause is Cause.READING and found == pytest.approx(10, rel=0.03)
 
 
-def test_light_of_walls_is_no_tone_curve() -> None:
-    """Nearly half of all light spread over the sensor: a curve fits by chance, with too little noise in the dark."""
+def test_light_of_walls_is_no_other_reading() -> None:
+    """Nearly half of all light spread over the sensor."""
     walls = bench(optics=lambda light: light + 0.42228 * gaussian_filter(light, 25), peak=4e3)
     misfit = reconstruct(walls.run("random:2", picture(2), 2), bench().calibrated(2)).misfit
-    assert misfit is not None and misfit.flagged and misfit.cause is not Cause.GAMMA
-
-
-@pytest.mark.parametrize("patterns", ["uniform", "random:4"])
-def test_a_curve_between_is_none_of_its_neighbours(patterns: str) -> None:
-    span = CODES - 1 - BLACK
-    cause, _ = reported(
-        patterns, lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 1.98) for f in frames]
-    )
-    assert cause is not None and cause is not Cause.GAMMA
-
-
-@pytest.mark.parametrize("patterns", ["dots:4", "hadamard:4", "random:4"])
-def test_a_tone_curve_of_dim_light(patterns: str) -> None:
-    """Where dark current is a part of it that the curve makes larger."""
-    span = CODES - 1 - BLACK
-    shots = with_frames(
-        replace(CAMERA, peak=400.0).run(patterns, picture(1), 1),
-        lambda frames: [BLACK + span * (np.maximum(f - BLACK, 0) / span) ** (1 / 2.2) for f in frames],
-    )
-    misfit = reconstruct(shots, CAMERA.calibrated(1)).misfit
-    assert misfit is not None and misfit.cause is Cause.GAMMA
-
-
-def test_a_tone_curve_that_fits_with_too_little_noise() -> None:
-    """Nearly even light before a centred model: only the noise, three quarters of what it should be, is wrong."""
-    even = replace(CAMERA, optics=lambda light: light / 50 + 0.98 * light.mean())
-    factors = CAMERA.calibrated(1)
-    factors = replace(factors, manifest=factors.manifest.model_copy(update={"centre": True}))
-    shots, span = even.run("dots:4", picture(1), 1), CODES - 1 - BLACK
-    assert reconstruct(shots, factors).ok
-    curved = with_frames(shots, lambda frames: [BLACK + span * ((f - BLACK) / span) ** (1 / 2.2) for f in frames])
-    misfit = reconstruct(curved, factors).misfit
-    assert misfit is not None and misfit.flagged and misfit.cause is Cause.GAMMA
-
-
-@pytest.mark.parametrize(("patterns", "peak", "seed"), [("uniform", 4673.0, 54), ("random:2", 3498.0, 69)])
-def test_too_much_noise_stated_is_no_tone_curve(patterns: str, peak: float, seed: int) -> None:
-    """A curve that makes numbers larger makes their noise as large as is stated; their likelihood counts that against
-    it."""
-    shots, factors = bench(peak=peak).run(patterns, picture(seed), seed), bench().calibrated(seed)
-    digital = shots.manifest.digital.model_copy(update={"read_noise_e": 6 * READ})
-    stated = Capture(shots.manifest.model_copy(update={"digital": digital}), memory=shots._memory)
-    misfit = reconstruct(stated, factors).misfit
-    assert misfit is not None and misfit.chi_square < 0.9 and misfit.reading is None
+    assert misfit is not None and misfit.flagged and not misfit.readings
 
 
 def test_another_order_of_dim_light() -> None:
-    """Light that is off by less than chance leaves to all of it fits the right order alone."""
     shots = replace(CAMERA, peak=10.0).run("dots:4", picture(1), 1)
     late = with_frames(shots, lambda frames: [frames[-1], *frames[:-1]])
     misfit = reconstruct(late, CAMERA.calibrated(1)).misfit
-    assert misfit is not None and misfit.flagged and misfit.reason.startswith("the frames are one step late")
-    assert misfit.chi_square < 1 + 6 * np.sqrt(2 / (16 * 96 * 96))
+    assert misfit is not None and misfit.flagged and "one step late" in misfit.reason
 
 
 def left_aligned(gain: float) -> Capture:
@@ -172,53 +129,24 @@ def left_aligned(gain: float) -> Capture:
 
 
 def test_numbers_that_were_multiplied() -> None:
-    """An image 16 times too bright fits; its noise does not. Where the camera file knows of it, all is well."""
+    """An image 16 times too bright fits, but its noise does not. A camera file of these numbers fits."""
     found = reconstruct(left_aligned(1.0), bench().calibrated(1))
-    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.SCALE
-    assert "multiples of 16" in str(found.status) and "divide" in str(found.status)
+    assert not found.ok and found.misfit is not None and found.misfit.cause is Cause.READING
+    assert "multiples of 16" in str(found.status) and "divided by 16" in str(found.status)
     assert reconstruct(left_aligned(16.0), bench().calibrated(1)).ok
 
 
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
-    """Gloss and depth as before."""
+    """Gloss and depth."""
     place = np.linspace(-1, 1, 96)
     glossy = Bench(shadow(), shadow(), lambda light: light * (1 + 0.1 * np.outer(place, place)))
-    for camera, cause in ((glossy, Cause.GLOSS), (bench(0.3), Cause.DEPTH)):
+    for camera in (glossy, bench(0.3)):
         misfit = reconstruct(camera.run("dots:4", picture(1), 1), bench().calibrated(1)).misfit
-        assert misfit is not None and misfit.cause is cause and misfit.reading is None and not misfit.faults
+        assert misfit is not None and misfit.flagged and not misfit.readings and not misfit.faults
 
 
-@pytest.mark.parametrize("words", _SHAPES)
-def test_the_slope_of_a_tone_curve_is_its_derivative(words: str) -> None:
-    """As the likelihood of numbers takes it, in the dark and in the light. (Planted: the two parts of sRGB
-    exchanged.)"""
-    light, slope = _SHAPES[words]
-    numbers = np.array([0.01, 0.03, 0.0404, 0.0405, 0.1, 0.5, 0.9])
-    np.testing.assert_allclose((light(numbers + 1e-6) - light(numbers - 1e-6)) / 2e-6, slope(numbers), rtol=1e-6)
-
-
-@pytest.mark.parametrize(("patterns", "part"), [("dots:2", 0.3), ("dots:4", 1.5 / 16), ("dots:8", 0.05)])
-def test_an_order_may_leave_a_frame_of_its_cycle(patterns: str, part: float) -> None:
-    """Where most frames are off: one and a half of so many frames, between a twentieth and three tenths of what is
-    unexplained. (Planted: three tenths always.)"""
-    data = accumulate(CAMERA.run(patterns, picture(1), 1), CAMERA.calibrated(1))
-    for all_off, most in ((True, part), (False, 0.05)):
-        allowed = [each[3] for each in Readings(data)._candidates(all_off) if each[0] is Cause.ORDER]
-        assert allowed and allowed == pytest.approx([most] * len(allowed))
-
-
-def test_the_light_around_a_reading_is_not_its_own() -> None:
-    """Noise of a reading says nothing of whether it is a dark or a bright one. (Planted: more than its own taken
-    off.)"""
-    alone = np.zeros((11, 11))
-    alone[5, 5] = 1.0
-    found = light_around(alone)
-    assert found[5, 5] == pytest.approx(0, abs=1e-12) and found[3:8, 3:8].sum() == pytest.approx(24 / 25)
-
-
-def test_noise_of_the_factors_is_no_other_cause() -> None:
-    """Turned frames against factors of a fiftieth's error: what that leaves of them as they were is expected.
-    (Planted: taken off what is expected; depth.)"""
+def test_noise_of_the_factors_is_no_misfit_of_a_reading() -> None:
+    """Turned frames against factors of a fiftieth's error. (Planted: the factors' noise left out of what is allowed.)"""
     shots = with_frames(CAMERA.run("dots:4", picture(1), 1), lambda frames: [np.flipud(frame) for frame in frames])
     misfit = reconstruct(shots, CAMERA.calibrated(1, 0.02)).misfit
-    assert misfit is not None and misfit.cause is Cause.ORIENTATION
+    assert misfit is not None and misfit.cause is Cause.READING
