@@ -27,7 +27,7 @@ OFF = 7e-3
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 """Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
 does not fit as a whole, and no single frames are named."""
-_FOREIGN, _DISTURBED = 6.5, 8.5
+_FOREIGN, _DISTURBED = 6.5, 7.5
 """Robust deviations from which a frame, and a window of frames, contradict the picture: 0 of 300 good runs."""
 _FLICKERS, _POWER = 15.0, 0.01
 """Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a

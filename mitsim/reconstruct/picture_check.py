@@ -28,10 +28,12 @@ from mitsim.core.arrays import FloatArray
 
 IntArray = npt.NDArray[np.intp]
 
-_SCALES = 8.0, 4.0, 2.0, 1.0, 1.0
+_SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
 _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
+_FEW, _OF_NORMAL = 0.35, 0.454
+"""Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
 _MOST = 3.0
 """Scales at which a single pixel's difference counts in full: edges of a print reach more."""
 _POWER, _SHIFT = 0.1, 0.5
@@ -99,10 +101,10 @@ def check_picture(image: FloatArray, frame_of: IntArray, periods: Sequence[int],
     stencil = _Stencil(image, frame_of)
     if not stencil.offsets or stencil.pixels.size < _FEWEST * (count + len(stencil.offsets)):
         return None
-    power, power_error, differences = stencil.fit([image], count, noise, _POWER)
+    power, power_error, differences = stencil.fit(count, noise, _POWER)
     # A shift is looked for in the picture without the powers, because in even parts these look like a slope.
     even = image / np.maximum(1 + power, _POWER)[frame_of]
-    shift, shift_error, _ = _Stencil(even, frame_of).fit([*np.gradient(even)], count, noise, _SHIFT)
+    shift, shift_error = stencil.fit_with_weights(even, [*np.gradient(even)], count, noise, _SHIFT)
     own = frame_of.ravel()[stencil.pixels]
     lit = np.maximum(np.bincount(own, minlength=count), 1)
     roughness = np.log1p(np.square(differences))
@@ -110,6 +112,30 @@ def check_picture(image: FloatArray, frame_of: IntArray, periods: Sequence[int],
     foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
     disturbed = _disturbed(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
     return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed)
+
+
+def _solve(
+    design: csr_matrix, weights: FloatArray, rest: FloatArray, prior: float, count: int
+) -> tuple[FloatArray, FloatArray, csr_matrix]:
+    """Return weighted least squares of ``rest``, the inverse of the normal matrix, and the weighted design.
+
+    The same change of all ``count`` frames is a change of the picture, and is held at zero.
+    """
+    size = design.shape[1]
+    known = np.eye(size) / prior**2 + np.kron(np.eye(size // count), np.full((count, count), _FIXED))
+    weighted = design.multiply(weights[:, None]).tocsr()
+    inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
+    return inverse @ (weighted.T @ rest), inverse, weighted
+
+
+def _errors(weighted: csr_matrix, inverse: FloatArray, left_over: FloatArray, prior: float, count: int) -> FloatArray:
+    """Return the standard errors of the sandwich estimator (Huber 1967), which does not take differences for normal
+    numbers."""
+    scores = weighted.multiply(left_over[:, None]).tocsr()
+    known = np.eye(len(inverse)) / prior**2
+    covariance = inverse @ ((scores.T @ scores).toarray() + known) @ inverse
+    spare = max(len(left_over) - len(inverse), 1) / len(left_over)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare))
 
 
 def _disturbed(
@@ -133,6 +159,8 @@ def _disturbed(
             runs = range(count - length + 1)
             total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
             scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
+            # A texture with a period of its own deviates in most frames, and a disturbance in few.
+            scores /= np.maximum(np.quantile(scores, _FEW, axis=0) / _OF_NORMAL, 1.0)
             for k, worst in enumerate(scores.max(axis=(1, 2))):
                 found[k : k + length] = np.maximum(found[k : k + length], worst)
     return found
@@ -154,50 +182,65 @@ class _Stencil:
             if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
         ]
 
-    def fit(
-        self, changes: Sequence[FloatArray], count: int, noise: FloatArray, prior: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit the stencil together with how far each frame is off by each of the ``changes`` (n, n').
+    def fit(self, count: int, noise: FloatArray, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fit the stencil together with the power of each frame.
 
-        Returns the parameters of the changes, len(changes) ``count`` of them, their standard errors, and the differences
-        of the pixels from their predictions in units of their scale. Least squares are reweighted by Cauchy's weights;
-        parameters have a normal ``prior``; errors are those of the sandwich estimator (Huber 1967), which does not take
-        differences for normal numbers.
+        Returns the ``count`` relative powers, their standard errors, and the differences of the pixels from their
+        predictions in units of their scale. Least squares are reweighted by Cauchy's weights, because edges of the print
+        are outliers; powers have a normal ``prior``.
 
         The stencil has no negative weights, because these imitate a lamp that flickers in the period of the dots. A
-        stencil along the other direction may still do so, and the errors of the parameters then say it.
+        stencil along the other direction may still do so, and the errors of the powers then show it.
         """
-        target = self._image[self.pixels]
-        pairs = [(self._image[self.pixels + each] + self._image[self.pixels - each]) / 2 for each in self.offsets]
-        own, floor = np.stack([*pairs, np.ones(len(target)), -np.ones(len(target))], axis=1), 1e-9 * float(np.abs(target).max()) + 1e-300
-        stencil, found = np.full(own.shape[1], 1.0 / len(pairs)), np.zeros(len(changes) * count)
-        # The same change of all frames is a change of the picture, and is left out.
-        known = np.eye(len(found)) / prior**2 + np.kron(np.eye(len(changes)), np.full((count, count), _FIXED))
+        image = self._image.reshape(self.shape)
+        own, target = self._pairs(self._image), self._image[self.pixels]
+        self.weights, found = np.full(own.shape[1], 1.0 / len(self.offsets)), np.zeros(count)
+        left_over = target - own @ self.weights
         for wider in _SCALES:
-            design = self._sensitivity(changes, count, stencil[: len(pairs)])
-            left_over = target - own @ stencil - design @ found
-            scale = np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + noise.ravel()[self.pixels]), floor)
-            weights = 1 / (np.square(wider * scale) + np.square(left_over))
-            moved = target - design @ found
+            weights = self._robust(left_over, noise, wider)[0]
+            explained = target - (design @ found if found.any() else 0.0)
             normal = own.T @ (weights[:, None] * own)
             normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
             root = np.linalg.cholesky(normal)
-            stencil = nnls(root.T, np.linalg.solve(root, own.T @ (weights * moved)))[0]
-            design = self._sensitivity(changes, count, stencil[: len(pairs)])
-            weighted = design.multiply(weights[:, None]).tocsr()
-            inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
-            found = inverse @ (weighted.T @ (target - own @ stencil))
-        left_over = target - own @ stencil - design @ found
-        scores = weighted.multiply(left_over[:, None]).tocsr()
-        covariance = inverse @ ((scores.T @ scores).toarray() + known) @ inverse
-        spare = max(len(target) - len(found), 1) / len(target)
-        return found, np.sqrt(np.diag(covariance) / spare), left_over / scale
+            self.weights = nnls(root.T, np.linalg.solve(root, own.T @ (weights * explained)))[0]
+            design = self._sensitivity([image], count)
+            rest = target - own @ self.weights
+            found, inverse, weighted = _solve(design, weights, rest, prior, count)
+            left_over = rest - design @ found
+        errors = _errors(weighted, inverse, left_over, prior, count)
+        return found, errors, left_over / self._robust(left_over, noise, 1.0)[1]
 
-    def _sensitivity(self, changes: Sequence[FloatArray], count: int, stencil: FloatArray) -> csr_matrix:
-        """Return the change of pixels less their predictions (pixels, len(changes) count) with a ``stencil``."""
+    def fit_with_weights(
+        self, image: FloatArray, changes: Sequence[FloatArray], count: int, noise: FloatArray, prior: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n') with the present stencil;
+        return the parameters and their standard errors."""
+        values = image.ravel()
+        rest = values[self.pixels] - self._pairs(values) @ self.weights
+        design, left_over = self._sensitivity(changes, count), rest
+        for _ in range(2):
+            weights = self._robust(left_over, noise, 1.0)[0]
+            found, inverse, weighted = _solve(design, weights, rest, prior, count)
+            left_over = rest - design @ found
+        return found, _errors(weighted, inverse, left_over, prior, count)
+
+    def _pairs(self, values: FloatArray) -> FloatArray:
+        """Return the means of opposite neighbours (pixels, pairs), and a constant of either sign."""
+        pairs = [(values[self.pixels + each] + values[self.pixels - each]) / 2 for each in self.offsets]
+        ones = np.ones(len(self.pixels))
+        return np.stack([*pairs, ones, -ones], axis=1)
+
+    def _robust(self, left_over: FloatArray, noise: FloatArray, wider: float) -> tuple[FloatArray, FloatArray]:
+        """Return Cauchy's weights of differences, and their scale."""
+        floor = 1e-9 * float(np.abs(self._image).max()) + 1e-300
+        scale = np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + noise.ravel()[self.pixels]), floor)
+        return 1 / (np.square(wider * scale) + np.square(left_over)), scale
+
+    def _sensitivity(self, changes: Sequence[FloatArray], count: int) -> csr_matrix:
+        """Return the change of pixels less their predictions (pixels, len(changes) count) by one frame alone."""
         place, terms = np.arange(len(self.pixels)), [(0, 1.0)]
-        for offset, weight in zip(self.offsets, stencil, strict=True):
-            terms += [(offset, -weight / 2), (-offset, -weight / 2)]
+        for offset, weight in zip(self.offsets, self.weights, strict=False):
+            terms += [(offset, -weight / 2), (-offset, -weight / 2)] if weight else []
         parts = [
             (weight * change.ravel()[self.pixels + offset], place, self._frames[self.pixels + offset] + number * count)
             for number, change in enumerate(changes)

@@ -128,10 +128,10 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     if unexplained <= chance / 2:
         return ()
     found = [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.candidates()]
-    most = allowed + max(_FITS * unexplained, min(chance, unexplained / 2))
+    by_chance = min(chance, unexplained / 2)
 
     def fits(misfit: float) -> bool:
-        return misfit < most and max(misfit - allowed, 0.0) < _AT_MOST**2 * whole
+        return misfit - allowed < max(min(_FITS * unexplained, _AT_MOST**2 * whole), by_chance)
 
     if not any(fits(misfit) for _, misfit in found):
         found += [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.combinations()]

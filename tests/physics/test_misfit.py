@@ -1,7 +1,7 @@
 """Misfit in rendered light: a sheet 2 mm off is flagged, and of 42 runs that fit none is.
 
 Rationale: at 400 mm, 60 mm beside the camera, 2 mm are 0.3 projector pixels of parallax, and 13 dB with 49 dots.
-Expectation: flagged as depth in front and behind, by every family but uniform light, which takes a moved image for an
+Expectation: flagged in front and behind, by every family but uniform light, which takes a moved image for an
 image. Fitting runs are flat matt prints at the calibrated distance, each with noise of its own; a false flag would need
 6 deviations of chance.
 """
@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
-from mitsim.reconstruct.causes import Cause
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED, UNEXPLAINED_TILE
 from mitsim.reconstruct.reconstruct import reconstruct
@@ -50,7 +48,6 @@ def test_a_sheet_2_mm_off_is_flagged(shipped_bench: Callable[..., object], facto
     light = shipped_bench("photograph", sheet_z=str(z)).light(accuracy=1e-3)
     for patterns in ("dots:4", "dots:7", "hadamard:8"):
         image = reconstruct(light.expose(patterns), factors)
-        assert image.misfit is not None and image.misfit.signatures is not None, patterns
+        assert image.misfit is not None, patterns
         print(f"{z} {patterns}: {image.misfit.chi_square:.3f} {image.misfit.unexplained:.1e}", flush=True)
-        assert image.status.verdict is Verdict.MISFIT and image.misfit.cause is Cause.DEPTH
-        assert image.misfit.signatures.columns > 0.9 > 0.1 > np.abs(image.misfit.signatures.rows)
+        assert image.status.verdict is Verdict.MISFIT and not image.misfit.faults and not image.misfit.readings
