@@ -88,7 +88,8 @@ def test_a_mask_is_not_looked_at_where_that_takes_too_much(monkeypatch: pytest.M
     bench: Any = SimpleNamespace(n=128, geometry=geometry)
     looked: list[int] = []
     monkeypatch.setattr(session.Session, "_first_cost", Cost())
-    monkeypatch.setattr(session.Session, "_inseparable", property(lambda _: looked.append(1)))
+    monkeypatch.setattr(session.Session, "mask_warnings", property(lambda _: looked.append(1)))
+    monkeypatch.setattr(session, "mask_fault", lambda _: None)
     run = session.Session(bench, load_recipe(), 0)
     with pytest.raises(MitsimError, match=r"calibration: would take about 2\.75 GiB"):
         run.check_mask(Job(limits=Limits(memory_bytes=2.7 * 2**30)))
