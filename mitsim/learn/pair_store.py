@@ -138,7 +138,8 @@ class PairsManifest(BaseModel):
     @property
     def mask(self) -> Any:
         """The mask, by name."""
-        return self.camera.get("geometry", {}).get("mask")
+        geometry = self.camera.get("geometry", {})
+        return geometry.get("mask_plate", geometry.get("mask"))
 
     @cached_property
     def family(self) -> PatternFamily:

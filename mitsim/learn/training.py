@@ -145,7 +145,7 @@ class Sums:
         return cls(np.stack(truths), np.stack(weights), variances, limits, kept, store.photographs)
 
 
-def split(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
+def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
     """Return the numbers of the pairs that teach, that choose the best step, and that give the stated PSNR.
 
     All pairs of a photograph go the same way, because a network that has learned one crop knows much of the next.
@@ -191,7 +191,7 @@ class Trainer:
         weighted = self.request.feature_weight or self.request.adversary_weight
         self.critic = Critic(self.request, self._like) if weighted else None
         photographs = np.arange(len(self.sums.truths)) if self.sums.photographs is None else self.sums.photographs
-        self.teaching, self.choosing, self.judging = split(photographs, self.request.seed)
+        self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
 
     def rate(self, number: int) -> float:
         """Learning rate of step ``number``."""

@@ -373,7 +373,7 @@ def test_no_photograph_teaches_and_judges(count: int, files: int) -> None:
     not teach either. (Planted: a permutation of pairs; one part for choosing and judging.)"""
     photographs = np.arange(count) % files
     for seed in range(5):
-        parts = training.split(photographs, seed)
+        parts = training.part_photographs(photographs, seed)
         shown = [set(photographs[part]) for part in parts]
         assert all(len(part) for part in parts) and not any(a & b for a, b in itertools.combinations(shown, 2))
         assert len(parts[0]) > count / 4 and max(map(len, parts[1:])) <= 48
