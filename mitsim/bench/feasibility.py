@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from mitsim.devices.plate import Plate
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.scene.darkness import why_dark
 from mitsim.transport.direct import DirectTracer
-
-if TYPE_CHECKING:
-    from mitsim.devices.patterns import PatternFactor
 
 _SEEN = 0.25
 """Part of the projector's pixels that must be seen; the shipped scenes have 0.96 to 1, and 0.75 beside a mirror."""
@@ -174,16 +171,16 @@ class Shortage:
 def shortage(bench: Apparatus, family: PatternFamily) -> Shortage | None:
     """Return how frames of a ``bench`` under the patterns of a ``family`` are too few, or None if they are enough.
 
-    The rank along an axis is at most that of generic rows, one for each sensor row that the mask lights. Behind colour
-    filters, every line of the light has its own unknowns.
+    Numbers are counted on the sensor rows and columns that the mask lights, and unknowns on the projector pixels that
+    any pattern lights. Behind colour filters, every line of the light has its own unknowns.
     """
     geometry, n = bench.geometry, bench.n
     half = geometry.build_mask().extent_mm / 2
     lit = [int(np.count_nonzero(np.abs(each).min(axis=1) <= half)) - geometry.centred for each in _crossings(bench)]
     patterns = family.left.shape[1], family.right.shape[1]
     lines = len(bench.lines.wavelengths_nm) if bench.filters and bench.lines else 1
-    ranks = [_rank(rows, side) for rows, side in zip(lit, (family.left, family.right), strict=True)]
     needed = [int(np.count_nonzero(side.any(axis=1))) for side in (family.left, family.right)]
+    ranks = [min(rows * count, most) for rows, count, most in zip(lit, patterns, needed, strict=True)]
     data, rank = math.prod(lit) * math.prod(patterns), math.prod(ranks) * lines
     if data > rank and ranks == needed:
         return None
@@ -196,13 +193,3 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Shortage | None:
         + f"; use at least {least} patterns, or more sensor pixels",
         data <= rank,
     )
-
-
-def _rank(rows: int, patterns: PatternFactor) -> int:
-    """The rank of so many generic ``rows`` under ``patterns`` (n, K), the columns that they light at most."""
-    lit = patterns[patterns.any(axis=1)]
-    if rows >= len(lit):
-        return len(lit)
-    generic = np.random.default_rng(0).standard_normal((max(rows, 0), len(lit)))
-    # The Gram matrix of all rows, sum_k diag(p_k) G^T G diag(p_k).
-    return int(np.linalg.matrix_rank((generic.T @ generic) * (lit.astype(float) @ lit.T), hermitian=True))

@@ -26,25 +26,22 @@ from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
-from mitsim.devices.plate import MOST_TERMS
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.memory import (
-    drawing_seconds,
     first_shadow,
     frame_seconds,
     frames_at_once,
     light_bytes,
-    raster_bytes,
 )
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import raster
 from mitsim.optics.frames import Frame, at_once, mixes
-from mitsim.optics.image_formation import largest_terms, number_of_terms
+from mitsim.optics.image_formation import number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
@@ -53,10 +50,8 @@ from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
 be of diffraction."""
-_TOLD, _TOLD_S = 4.0, 6e-11
-"""Times the terms of a mask that telling how far it is from a separable one takes in memory, with their sides stacked
-and factorised; and seconds of that for each term and byte of all (a drawing that is turned by one degree, 512
-pixels, 192 terms: 0.8 GiB, 3.1 processor seconds)."""
+_PLACES = 128
+"""Sensor pixels along an axis that the mask is compared on: of many terms all pixels would take gigabytes."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
 
@@ -128,13 +123,11 @@ class Session:
         )
 
     def check_mask(self, job: Job | None = None) -> None:
-        """Raise MitsimError for a mask without factors, and if a comparison with separable masks takes more than a
-        ``job`` allows."""
+        """Raise MitsimError for a mask without factors, and if the session takes more than a ``job`` allows."""
         job, fault = job or Job(), mask_fault(self.bench)
         self._first_cost.check("calibration", job.limits)
         if fault and fault.lost > MOST_LOST:
             raise MitsimError(f"{fault.reason}; {fault.remedy}")
-        self._mask_cost.check("calibration", job.limits)
         with job.clock.stage("mask"):
             _ = self.mask_warnings
 
@@ -145,31 +138,19 @@ class Session:
         seconds = session_seconds(self.board, count, self.shots, first)
         return session_cost(self.board, count, first, sum(seconds.values()), len(self.recipe.exposure_ladder))
 
-    @property
-    def _mask_cost(self) -> Cost:
-        """Memory and time of comparing the mask with separable ones, at most."""
-        geometry, most = self.bench.geometry, 1.0
-        seconds = bytes_drawn = 0.0
-        if geometry.is_drawn(waves=False):
-            most, seconds = float(MOST_TERMS), drawing_seconds(geometry, None)
-            bytes_drawn = raster_bytes(geometry, None)
-        elif self._told is None:
-            most = float(geometry.mask_terms)
-        bytes_told = 8.0 * most * self.bench.n * sum(geometry.frame_shape)
-        return Cost(seconds=seconds + _TOLD_S * most * bytes_told, memory_bytes=bytes_drawn + _TOLD * bytes_told)
-
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:
         """Return a warning if the best separable camera leaves more of the shadow than a calibration accepts, with the
         residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
-        geometry, told, fault = self.bench.geometry, self._told, mask_fault(self.bench)
-        residual = best_term(self.shadow(geometry, told)).residual
-        if geometry.is_drawn(waves=False):
-            left_out = raster(geometry, self.distance).largest.left_out
-            residual = math.sqrt(1 - (1 - residual**2) * (1 - left_out**2))
+        geometry, fault = self.bench.geometry, mask_fault(self.bench)
+        residual = rays = fault.lost if fault else 0.0
+        if not geometry.is_drawn(waves=False):
+            residual = rays = best_term(self.shadow(geometry, None, _PLACES)).residual
+            if geometry.few_wave_terms:
+                residual = best_term(self.shadow(geometry, self.bench.spectrum, _PLACES)).residual
         if residual <= SEPARABLE_RESIDUAL:
             return ()
-        rays, cause = residual if told is None else best_term(self.shadow(geometry)).residual, ""
+        cause = ""
         remedy = fault.remedy if fault else "mount the mask straight"
         if rays < _IN_RAYS * residual:
             cause = f" by diffraction ({rays:.1%} without)"
@@ -179,22 +160,17 @@ class Session:
             f"of its shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; {remedy}",
         )
 
-    @property
-    def _told(self) -> Spectrum | None:
-        """Lines of the light, in waves of which the shadow is a sum of few terms; None: it is told in rays."""
-        return self.bench.spectrum if self.bench.geometry.few_wave_terms else None
-
-    def shadow(self, geometry: CameraGeometry, spectrum: Spectrum | None = None) -> SeparableTerms:
+    def shadow(
+        self, geometry: CameraGeometry, spectrum: Spectrum | None = None, places: int | None = None
+    ) -> SeparableTerms:
         """Return the transmissions of a camera's ``geometry`` from projector pixels at the board's distance to sensor
-        pixels: in rays, or in waves of a ``spectrum``; centred where frames are."""
+        pixels: in rays, or in waves of a ``spectrum``; centred where frames are; on about so many ``places`` along an
+        axis, None for all."""
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )
-        if geometry.is_drawn(waves=False):
-            terms = largest_terms(geometry, rows, columns, self.distance, rough=True)
-            assert terms is not None
-        else:
-            terms = shadow_terms(geometry, rows, columns, self.distance, spectrum)
+        down, across = (tuple(range(0, size, max(size // (places or size), 1))) for size in geometry.frame_shape)
+        terms = shadow_terms(geometry, rows, columns, self.distance, spectrum, (down, across))
         return centre_terms(terms) if self.centre else terms
 
     @cached_property

@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench import feasibility
 from mitsim.bench.feasibility import mask_fault, obstacles, shortage
 from mitsim.bench.layout import layout_of
 from mitsim.devices.mask_profile import MaskProfile
@@ -83,14 +81,6 @@ def test_frames_of_no_more_numbers_than_unknowns_are_told_before_light(
     if short:
         rows, _, columns = short.words.rpartition("at least ")[2].split()[:3]
         assert shortage(bench, bench.family(f"dots:{rows}x{columns}")) is None
-
-
-def test_equal_patterns_give_no_more_rank() -> None:
-    """Each pattern alone gives as many directions as there are rows; the same one again gives none."""
-    once = np.ones((16, 1), dtype=np.int8)
-    assert feasibility._rank(4, once) == 4 and feasibility._rank(4, np.repeat(once, 8, axis=1)) == 4
-    assert feasibility._rank(4, np.eye(16, 4, dtype=np.int8) + 0) == 4, "lines that are never lit are no unknowns"
-    assert feasibility._rank(4, (np.arange(16)[:, None] % 4 == np.arange(4)).astype(np.int8)) == 16
 
 
 def test_a_scene_that_hardly_meets_the_window_is_told(small_scene: Callable[..., Path]) -> None:
