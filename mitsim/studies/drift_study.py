@@ -198,7 +198,8 @@ class DriftStand:
     def reason(self) -> str:
         """Return why the image without a drift is flagged, by its solution, its light or its factors; empty if not."""
         others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
-        return "; ".join(filter(None, (reason_of(self._before.status), *(text.replace("; ", ", ") for text in others))))
+        words = (text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in others)
+        return "; ".join(filter(None, (reason_of(self._before.status), *words)))
 
     @property
     def before_db(self) -> float:
