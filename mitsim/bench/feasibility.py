@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import count
 from typing import NamedTuple
 
@@ -32,7 +31,7 @@ _PLACES = 256
 
 
 class Fault(NamedTuple):
-    """Why there is no image, what to do, and the part of the light, rms, that an image lacks."""
+    """Why there is no image, what to do, and the part that an image lacks; 1: no image can be solved for."""
 
     reason: str
     remedy: str
@@ -49,8 +48,8 @@ def obstacles(bench: Apparatus, family: PatternFamily | None = None) -> tuple[st
     family
         patterns of the frames; None if they are not known yet, so that data are not counted.
     """
-    found, short = (_unseen_scene(bench), mask_fault(bench)), family and shortage(bench, family)
-    return tuple(f"{fault.reason}; {fault.remedy}" for fault in found if fault) + ((short.words,) if short else ())
+    found = _unseen_scene(bench), mask_fault(bench), family and shortage(bench, family)
+    return tuple(f"{fault.reason}; {fault.remedy}" for fault in found if fault)
 
 
 # ---- The scene ----
@@ -152,23 +151,7 @@ def _crossings(bench: Apparatus) -> list[FloatArray]:
 # ---- Data and unknowns ----
 
 
-@dataclass(frozen=True)
-class Shortage:
-    """Frames that hold too few numbers for the image.
-
-    Attributes
-    ----------
-    words
-        numbers, unknowns and the remedy.
-    undetermined
-        whether nothing is left to estimate the noise from, so that no automatic lambda is found.
-    """
-
-    words: str
-    undetermined: bool
-
-
-def shortage(bench: Apparatus, family: PatternFamily) -> Shortage | None:
+def shortage(bench: Apparatus, family: PatternFamily) -> Fault | None:
     """Return how frames of a ``bench`` under the patterns of a ``family`` are too few, or None if they are enough.
 
     Numbers are counted on the sensor rows and columns that the mask lights, and unknowns on the projector pixels that
@@ -176,7 +159,10 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Shortage | None:
     """
     geometry, n = bench.geometry, bench.n
     half = geometry.build_mask().extent_mm / 2
-    lit = [int(np.count_nonzero(np.abs(each).min(axis=1) <= half)) - geometry.centred for each in _crossings(bench)]
+    lit = [
+        int(np.count_nonzero((each.min(axis=1) <= half) & (each.max(axis=1) >= -half))) - geometry.centred
+        for each in _crossings(bench)
+    ]
     patterns = family.left.shape[1], family.right.shape[1]
     lines = len(bench.lines.wavelengths_nm) if bench.filters and bench.lines else 1
     needed = [int(np.count_nonzero(side.any(axis=1))) for side in (family.left, family.right)]
@@ -185,11 +171,11 @@ def shortage(bench: Apparatus, family: PatternFamily) -> Shortage | None:
     if data > rank and ranks == needed:
         return None
     least = " x ".join(str(n // max(rows, 1) + 1) for rows in lit)
-    return Shortage(
+    return Fault(
         f"{patterns[0]} x {patterns[1]} patterns ({family.name}) on {lit[0]} x {lit[1]} sensor pixels that the mask "
         f"lights give {patterns[0] * lit[0]} x {patterns[1] * lit[1]} numbers for {n} x {n} unknowns"
         f"{f' of each of {lines} lines' if lines > 1 else ''}, so that "
-        + ("noise cannot be told from the image" if data <= rank else "the image is not determined")
-        + f"; use at least {least} patterns, or more sensor pixels",
-        data <= rank,
+        + ("noise cannot be told from the image" if data <= rank else "the image is not determined"),
+        f"use at least {least} patterns, or more sensor pixels",
+        1.0 if data <= rank else 1 - math.prod(ranks) / math.prod(needed),
     )

@@ -163,9 +163,16 @@ class Session:
     def shadow(
         self, geometry: CameraGeometry, spectrum: Spectrum | None = None, places: int | None = None
     ) -> SeparableTerms:
-        """Return the transmissions of a camera's ``geometry`` from projector pixels at the board's distance to sensor
-        pixels: in rays, or in waves of a ``spectrum``; centred where frames are; on about so many ``places`` along an
-        axis, None for all."""
+        """Return the transmissions from projector pixels at the board's distance to sensor pixels, centred where frames
+        are.
+
+        Parameters
+        ----------
+        geometry, spectrum
+            camera, and the light whose waves are meant; None: in rays.
+        places
+            about how many sensor pixels along an axis; None: all.
+        """
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )

@@ -185,8 +185,8 @@ def _check_data(points: Sequence[Point]) -> None:
                 setup.scene, setup.variant, setup.camera, setup.projector, setup.outside, **parameters
             )
         short = shortage(bench, bench.family(patterns))
-        if short and short.undetermined:
-            raise MitsimError(f"study: {short.words}")
+        if short and short.lost == 1:
+            raise MitsimError(f"study: {short.reason}; {short.remedy}")
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> CampaignResult:

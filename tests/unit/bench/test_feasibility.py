@@ -77,10 +77,20 @@ def test_frames_of_no_more_numbers_than_unknowns_are_told_before_light(
     bench = open_bench(small_scene(pixels=pixels))
     assert bench.geometry.frame_shape == (pixels, pixels)
     short = shortage(bench, bench.family(patterns))
-    assert (short and short.undetermined) is undetermined
+    assert (short and short.lost == 1) is undetermined
     if short:
-        rows, _, columns = short.words.rpartition("at least ")[2].split()[:3]
+        rows, _, columns = short.remedy.rpartition("at least ")[2].split()[:3]
         assert shortage(bench, bench.family(f"dots:{rows}x{columns}")) is None
+
+
+def test_a_pinhole_lights_the_rows_that_it_projects_the_window_on(small_scene: Callable[..., Path]) -> None:
+    """Rays to both ends of the window pass beside the hole, and others through it: 16 rows of 64 see d 2 tan and the
+    hole's width. (Planted: rows counted by the rays to the window's ends.)"""
+    bench = open_bench(small_scene(mask="open", mask_order=2, mask_feature=0.01, mask_distance=0.5))
+    (low, high), rows = bench.windows[0], bench.geometry.centres(0) * (1 - 0.5 / 400)
+    lit = sum(2 * abs(row) <= 0.5 * (high - low) + 0.03 for row in rows)
+    short = shortage(bench, bench.family("uniform"))
+    assert lit == 16 and short and f"on {lit} x {lit} sensor pixels" in short.reason
 
 
 def test_a_scene_that_hardly_meets_the_window_is_told(small_scene: Callable[..., Path]) -> None:
