@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.api.bench import open_bench
 from mitsim.bench.apparatus import check_devices, check_scene, spelling
 from mitsim.bench.request import Exposure, Request, check_f_number, check_image, check_wavelength
-from mitsim.core.configuration import load_model, locate, opening_words, shipped_files
+from mitsim.core.configuration import CAMERA, load_model, locate, opening_words, shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
 from mitsim.core.job import Job
@@ -514,7 +514,7 @@ def characterise(
         from mitsim.studies.characterise import characterise_frames
 
         return characterise_frames(listed, output, job)
-    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     if isinstance(frames, (str, Path)):
         raise ArgumentError("frames", f"{frames}: give the frames of each stack, or no camera, to measure a real one")
     if sensor.quantum_efficiency_curve is None:
@@ -585,7 +585,7 @@ def sense(
     >>> frame.digital.shape, frame.digital.dtype
     ((4, 6), dtype('uint32'))
     """
-    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     facts = _Irradiance(**options_of(_Irradiance, irradiance, "sense"))
     asked = Exposure(None if exposure == "auto" else exposure, exposure_fraction)
     if not 0 < facts.scale < math.inf:

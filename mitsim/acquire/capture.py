@@ -27,6 +27,7 @@ from mitsim.acquire.exposure import (
 )
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.feasibility import obstacles
 from mitsim.bench.request import Request, Task
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, check_arguments, cut
@@ -367,7 +368,7 @@ def _run(
         seconds=job.clock.seconds(),
         kernels=job.clock.kernels(),
         predicted_memory_bytes=frames_cost(bench, plan.settings, family.lighting).memory_bytes,
-        warnings=light.warnings + tuple(_warnings(light, totals, shooting, request)),
+        warnings=tuple(_warnings(light, totals, shooting, request)),
         versions=versions(),
         command=job.command,
         opened=bench.opened,
@@ -469,7 +470,11 @@ def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | 
 
 def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
-    predicted_warnings = set(light.plan.warnings) - set(known_losses(light.bench.loaded, request.effects))
+    # The light may have been planned for other patterns, which do not give the same numbers.
+    planned = obstacles(light.bench, light.bench.family(light.plan.known_request.patterns, light.seed))
+    yield from obstacles(light.bench, shooting.family)
+    yield from (text for text in light.warnings if text not in planned)
+    predicted_warnings = {*light.plan.warnings} - {*known_losses(light.bench.loaded, request.effects), *planned}
     if not light.reached:
         yield from light.unreached
     elif total.bound > accuracy and not predicted_warnings and request.noise_fraction is None:

@@ -29,6 +29,7 @@ import numpy as np
 from mitsim.acquire.exposure import NoiseTarget
 from mitsim.bench.apparatus import Apparatus, Opened
 from mitsim.bench.effects import present
+from mitsim.bench.feasibility import obstacles
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -226,7 +227,8 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
     MitsimError
         when the request does not fit the bench, or no light of the projector reaches the camera.
     """
-    lighting, effects = bench.family(request.patterns, request.seed).lighting, request.effects
+    family, effects = bench.family(request.patterns, request.seed), request.effects
+    lighting = family.lighting
     exposing = frame_seconds(bench, lines * len(lighting.weights))
     if request.seconds is None:
         plan = make_plan(bench, lighting, request.accuracy, request.seed, effects, lines)
@@ -234,7 +236,8 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
         plan = plan_within(bench, lighting, request.seconds, request.seed, effects)
     plan = plan.taking(**exposing)
     cost = frames_cost(bench, plan.settings, lighting, plan.predicted_seconds, lines=lines)
-    return replace(plan, request=request, cost=cost, made_of=bench.deciding)
+    warnings = (*plan.warnings, *obstacles(bench, family))
+    return replace(plan, request=request, cost=cost, made_of=bench.deciding, warnings=warnings)
 
 
 # -------- All lines at once behind colour filters

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mitsim.core.configuration import DEFAULT_CAMERA, load_model, locate, read_toml
+from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, PROJECTOR, load_model, locate, read_toml
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain
@@ -413,8 +413,10 @@ def check_scene(
 def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
     """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.bench.open_bench`; MitsimError for one that
     there is not."""
-    found = ((camera, DEFAULT_CAMERA), (projector, "mp_cl1"))
-    first, second = (locate(default if name is None else name, "calibration", ".toml") for name, default in found)
+    found = ((camera, DEFAULT_CAMERA, CAMERA), (projector, "mp_cl1", PROJECTOR))
+    first, second = (
+        locate(default if name is None else name, "calibration", ".toml", field) for name, default, field in found
+    )
     if camera is not None:
         _check_camera(first)
     return first, second

@@ -16,11 +16,10 @@ import numpy.typing as npt
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import camera_place
+from mitsim.bench.feasibility import obstacles, seen_light
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.reconstruct.focus import pixels_of_parallax
-from mitsim.scene.darkness import why_dark
-from mitsim.transport.direct import DirectTracer
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays
 
@@ -94,8 +93,8 @@ class Layout:
         nearest and farthest depth [mm] that this light is seen at; None where there is none.
     moves
         rows and columns of projector pixels by which a change of 1/z by 1/mm moves the window.
-    trouble
-        why none of the projector's light is seen; None where some is.
+    obstacles
+        why no calibration can give an image of this bench, a sentence each.
     """
 
     surfaces: tuple[Surface, ...]
@@ -105,7 +104,7 @@ class Layout:
     seen: int
     depths: tuple[float, float] | None
     moves: tuple[float, float]
-    trouble: str | None
+    obstacles: tuple[str, ...]
 
     @property
     def parallax(self) -> tuple[float, float]:
@@ -132,12 +131,7 @@ def layout_of(bench: Apparatus) -> Layout:
     projector = (rays.origin - origin) @ turn
     ends = rays.directions(np.array([[0, 0], [0, n], [n, n], [n, 0]], dtype=np.float64)) @ turn
     window = projector + ends * ((geometry.scene_distance - projector[2]) / ends[:, 2])[:, None]
-    light = DirectTracer(bench.setup, 1).trace(0, 0, 1)
-    lit = light.value > 0
-    seen, trouble = len(np.unique(light.pixel[lit])), None
-    depths = (1 / float(light.inverse_depth[lit].max()), 1 / float(light.inverse_depth[lit].min())) if seen else None
-    if not seen and not loaded.mirrors:
-        trouble = f"no light of the projector reaches the camera: {why_dark(loaded)}"
+    seen, depths = seen_light(bench)
     row, column = (max(map(abs, pixels_of_parallax(bench.parallax, axis, n)[:2])) for axis in (0, 1))
     lamps = {}
     for emitter, tag in loaded.small_lamps:
@@ -149,7 +143,9 @@ def layout_of(bench: Apparatus) -> Layout:
         else:
             continue
         lamps[f"{name}, line {tag.line}"] = (place - origin) @ turn
-    return Layout(_surfaces(bench, turn, origin), projector, window, lamps, seen, depths, (row, column), trouble)
+    return Layout(
+        _surfaces(bench, turn, origin), projector, window, lamps, seen, depths, (row, column), obstacles(bench)
+    )
 
 
 # -------- Surfaces as triangles

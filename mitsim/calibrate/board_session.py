@@ -19,58 +19,41 @@ from mitsim.acquire.drifting import levels
 from mitsim.acquire.exposure import camera_warnings
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
+from mitsim.bench.feasibility import MOST_LOST, mask_fault
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.devices.camera import CameraGeometry, side_of
 from mitsim.devices.patterns import Lighting, stripe_signs
-from mitsim.devices.plate import MOST_TERMS
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
 from mitsim.light.memory import (
-    drawing_seconds,
     first_shadow,
     frame_seconds,
     frames_at_once,
     light_bytes,
-    raster_bytes,
 )
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation
 from mitsim.optics.fft_shadow import raster
 from mitsim.optics.frames import Frame, at_once, mixes
-from mitsim.optics.image_formation import largest_terms, number_of_terms
+from mitsim.optics.image_formation import number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
-from mitsim.optics.terms import best_term, centre_terms, shadow_terms, stripe_misfits
+from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.reconstruct.session_side import odd_responses, too_many
 
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
 be of diffraction."""
-_TOLD, _TOLD_S = 4.0, 6e-11
-"""Times the terms of a mask that telling how far it is from a separable one takes in memory, with their sides stacked
-and factorised; and seconds of that for each term and byte of all (a drawing that is turned by one degree, 512
-pixels, 192 terms: 0.8 GiB, 3.1 processor seconds)."""
-_DARK = 1e-12
-"""Transmission below which nothing is seen: rounding of sums."""
+_PLACES = 128
+"""Sensor pixels along an axis that the mask is compared on: of many terms all pixels would take gigabytes."""
 _LINES = 4
 """Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
-
-
-@dataclass(frozen=True)
-class _Inseparable:
-    """What the best separable mask leaves of a mask's shadow in ``words``, its ``remedy``, and how many ``patterns`` of
-    a session are of another shape than the others."""
-
-    words: str
-    remedy: str
-    patterns: int
 
 
 @dataclass(frozen=True)
@@ -139,26 +122,14 @@ class Session:
             "take a larger board, or hang it straight",
         )
 
-    @cached_property
-    def mask_warnings(self) -> tuple[str, ...]:
-        """A warning where no separable camera comes near this one's shadow between projector pixels and sensor, with
-        the residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
-        found = self._inseparable
-        return () if found is None else (f"{found.words}, and images of these factors lack it; {found.remedy}",)
-
     def check_mask(self, job: Job | None = None) -> None:
-        """MitsimError for a mask behind which more patterns of the session are of another shape than may be left out of
-        it, which its frames would show after all the work; and when to tell so takes more than a ``job`` allows."""
-        job, count = job or Job(), self.signs.shape[1]
+        """Raise MitsimError for a mask without factors, and if the session takes more than a ``job`` allows."""
+        job, fault = job or Job(), mask_fault(self.bench)
         self._first_cost.check("calibration", job.limits)
-        self._mask_cost.check("calibration", job.limits)
+        if fault and fault.lost > MOST_LOST:
+            raise MitsimError(f"{fault.reason}; {fault.remedy}")
         with job.clock.stage("mask"):
-            found = self._inseparable
-        if found is not None and too_many(found.patterns, count):
-            raise MitsimError(
-                f"{found.words}: {found.patterns} of {2 * count} patterns would show another shape than the rest, too "
-                f"many for factors; {found.remedy}; it can be planned and captured, and no image of it is solved"
-            )
+            _ = self.mask_warnings
 
     @property
     def _first_cost(self) -> Cost:
@@ -167,82 +138,47 @@ class Session:
         seconds = session_seconds(self.board, count, self.shots, first)
         return session_cost(self.board, count, first, sum(seconds.values()), len(self.recipe.exposure_ladder))
 
-    @property
-    def _mask_cost(self) -> Cost:
-        """Memory and time of comparing the mask with separable ones, at most."""
-        geometry, most = self.bench.geometry, 1.0
-        seconds = bytes_drawn = 0.0
-        if geometry.is_drawn(waves=False):
-            most, seconds = float(MOST_TERMS), drawing_seconds(geometry, None)
-            bytes_drawn = raster_bytes(geometry, None)
-        elif self._told is None:
-            most = float(geometry.mask_terms)
-        bytes_told = 8.0 * most * self.bench.n * sum(geometry.frame_shape)
-        return Cost(seconds=seconds + _TOLD_S * most * bytes_told, memory_bytes=bytes_drawn + _TOLD * bytes_told)
-
     @cached_property
-    def _inseparable(self) -> _Inseparable | None:
-        """Of the mask's shadow in closed form; None where a separable mask has next to all of it."""
-        geometry, told, remedy = self.bench.geometry, self._told, "straighten the mask, or take a separable one"
-        seen = self._transmissions(geometry, told)
-        terms = centre_terms(seen) if self.centre else seen
-        residual = best_term(terms).residual
-        if geometry.is_drawn(waves=False):
-            left_out = raster(geometry, self.distance).largest.left_out
-            residual = math.sqrt(1 - (1 - residual**2) * (1 - left_out**2))
+    def mask_warnings(self) -> tuple[str, ...]:
+        """Return a warning if the best separable camera leaves more of the shadow than a calibration accepts, with the
+        residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
+        geometry, fault = self.bench.geometry, mask_fault(self.bench)
+        residual = rays = fault.lost if fault else 0.0
+        if not geometry.is_drawn(waves=False):
+            residual = rays = best_term(self.shadow(geometry, None, _PLACES)).residual
+            if geometry.few_wave_terms:
+                residual = best_term(self.shadow(geometry, self.bench.spectrum, _PLACES)).residual
         if residual <= SEPARABLE_RESIDUAL:
-            return None
-        rays, cause = residual if told is None else best_term(self.shadow(geometry)).residual, ""
+            return ()
+        cause = ""
+        remedy = fault.remedy if fault else "mount the mask straight"
         if rays < _IN_RAYS * residual:
             cause = f" by diffraction ({rays:.1%} without)"
             remedy = "bring the mask nearer to the sensor, or give it larger features: without waves it is separable"
-        words = (
+        return (
             f"the mask ({geometry.mask_words}) is not separable{cause}: the best separable one leaves {residual:.1%} "
-            f"of its shadow, {-decibels(residual):.1f} dB below it"
+            f"of its shadow, {-decibels(residual):.1f} dB below it, and images of these factors lack it; {remedy}",
         )
-        noise, scale = self._noise_behind(seen)
-        numbers = math.prod(geometry.frame_shape)
-        patterns = sum(
-            len(odd_responses(scale * misfits + noise, scale * energies + noise, numbers))
-            for misfits, energies in stripe_misfits(terms, self.signs)
-        )
-        return _Inseparable(words, remedy, patterns)
 
-    @property
-    def _told(self) -> Spectrum | None:
-        """Lines of the light, in waves of which the shadow is a sum of few terms; None: it is told in rays."""
-        return self.bench.spectrum if self.bench.geometry.few_wave_terms else None
+    def shadow(
+        self, geometry: CameraGeometry, spectrum: Spectrum | None = None, places: int | None = None
+    ) -> SeparableTerms:
+        """Return the transmissions from projector pixels at the board's distance to sensor pixels, centred where frames
+        are.
 
-    def _noise_behind(self, terms: SeparableTerms) -> tuple[float, float]:
-        """Squared noise of a +-1 response all in all [electrons^2], and squared electrons of a shot for a transmission
-        of one of the shadow's ``terms``: the brightest pixel of the uniform frame has the recipe's part of the full
-        well. Without falloff, dark current, speckle and steps of numbers."""
-        sensor, recipe = self.bench.sensor, self.recipe
-        rows, columns = (np.stack([each.sum(axis=1) for each in side]) for side in zip(*terms, strict=True))
-        white = self.through_filters(np.maximum(rows.T @ columns, 0.0))
-        scale = recipe.exposure_fraction * sensor.superpixel_full_well_e / max(float(white.max()), _DARK)
-        # A pair's two shots share the uniform light; 2 Y - U has twice that light of its own, and the readings of four.
-        light, readings = (1.0, 2.0) if self.pairs else (2.0, 4.0)
-        variance = light * scale * white + readings * sensor.superpixel_reading_noise_e**2
-        passed = 1.0 if self.filters is None else np.square(self.filters)
-        return float(np.sum(variance / passed)) / recipe.repeats, scale**2
-
-    def shadow(self, geometry: CameraGeometry, spectrum: Spectrum | None = None) -> SeparableTerms:
-        """The operator of a camera's ``geometry`` from projector pixels at the board's distance to the sensor, of
-        transmissions: in rays, or in waves of a ``spectrum``; centred where frames are."""
-        terms = self._transmissions(geometry, spectrum)
-        return centre_terms(terms) if self.centre else terms
-
-    def _transmissions(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> SeparableTerms:
-        """The same of frames as they are."""
+        Parameters
+        ----------
+        geometry, spectrum
+            camera, and the light whose waves are meant; None: in rays.
+        places
+            about how many sensor pixels along an axis; None: all.
+        """
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
         )
-        if geometry.is_drawn(waves=False):
-            seen = largest_terms(geometry, rows, columns, self.distance, rough=True)
-            assert seen is not None
-            return seen
-        return shadow_terms(geometry, rows, columns, self.distance, spectrum)
+        down, across = (tuple(range(0, size, max(size // (places or size), 1))) for size in geometry.frame_shape)
+        terms = shadow_terms(geometry, rows, columns, self.distance, spectrum, (down, across))
+        return centre_terms(terms) if self.centre else terms
 
     @cached_property
     def signs(self) -> FloatArray:

@@ -455,14 +455,14 @@ def sense(
     $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
     """
     from mitsim.bench.request import check_ending, check_image
-    from mitsim.core.configuration import locate
+    from mitsim.core.configuration import CAMERA, locate
     from mitsim.core.files import check_apart, output_file
     from mitsim.devices.sensor import load_sensor
 
     words = {**vars(exposed), "exposure": number_of("exposure", exposed.exposure)}
     if words["exposure"] != "auto":
         refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
-    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml"))
+    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml", CAMERA))
     check_ending(output, sensor)
     check_image(image)
     check_apart(output, [image])

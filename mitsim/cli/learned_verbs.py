@@ -180,10 +180,9 @@ def train(
     with limited.job() as job:
         made = train_model(method, pairs, output, calibration, resume, job, **vars(schedule))
         payload = {**made.summary(), "seconds": job.clock.seconds()}
-    (_, before), (last, _) = made.curve[0], made.curve[-1]
     lines = [
-        f"{payload['model']}: {payload['weights']} weights, {last} of {schedule.steps} steps in "
+        f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {schedule.steps} steps in "
         f"{payload['seconds']['total']:.0f} s (predicted {made.predicted_seconds:.0f}): {output}",
-        f"PSNR of pairs that did not teach: {before:.2f} dB before, {payload['psnr_db']:.2f} dB after",
+        f"PSNR of photographs held out: {made.psnr_before_db:.2f} dB before, {made.psnr_db:.2f} dB after",
     ]
     return finish(limited.as_json, payload, lines, ())

@@ -23,7 +23,7 @@ from typer.models import OptionInfo
 
 import mitsim
 from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, metavar_of
-from mitsim.core.configuration import shipped_files
+from mitsim.core.configuration import CAMERA, LIST, PROJECTOR, shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, MitsimError, printable
 from mitsim.core.job import Limits, running_seconds
@@ -55,10 +55,6 @@ _BENCH_ARGUMENTS = ("scene", "variant", "camera", "projector", "allow_outside_fi
 
 NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 """Words of --colour beside `lines` and `bands:K`."""
-
-CAMERA, PROJECTOR, RECIPE, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
-"""Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
-known of frames."""
 
 
 def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
@@ -357,7 +353,8 @@ class Devices(LitScene):
         from mitsim.core.configuration import locate
         from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
 
-        files = [locate(each, "calibration", ".toml") for each in (self.camera, self.projector) if each]
+        named = (self.camera, CAMERA), (self.projector, PROJECTOR)
+        files = [locate(each, "calibration", ".toml", field) for each, field in named if each]
         mask = load_mask(files[0]) if self.camera else None
         return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
 

@@ -15,9 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.cli.help_page import WHAT
-from mitsim.cli.options import CAMERA, PROJECTOR, RECIPE, Common, completing, refuse_unused, verb
+from mitsim.cli.options import Common, completing, refuse_unused, verb
 from mitsim.cli.screen import finish
-from mitsim.core.configuration import DEFAULT_CAMERA, load_model, opening_words, read_toml, shipped_files
+from mitsim.core.configuration import (
+    CAMERA,
+    DEFAULT_CAMERA,
+    PROJECTOR,
+    RECIPE,
+    load_model,
+    opening_words,
+    read_toml,
+    shipped_files,
+)
 from mitsim.core.errors import MitsimError, near_name
 
 if TYPE_CHECKING:

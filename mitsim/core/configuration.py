@@ -107,7 +107,12 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
         raise refusal(model, error, where, data) from error
 
 
-def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str) -> Path:
+CAMERA, PROJECTOR, RECIPE, LIST = "full_well_e", "effective_wavelength_nm", "board_reflectance", "patterns"
+"""Fields by which a shipped file is known to be of a camera or a projector, a session's recipe, or a list of what is
+known of frames."""
+
+
+def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> Path:
     """The path of a file: that of a shipped one by its bare name, else ``name`` itself.
 
     Parameters
@@ -118,6 +123,8 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
         where shipped ones lie.
     ending
         what follows the name: a file in the folder ``name``, or a suffix.
+    field
+        which all files have that a message may offer, as :func:`shipped_files` takes it.
 
     Raises
     ------
@@ -134,7 +141,7 @@ def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"]
         return known
     if path.exists():
         return path / ending if inside and path.is_dir() else path
-    names = shipped_files(shelf, ending)
+    names = shipped_files(shelf, ending, field)
     raise MitsimError(
         f"{name}: no such file, and none of that name is shipped; {near_name(text, names)}"
         f"shipped are {', '.join(names)}"

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from mitsim.core.arrays import FloatArray
@@ -114,6 +115,13 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     What a plan chooses, which no scene states."""
 
+    @field_validator("mask", mode="before")
+    @classmethod
+    def _scenes_have_few_masks(cls, kind: object) -> object:
+        if kind not in get_args(CameraMask):
+            raise ValueError("a scene has separable, flatcam or open; others come with --camera and its table [mask]")
+        return kind
+
     @model_validator(mode="after")
     def _mask_lies_before_the_scene(self) -> CameraGeometry:
         if self.mask_distance + self.mask_thickness >= self.scene_distance:
@@ -144,7 +152,7 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     @model_validator(mode="after")
     def _a_plate_is_there(self) -> CameraGeometry:
         if (self.mask == "plate") != (self.mask_plate is not None):
-            raise ValueError("mask: got 'plate' without one; a camera file's table [mask] gives it, with --camera")
+            raise ValueError("mask: got 'plate'; use separable, flatcam or open, or --camera with a table [mask]")
         if self.mask_plate is not None and self.mask_thickness and not self.mask_plate.may_be_thick:
             raise ValueError(
                 f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "

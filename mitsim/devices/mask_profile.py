@@ -118,7 +118,7 @@ class MaskProfile(Configuration):
         missing = [name for name in _NEEDED.get(self.kind, ()) if getattr(self, name) is None]
         if missing:
             raise ValueError(f"a mask {self.kind} needs {missing[0]}; add it")
-        if self.kind == "mura" and not _is_odd_prime(self.features or 0):
+        if self.kind == "mura" and not is_odd_prime(self.features or 0):
             raise ValueError(f"features: got {self.features}; a MURA has an odd prime, as 101 or 251")
         if self.opaque_transmission >= self.clear_transmission:
             raise ValueError(
@@ -256,7 +256,8 @@ def load_mask(path: Path | str) -> MaskProfile | None:
     return validate(MaskProfile, table.part("mask"), f"file {path}")
 
 
-def _is_odd_prime(number: int) -> bool:
+def is_odd_prime(number: int) -> bool:
+    """Return True if a MURA can have this ``number`` of features a side."""
     return number > 2 and all(number % divisor for divisor in range(2, int(number**0.5) + 1))
 
 

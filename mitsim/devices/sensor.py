@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, locate, read_toml, shipped_files, validate
+from mitsim.core.configuration import CAMERA, Configuration, locate, read_toml, shipped_files, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import Digital
 from mitsim.core.mistakes import Table
@@ -450,7 +450,7 @@ def sensor_table(path: Path | str) -> Table:
     while (base := table.pop(BASE, None)) is not None:
         if not isinstance(base, str):
             raise MitsimError(f"file {path}: {BASE}: got {base!r}; give the name of a camera, or a file")
-        beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", "full_well_e")
+        beside, known = Path(path).parent / base, shipped_files("calibration", ".toml", CAMERA)
         is_beside = os.path.isfile(beside)  # False of a name that is too long
         if not is_beside and Path(base).name == base and not Path(base).suffix and base not in known:
             raise MitsimError(

@@ -28,6 +28,7 @@ class ModelManifest(Configuration):
     pairs: Plain
     """What the store of the pairs says of itself."""
     training: Plain
-    """Steps, batch, rate, seed and weights of losses; PSNR of pairs that did not teach, by step; seconds."""
+    """Steps, batch, rate, seed and weights of losses; `curve`, the PSNR of pairs that choose, by step; `psnr_db` of
+    pairs that neither teach nor choose."""
     versions: dict[str, str]
     """Of mitsim, torch and others."""

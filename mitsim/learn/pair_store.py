@@ -11,6 +11,7 @@ seed.
 from __future__ import annotations
 
 import json
+import re
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
@@ -25,7 +26,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray, hdf5_errors, whole_hdf5
+from mitsim.core.arrays import FloatArray, Labels, hdf5_errors, whole_hdf5
 from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import PAIRS, read_json, write_json
@@ -113,6 +114,9 @@ class PairsManifest(BaseModel):
     """Pairs."""
     pictures: str
     """Where the pictures came from."""
+    photographs: tuple[int, ...] = ()
+    """Photograph that each file of a folder shows, the same for equal files; pair i shows that of file i, modulo their
+    number. Empty: every pair has a picture of its own."""
     ambient_shots: int = Field(ge=0)
     """Shots of the ambient frame that is taken off; 0: none is."""
     groups: tuple[dict[str, float], ...] = ()
@@ -134,7 +138,8 @@ class PairsManifest(BaseModel):
     @property
     def mask(self) -> Any:
         """The mask, by name."""
-        return self.camera.get("geometry", {}).get("mask")
+        geometry = self.camera.get("geometry", {})
+        return geometry.get("mask_plate", geometry.get("mask"))
 
     @cached_property
     def family(self) -> PatternFamily:
@@ -374,6 +379,14 @@ class PairStore:
 
     def __len__(self) -> int:
         return self.manifest.count
+
+    @property
+    def photographs(self) -> Labels:
+        """(N,) number of the photograph that each pair shows: all crops of a photograph have one number."""
+        numbers = np.arange(len(self))
+        files = re.match(r"([0-9]+) files of", self.manifest.pictures)  # stores that were made before files had numbers
+        labels = self.manifest.photographs or (range(int(files[1])) if files else numbers)
+        return np.asarray(labels)[numbers % len(labels)]
 
     def __repr__(self) -> str:
         made = self.manifest

@@ -279,6 +279,7 @@ class _Maker:
             seed=capture.seed,
             count=asked.count,
             pictures=self._pictures.source,
+            photographs=self._pictures.photographs,
             ambient_shots=(capture.ambient_shots or ambient_shots(self._family)) if taken else 0,
             groups=tuple(self._groups) if asked.variation else (),
             shards=shards,

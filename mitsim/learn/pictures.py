@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +59,11 @@ class Pictures(Protocol):
         """What a store says that they are."""
         ...
 
+    @property
+    def photographs(self) -> tuple[int, ...]:
+        """Return which photograph each file shows; () if every picture is drawn for itself."""
+        ...
+
     def draw(self, number: int, n: int) -> Codes:
         """Picture ``number`` of ``n`` pixels a side."""
         ...
@@ -72,6 +77,7 @@ class DrawnPictures:
     """Pictures that are drawn from a ``seed``."""
 
     seed: int
+    photographs: ClassVar[tuple[int, ...]] = ()
 
     @property
     def source(self) -> str:
@@ -216,6 +222,12 @@ class FolderPictures:
         for path in self.files:
             digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())
         return f"{len(self.files)} files of {self.folder}, names and sizes {digest.hexdigest()[:16]}"
+
+    @cached_property
+    def photographs(self) -> tuple[int, ...]:
+        """Return the number of the first file that holds the same bytes as each file."""
+        digests = [hashlib.sha256(path.read_bytes()).digest() for path in self.files]
+        return tuple(map(digests.index, digests))
 
     def draw(self, number: int, n: int) -> Codes:
         """Picture ``number`` of ``n`` pixels a side.

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.job import Cost, Job
@@ -33,15 +33,15 @@ from mitsim.learn.methods import CLASSES, Method, decibels
 from mitsim.learn.model_manifest import ModelManifest
 from mitsim.learn.networks import drawn_way, has_half
 from mitsim.learn.pair_store import PairStore
-from mitsim.learn.training_request import FEWEST_PAIRS, Training
+from mitsim.learn.training_request import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.solvers import SOLVERS
 
-_JUDGING, _MOST_JUDGING = 16, 48
-"""One pair in so many judges and does not teach, up to so many: their mean PSNR is then known to 0.5 dB, and its change
-from step to step much better."""
+_PART, _MOST = 16, 48
+"""One photograph in so many chooses the best step, and one gives the stated PSNR, up to so many pairs each: their mean
+PSNR is then known to 0.5 dB, and its change from step to step much better."""
 _LOOKS = 20
 """Times that the training is judged; a look takes a twentieth of the steps between two."""
 _PATIENCE = 6
@@ -98,6 +98,8 @@ class Sums:
         least and largest noise of a datum over its rms.
     frames
         (N, K, K', b, b') the frames, binned; None: for methods that read none.
+    photographs
+        (N,) number of the photograph that each pair shows; None: each its own.
     """
 
     truths: FloatArray
@@ -105,6 +107,7 @@ class Sums:
     variances: FloatArray
     noise: tuple[float, float]
     frames: FloatArray | None = None
+    photographs: Labels | None = None
 
     @classmethod
     def of(cls, store: PairStore, prepared: Prepared, job: Job, keep: bool = False) -> Sums:
@@ -139,7 +142,26 @@ class Sums:
                 Cost(each * count, held).check(f"{store.folder}: reading {count} pairs", job.limits)
             job.progress("read", (index + 1) / count)
         limits = float(noise.min()), float(noise.max())
-        return cls(np.stack(truths), np.stack(weights), variances, limits, kept)
+        return cls(np.stack(truths), np.stack(weights), variances, limits, kept, store.photographs)
+
+
+def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
+    """Return the numbers of the pairs that teach, that choose the best step, and that give the stated PSNR.
+
+    All pairs of a photograph go the same way, because a network that has learned one crop knows much of the next.
+
+    Parameters
+    ----------
+    photographs
+        (N,) number of the photograph that each pair shows; three at least.
+    seed
+        which photographs go which way.
+    """
+    names = stream(seed, "judging").permutation(np.unique(photographs))
+    count = min(max(len(names) // _PART, 1), _MOST)
+    parts = names[2 * count :], names[:count], names[count : 2 * count]
+    teaching, choosing, judging = (np.flatnonzero(np.isin(photographs, part)) for part in parts)
+    return teaching, choosing[:_MOST], judging[:_MOST]
 
 
 # -------- Steps
@@ -168,10 +190,8 @@ class Trainer:
         self.model = Diagonal.of(self.prepared, self._like)
         weighted = self.request.feature_weight or self.request.adversary_weight
         self.critic = Critic(self.request, self._like) if weighted else None
-        count = len(self.sums.truths)
-        judging = min(max(count // _JUDGING, 1), _MOST_JUDGING)
-        order = stream(self.request.seed, "judging").permutation(count)
-        self.judging, self.teaching = np.sort(order[:judging]), np.sort(order[judging:])
+        photographs = np.arange(len(self.sums.truths)) if self.sums.photographs is None else self.sums.photographs
+        self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
 
     def rate(self, number: int) -> float:
         """Learning rate of step ``number``."""
@@ -244,12 +264,12 @@ class Trainer:
         self.optimiser.zero_grad()
         return taken[-1] * (1 + _LOOK)
 
-    def judge(self) -> float:
-        """Mean PSNR [dB] of the pairs that do not teach."""
+    def judge(self, pairs: Labels) -> float:
+        """Mean PSNR [dB] of some ``pairs``, by their numbers."""
         found = []
         self.network.eval()
         with torch.no_grad():
-            for index in self.judging:
+            for index in pairs:
                 truths, data = self.batch(np.array([index]))
                 found.append(-10 * math.log10(float((self.network(data, self.model) - truths).square().mean())))
         return float(np.mean(found))
@@ -267,7 +287,7 @@ class State:
     step
         steps that are done.
     curve
-        step, and mean PSNR [dB] of the pairs that do not teach after it; the first before any step.
+        step, and mean PSNR [dB] of the pairs that choose after it; the first before any step.
     best
         weights after the best of these.
     network, optimiser
@@ -287,7 +307,7 @@ class State:
     def first(cls, trainer: Trainer) -> State:
         """Before any step of a ``trainer``."""
         weights = _copy(trainer.network)
-        curve = [(0, trainer.judge())]
+        curve = [(0, trainer.judge(trainer.choosing))]
         return cls(0, curve, weights, weights, trainer.optimiser.state_dict(), _critic(trainer))
 
     def restore(self, trainer: Trainer) -> None:
@@ -311,7 +331,7 @@ class State:
                 raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
             self.step = number + 1
             job.progress("train", self.step / steps)
-        self.curve.append((self.step, trainer.judge()))
+        self.curve.append((self.step, trainer.judge(trainer.choosing)))
         job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.step / steps)
         self.network, self.optimiser = _copy(trainer.network), trainer.optimiser.state_dict()
         self.critic = _critic(trainer)
@@ -365,7 +385,9 @@ class Trained:
     model
         the network.
     curve
-        step, and mean PSNR [dB] of the pairs that do not teach after it; the first before any step.
+        step, and mean PSNR [dB] of the pairs that choose the best step after it; the first before any step.
+    psnr_before_db, psnr_db
+        mean PSNR of pairs that neither teach nor choose, before the first step and by the best weights.
     predicted_seconds
         of it all.
     output
@@ -374,6 +396,8 @@ class Trained:
 
     model: LearnedSolver
     curve: tuple[tuple[int, float], ...]
+    psnr_before_db: float
+    psnr_db: float
     predicted_seconds: float
     output: str
 
@@ -383,8 +407,8 @@ class Trained:
             "model": self.model.name,
             "weights": sum(values.numel() for values in self.model.network.parameters()),
             "curve": [list(point) for point in self.curve],
-            "psnr_before_db": self.curve[0][1],
-            "psnr_db": max(psnr for _, psnr in self.curve),
+            "psnr_before_db": self.psnr_before_db,
+            "psnr_db": self.psnr_db,
             "steps": self.curve[-1][0],
             "predicted_seconds": self.predicted_seconds,
             "output": self.output,
@@ -427,7 +451,7 @@ def train_network(
         network = first_network(request, (factors.left.shape[1], factors.right.shape[1]))
         _memory(store, network, request).check(f"{store.folder}: training {request.method}", job.limits)
         sums = sums or Sums.of(store, prepared, job, network.reads_frames)
-    trainer = Trainer(request, prepared, sums, network)
+    trainer, first = Trainer(request, prepared, sums, network), _copy(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     half = has_half(trainer.model.sigma.device)
     digest = _digest(asdict(request), factors.fingerprint, about, half)
@@ -441,8 +465,11 @@ def train_network(
         while not state.is_over(request.steps):
             state.go_on(trainer, job)
             unfinished.write(state)
+    network.load_state_dict(first)
+    before = trainer.judge(trainer.judging)
     network.load_state_dict(state.best)
-    how = {**asdict(request), "half_precision": half, "curve": state.curve}
+    after = trainer.judge(trainer.judging)
+    how = {**asdict(request), "half_precision": half, "curve": state.curve, "psnr_db": after}
     manifest = ModelManifest(
         method=request.method, camera=factors.manifest.camera, factors=factors.fingerprint,
         patterns=store.manifest.patterns, exposure_s=store.manifest.exposure_s, noise=sums.noise, pairs=about,
@@ -451,7 +478,7 @@ def train_network(
     model = LearnedSolver(manifest, network.eval(), factors.sides, store.patterns)
     model.save(output)
     unfinished.path.unlink(missing_ok=True)
-    return Trained(model, tuple(state.curve), predicted, str(output))
+    return Trained(model, tuple(state.curve), before, after, predicted, str(output))
 
 
 def first_network(request: Training, shape: tuple[int, int]) -> Method:
@@ -471,6 +498,11 @@ def _check(store: PairStore, factors: Factors) -> None:
     """MitsimError where a ``store`` has too few pairs, or the ``factors`` are of another camera."""
     if len(store) < FEWEST_PAIRS:
         raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
+    if (count := len(np.unique(store.photographs))) < FEWEST_PHOTOGRAPHS:
+        raise MitsimError(
+            f"{store.folder}: its pairs show {count} photographs; give at least {FEWEST_PHOTOGRAPHS}, because one "
+            "chooses the best step and one judges, and neither may teach"
+        )
     sizes = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
     found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
     if sizes != found:

@@ -23,6 +23,8 @@ _LARGEST_WEIGHT = 100
 """Of a loss beside the squared error: then that counts for nothing; chosen so."""
 FEWEST_PAIRS = 8
 """Fewer cannot be parted into those that teach and those that judge; chosen so."""
+FEWEST_PHOTOGRAPHS = 3
+"""One that teaches, one that chooses the best step, and one that judges."""
 
 
 @checked_fields

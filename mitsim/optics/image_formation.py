@@ -431,7 +431,6 @@ def largest_terms(
     depth: float,
     spectrum: Spectrum | None = None,
     places: Places | None = None,
-    rough: bool = False,
 ) -> SeparableTerms | None:
     """The shadow of a mask that is drawn on a raster, but for 1e-4 of it, as separable terms; None where these would
     take too much memory.
@@ -440,17 +439,14 @@ def largest_terms(
     ----------
     geometry, rows, columns, depth, spectrum, places
         as for :func:`mitsim.optics.terms.shadow_terms`.
-    rough
-        that as many as are ever looked for are taken, whatever they leave and take.
     """
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
     sides = sum(side * len(each.centres) for side, each in zip(shape, (rows, columns), strict=True))
-    if not rough and 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
+    if 8 * number_of_terms(drawn) * sides > SUMMED_BYTES:
         return None
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=drawn)
-    terms = drawn.largest.terms() if rough else drawn.terms
-    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places, terms)
+    return terms_of_raster(shadow, rows, columns, geometry.pixel_fill_factor, places, drawn.terms)
 
 
 @lru_cache(maxsize=RASTERS_KEPT)

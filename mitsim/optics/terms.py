@@ -238,10 +238,6 @@ def tilted_terms(
 _LEFT_OUT = 0.03
 """Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two or three terms hold the
 rest of FlatCam's masks and of MURA in three lines."""
-_UNSEEN = 1e-4
-"""Singular value of uniform responses, over the largest, below which it leaves 1e-8 of their energy."""
-_ROWS = 64
-"""Of all terms at a time: a few MB of a hundred terms."""
 _TURNS = 2
 """Steps to the brightness of a session's pixels: the third moves the residual by 1e-7."""
 
@@ -261,10 +257,6 @@ class BestTerm:
     left: FloatArray
     right: FloatArray
     residual: float
-
-
-StripeMisfits = tuple[FloatArray, FloatArray]
-"""(N,) squares of what is not explained of each response, and of all of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,37 +325,6 @@ def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
         sum((a * (np.dot(b.sum(axis=1), split[1]) / np.dot(split[1], split[1])) for a, b in terms), 0 * terms[0][0]),
         sum((b * (np.dot(a.sum(axis=1), split[0]) / np.dot(split[0], split[0])) for a, b in terms), 0 * terms[0][1]),
     )
-
-
-def stripe_misfits(terms: SeparableTerms, signs: FloatArray) -> tuple[StripeMisfits, StripeMisfits]:
-    """What no separable camera explains of a session's responses, without noise: of horizontal stripes, and of vertical
-    ones.
-
-    With B = (R_1 1, .., R_K 1) = Q S V^T, the response sum_k L_k h_i (R_k 1)^T to stripes h_i 1^T has in the columns of
-    Q the parts (S V^T)_rk L_k h_i, and so has v of :func:`_of_stripes`.
-
-    Parameters
-    ----------
-    terms
-        the operator [(left (m, n), right (m', n')), ...].
-    signs
-        (n, N) h_i.
-    """
-    sums = [np.stack([side.sum(axis=1) for side in sides], axis=1) for sides in zip(*terms, strict=True)]
-    uniform = best_term([(sums[0][:, [k]], sums[1][:, [k]]) for k in range(len(terms))])
-    found = []
-    for side, common in ((0, uniform.right[:, 0]), (1, uniform.left[:, 0])):
-        columns, values, small = np.linalg.svd(sums[1 - side], full_matrices=False)
-        kept = values > _UNSEEN * values[0]
-        along = columns.T[kept] @ common / np.linalg.norm(common)
-        whole, explained = np.zeros((2, signs.shape[1]))
-        for start in range(0, len(terms[0][side]), _ROWS):
-            rows = np.stack([term[side][start : start + _ROWS] for term in terms])
-            shown = np.tensordot(values[kept, None] * small[kept], rows, axes=1) @ signs
-            whole += np.square(shown).sum(axis=(0, 1))
-            explained += np.square(np.tensordot(along, shown, axes=1)).sum(axis=0)
-        found.append((np.maximum(whole - explained, 0.0), whole))
-    return found[0], found[1]
 
 
 def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], SeparableTerm]]:

@@ -360,7 +360,6 @@ class _Words:
             if cells != fewest and drawn.error is not None:
                 reason += f", {fewest} {_error_words(drawn.error)}"
                 spent = max(by_fft - seconds(fewest), 0.0)
-            reason += "; calibrate tells, before any light, whether two factors hold it, which an image needs"
             return (PlanRow("mask-shadow", "approximate", reason, None, spent),)
         sums = seconds(0)
         terms = f"{forming.geometric_terms:.0f} separable terms"

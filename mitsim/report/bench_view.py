@@ -110,8 +110,8 @@ class BenchView:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why nothing of the projector's light is seen, where that is so."""
-        return () if self.layout.trouble is None else (self.layout.trouble,)
+        """Return why no calibration can give an image of the bench."""
+        return self.layout.obstacles
 
     def summary(self) -> dict[str, Any]:
         """What the command line reports, but for the file's name."""
@@ -159,7 +159,7 @@ class BenchView:
     def _light_words(self) -> str:
         layout, every = self.layout, self.bench.n**2
         if layout.depths is None:
-            return "nowhere" if layout.trouble else "in mirrors alone"
+            return "in mirrors alone" if self.bench.loaded.mirrors else "nowhere"
         near, far = layout.depths
         where = f"at {near:.4g} mm" if far - near < _FLAT * far else f"from {near:.4g} to {far:.4g} mm"
         more = "; mirrors may show more" if self.bench.loaded.mirrors and layout.seen < every else ""

@@ -51,7 +51,7 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
-from mitsim.report.pages import Mean, Table
+from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, pair_chart
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
@@ -70,7 +70,7 @@ from mitsim.studies.framework.experiment import (
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.studio import Studio
+from mitsim.studies.framework.studio import Studio, reason_of
 from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise
 
 AMBIENT, SESSION = "ambient frame", "session"
@@ -193,6 +193,13 @@ class DriftStand:
     def image(self) -> FloatArray:
         """(n, n) without a drift."""
         return self._before.image
+
+    @property
+    def reason(self) -> str:
+        """Return why the image without a drift is flagged, by its solution, its light or its factors; empty if not."""
+        others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
+        words = (text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in others)
+        return "; ".join(filter(None, (reason_of(self._before.status), *words)))
 
     @property
     def before_db(self) -> float:
@@ -546,11 +553,12 @@ def _measure(studio: Studio, point: Point) -> Found:
     if kind.startswith("projector"):
         moved = studio.once("moved projector", 6, (setup, drift), lambda: _move_projector(lit, drift))
     found = known.outcome(drift, session, moved)
-    measured = {
+    measured: dict[str, Value] = {
         "before_db": found.before_db, "after_db": found.after_db,
         "lost_db": found.lost_db, "lost_auto_db": found.lost_auto_db,
         "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
         "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
+        "flagged": bool(known.reason), "reason": known.reason,
     }  # fmt: skip
     shown = {IMAGE: found.image, _BEFORE: known.image, TRUTH: lit.truth}
     return Found((point.row(**measured),), single_precision(shown))
@@ -651,4 +659,5 @@ EXPERIMENT = Experiment(
     "formed. Their uncertainty, the bars of the figure, is what they leave out of the image without a drift, such as "
     "detail inside projector pixels.",
     heads=("", "Predicted", "Measured"),
+    solved=True,
 )  # fmt: skip

@@ -2,7 +2,8 @@
 prints and of trainings, and what becomes of the paper's claims, out.
 
 A gain is of each print, paired with the best classical image of the same frames. It has two standard errors: over
-prints, each a mean over trainings, and over trainings, each a mean over prints. A claim holds where both say so.
+prints, each a mean over trainings, and over trainings, each a mean over prints. A claim holds where both say so. A
+claim on the best or the worst of many has wider intervals, because chance has a part in that choice.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from mitsim.learn.training_request import FLATNET, REFINED
@@ -58,14 +59,15 @@ class Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Gain:
-    """A mean over ``prints``, and over ``trainings``."""
+    """A mean over ``prints``, and over ``trainings``; the best or worst of ``among`` such means."""
 
     prints: Mean
     trainings: Mean
+    among: int = 1
 
     def within(self, low: float = -math.inf, high: float = math.inf) -> Holds:
-        """Whether it lies in a range from ``low`` to ``high``, by prints and by trainings."""
-        return every(within(self.prints, low, high), within(self.trainings, low, high))
+        """Return whether it lies in a range from ``low`` to ``high``, by prints and by trainings."""
+        return every(*(within(each, low, high, self.among) for each in (self.prints, self.trainings)))
 
     def __str__(self) -> str:
         """With both standard errors, where there are such."""
@@ -194,7 +196,8 @@ def _mean(values: Iterable[tuple[Value, Value, Any]]) -> Gain:
         prints[picture].append(float(value))
         seeds[seed].append(float(value))
     means = ([sum(each) / len(each) for each in by.values()] for by in (prints, seeds))
-    return Gain(*(Mean.of_numbers(each, "a network") for each in means))
+    of_prints, of_trainings = (Mean.of_numbers(each, "a network") for each in means)
+    return Gain(of_prints, of_trainings)
 
 
 # -------- Claims
@@ -208,8 +211,9 @@ def find_claims(results: Results) -> Sequence[Claim]:
 
 
 def _best(matrix: Matrix, training: str, patterns: str, condition: str) -> tuple[Kind, Gain] | None:
-    """The kind of a training that gains most."""
-    gains = [(kind, matrix.gain(kind, condition)) for kind in matrix.of(training, patterns)]
+    """Return the kind of a training that gains most, and its gain as the best of all these kinds."""
+    kinds = matrix.of(training, patterns)
+    gains = [(kind, replace(matrix.gain(kind, condition), among=len(kinds))) for kind in kinds]
     return max(gains, key=lambda item: item[1].prints.value, default=None)
 
 
@@ -275,14 +279,15 @@ def _catastrophe(matrix: Matrix) -> list[Claim]:
     if not found:
         return []
     gain, kind, name = min(found, key=lambda item: item[0].prints.value)
+    gain = replace(gain, among=len(found))
     own = max(
         ((matrix.loss(other, each), other, each) for other in matrix.kinds for each in matrix.mismatches(other)),
         key=lambda item: item[0].prints.value,
     )
     plain = matrix.gain(kind, name, weight=AUTOMATIC)
     text = (
-        f"worst {gain:+} dB against the best classical image of the same frames ({plain.prints:+} at automatic "
-        "weights): "
+        f"worst of {len(found)} {gain:+} dB against the best classical image of the same frames "
+        f"({plain.prints:+} at automatic weights): "
         f"{kind}, {in_text(kind.patterns)}, {name}; "
         f"worst loss of its own {own[0]} dB: {own[1]}, {in_text(own[1].patterns)}, {own[2]}"
     )

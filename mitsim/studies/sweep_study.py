@@ -209,4 +209,5 @@ EXPERIMENT = Experiment(
     "pixel fills the same part of the full well), and the images that mitsim reconstruct makes of them, with "
     "factors calibrated by a session of the same camera. Parameters have the names and units of the scene file, "
     "where lengths are in mm.",
+    solved=True,
 )  # fmt: skip

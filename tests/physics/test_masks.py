@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -273,7 +272,7 @@ def test_calibration_and_image_of_a_turned_mask_say_so(
     small_scene: Callable[..., Path], variant: str, tmp_path: Path
 ) -> None:
     """(Planted: the session's warning left out.)"""
-    camera = camera_file(tmp_path, "turned", turned(drawn("separable", 8), 1.0))
+    camera = camera_file(tmp_path, "turned", turned(drawn("separable", 8), 0.2))
     bench = open_bench(small_scene(mask_order=8), variant, camera)
     factors = bench.calibrate(accuracy=0.02)
     assert not factors.ok and any("is not separable" in text and " dB" in text for text in factors.warnings)
@@ -360,7 +359,7 @@ def test_a_session_behind_a_slanted_bar_is_refused_for_its_mask(
     along = np.arange(16) - 7.5
     path = camera_file(tmp_path, "bar", (np.abs(along[:, None] - along) < 2).astype(float))
     bench = open_bench(small_scene(mask_order=8), variant, path)
-    sentence = r"^the mask \(drawing bar.npy\) is not separable: [^\n]* 4 of 32 patterns [^\n]*take a separable"
+    sentence = r"^the mask \(drawing bar.npy\) has no two factors: [^\n]*use a mask of the kind separable"
     recipe = load_recipe().model_copy(update={"depths": (380.0, 400.0)})
     for refused in (
         lambda: bench.calibrate(output=tmp_path / "cal"),
@@ -395,19 +394,12 @@ def test_drawing_the_first_shadow_is_held_against_limits_before_anything_is_look
         bench.light("dots:2", Job(limits=Limits(memory_bytes=1e6)), effects="-diffraction")
 
 
-@pytest.mark.parametrize(
-    ("drawing", "refused"),
-    [
-        *(pytest.param(drawing, False, marks=pytest.mark.slow) for drawing in ("random", "ring", "turned")),
-        *(("bar", True), ("cross", False)),
-    ],
-)
-def test_a_mask_is_refused_where_its_session_would_be(
-    small_scene: Callable[..., Path], variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    drawing: str, refused: bool,
-) -> None:  # fmt: skip
-    """By the drawing alone as by all frames: what differs by as much in all patterns is flagged, and goes on. (Planted:
-    a residual beyond a few percent is refused; what is not explained held against all patterns' energy.)"""
+@pytest.mark.parametrize("drawing", ["random", "ring", "turned", "bar", "cross"])
+def test_a_mask_without_factors_is_not_calibrated(
+    small_scene: Callable[..., Path], variant: str, tmp_path: Path, drawing: str
+) -> None:
+    """The best separable shadow leaves much of the whole operator's, which the drawing alone tells. (Planted: refused
+    for any residual, which the masks of the tests above have.)"""
     along = np.arange(16) - 7.5
     radius = np.hypot(along[:, None], along)
     values = {
@@ -421,9 +413,5 @@ def test_a_mask_is_refused_where_its_session_would_be(
     session = Session(bench, load_recipe())
     (warned,) = session.mask_warnings
     assert float(re.findall(r"leaves ([0-9.]+)%", warned)[0]) > 20
-    known = pytest.raises(MitsimError, match="is not separable") if refused else nullcontext()
-    with known:
+    with pytest.raises(MitsimError, match="has no two factors"):
         session.check_mask()
-    monkeypatch.setattr(Session, "check_mask", lambda *_: None)
-    with pytest.raises(MitsimError, match="no shape in common") if refused else nullcontext():
-        assert not bench.calibrate(accuracy=0.02).ok

@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from mitsim.bench.apparatus import check_scene
+from mitsim.bench.apparatus import check_scene, open_apparatus
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, find_experiment
+from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, Setup, find_experiment
 from mitsim.studies.framework.run import (
     KEPT,
     POINTS,
@@ -92,6 +92,8 @@ class CampaignResult(InFolder):
         of a whole study: all that was measured, what becomes of the paper's claims, and files of figures.
     section
         of a whole study: how a page shows it.
+    warnings
+        of a whole study: how many images are flagged, and why.
     """
 
     study: str
@@ -103,11 +105,7 @@ class CampaignResult(InFolder):
     claims: tuple[Claim, ...] = ()
     figures: tuple[str, ...] = ()
     section: Section | None = None
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """None: what a study of many points found is told by its claims' verdicts."""
-        return ()
+    warnings: tuple[str, ...] = ()
 
     def payload(self) -> dict[str, Any]:
         """As JSON."""
@@ -122,7 +120,6 @@ class CampaignResult(InFolder):
             ]
         heads = self.section.experiment.heads if self.section else HEADS
         lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
-        lines += self.section.warnings if self.section else ()
         return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
 
@@ -156,8 +153,11 @@ def run_experiment(
     campaign, job, where = _Campaign.of(study, scope, output), job or Job(), where or Where()
     kept = campaign.experiment.kept
     own, started = where.shard.part(campaign.points, kept), time.perf_counter()
+    # Before there is a folder.
     for setup in dict.fromkeys(point.setup for point in own):
-        check_scene(setup.scene, dict(setup.parameters), setup.outside)  # before there is a folder
+        check_scene(setup.scene, dict(setup.parameters), setup.outside)
+    if campaign.experiment.solved:
+        _check_data(own)
     with campaign.folder(output) as (folder, store):
         todo = [point for point in own if not store.has(point)]
         if kept:
@@ -168,6 +168,25 @@ def run_experiment(
             left = (time.perf_counter() - started) / done * (len(todo) - done)
             job.progress(f"{study}: {done} of {len(todo)} points, {_duration_text(left)} left", done / len(todo))
         return campaign.finish(folder, store, time.perf_counter() - started)
+
+
+def _check_data(points: Sequence[Point]) -> None:
+    """Raise MitsimError for a point whose frames hold no more numbers than its image, so that no lambda can be chosen.
+
+    A bench is opened once for all points that differ in their prints or accuracies alone.
+    """
+    from mitsim.bench.feasibility import shortage  # here: it needs the renderer
+
+    asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
+    for setup, patterns in sorted(asked, key=str):
+        parameters: dict[str, Any] = dict(setup.parameters)
+        with warnings.catch_warnings(action="ignore"):  # whoever measures the point repeats them
+            bench = open_apparatus(
+                setup.scene, setup.variant, setup.camera, setup.projector, setup.outside, **parameters
+            )
+        short = shortage(bench, bench.family(patterns))
+        if short and short.lost == 1:
+            raise MitsimError(f"study: {short.reason}; {short.remedy}")
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> CampaignResult:
@@ -234,6 +253,7 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignR
             sum(one.seconds for one in found),
             claims=tuple(claim for one in found for claim in one.claims),
             figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
+            warnings=tuple(f"{one.study}: {text}" for one in found for text in one.warnings),
         )
         write_json(folder / f"{ALL}.json", {**head, **result.payload(), "status": "complete"})
         return result
@@ -291,7 +311,9 @@ class _Campaign:
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", section.title)
         rows = tuple(dict(row) for row in results.table.rows)
-        found = CampaignResult(self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section)
+        found = CampaignResult(
+            self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section, section.warnings
+        )
         self._write(folder, status="complete", **found.payload())
         return found
 

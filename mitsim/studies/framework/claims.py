@@ -70,8 +70,8 @@ def _by(by: str, rows: Table, column: str) -> dict[Value, float]:
     return {key: rows.mean(column, **{by: key}).value for key in keys if rows.numbers(column, **{by: key})}
 
 
-def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Holds:
-    """Whether a quantity lies in a range, by Student's interval; never decided of a single value.
+def within(quantity: Mean, low: float = -math.inf, high: float = math.inf, among: int = 1) -> Holds:
+    """Return whether a quantity lies in a range, by Student's interval; never decided of a single value.
 
     Parameters
     ----------
@@ -79,10 +79,13 @@ def within(quantity: Mean, low: float = -math.inf, high: float = math.inf) -> Ho
         mean of independent values; their number less one is the degrees of freedom.
     low, high
         ends of the range.
+    among
+        number of quantities of which this one was chosen by its value. All of their intervals hold together with the
+        usual confidence (Bonferroni), and so does that of the chosen one.
     """
     if quantity.of < 2:
         return None
-    reach = float(stdtrit(quantity.of - 1, (1 + CONFIDENCE) / 2)) * quantity.error
+    reach = float(stdtrit(quantity.of - 1, 1 - (1 - CONFIDENCE) / 2 / among)) * quantity.error
     if low < quantity.value - reach and quantity.value + reach < high:
         return True
     return False if quantity.value + reach < low or quantity.value - reach > high else None

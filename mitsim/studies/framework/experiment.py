@@ -275,6 +275,9 @@ class Experiment:
         whether light is traced, to an accuracy that the page states.
     note
         what the reader of its figures has to know beside their titles and axes.
+    solved
+        whether all points have patterns whose frames are solved with an automatic lambda, which needs more data than
+        unknowns: points without are refused before any is measured.
     kept
         whether what points share is kept in the study's folder: plans, calibrations, and what else a studio makes once.
         A process may then measure any point, whatever its setup, and an interrupted study loses none of it.
@@ -294,6 +297,7 @@ class Experiment:
     note: str = ""
     traced: bool = True
     kept: bool = False
+    solved: bool = False
 
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:

@@ -109,8 +109,8 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     reasons = Counter(reason for each in found for reason in each.split("; ") if reason)
     counts = "; ".join(f"{count} \N{MULTIPLICATION SIGN} {reason}" for reason, count in reasons.most_common())
     return (
-        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, and "
-        f"count all the same (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
+        f"{len(found)} of {len(rows)} images are flagged by the solver, their calibration or their capture, but "
+        f"included in the means (column flagged of {name}.csv){': ' if counts else ''}{counts}.",
     )
 
 

@@ -44,7 +44,7 @@ def test_devices_and_light_stand_where_the_scene_says(small_scene: Callable[...,
     assert_allclose(np.ptp(found.window, axis=0), [120, 120, 0], atol=2e-3)
     assert_allclose(found.window[0], [60, 60, 400], atol=2e-3)
     assert_allclose(found.window_at(200.0).mean(axis=0), [30, 0, 200], atol=2e-3)
-    assert found.depths == pytest.approx((350, 400), rel=1e-5) and found.trouble is None
+    assert found.depths == pytest.approx((350, 400), rel=1e-5) and found.obstacles == ()
     assert found.parallax == pytest.approx((0, 60 * (1 / 350 - 1 / 400) * 400 * 16 / 120), abs=1e-4)
     sheet, card = found.surfaces
     assert_allclose([sheet.points.min(axis=0), sheet.points.max(axis=0)], [[-64, -64, 400], [64, 64, 400]], atol=1e-3)
@@ -58,7 +58,7 @@ def test_light_that_is_seen_is_counted(small_scene: Callable[..., Path]) -> None
     side = 2 * np.floor(400 * np.tan(np.radians(6)) / 7.5)
     assert abs(layout(small_scene(fov=12)).seen - side**2) <= 4 * side  # edges fall inside pixels
     dark = layout(small_scene(sheet_z=-400))
-    assert dark.seen == 0 and dark.depths is None and dark.trouble and "no light of the projector" in dark.trouble
+    assert dark.seen == 0 and dark.depths is None and "no light of the projector" in dark.obstacles[0]
 
 
 @pytest.mark.slow

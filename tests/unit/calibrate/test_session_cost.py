@@ -8,9 +8,6 @@ from typing import Any
 import pytest
 
 from mitsim.calibrate import board_session as session
-from mitsim.core.errors import MitsimError
-from mitsim.core.job import Cost, Job, Limits
-from mitsim.devices.session import load_recipe
 from mitsim.light.settings import Settings
 
 CELLS, FORMED_S, LIGHT = 80, 7.0, 1e6
@@ -77,21 +74,3 @@ def test_each_exposure_takes_memory() -> None:
     """Weights of three, and two more frames of both others for each response that is worked on."""
     one, three = (session.session_cost(board(*HELD), 128, Settings(400.0), 3.0, count) for count in (1, 3))
     assert three.memory_bytes - one.memory_bytes == pytest.approx(8 * (3 + 2 * 2 * 16) * 512**2)
-
-
-def test_a_mask_is_not_looked_at_where_that_takes_too_much(monkeypatch: pytest.MonkeyPatch, asked: list[Any]) -> None:
-    """192 terms of 2 x 512 x 128 numbers, and what their factorisation holds besides, are 0.75 GiB; drawing takes 2.
-    Planted: no look at the limits before the mask."""
-    monkeypatch.setattr(session, "drawing_seconds", lambda *_: 0.0)
-    monkeypatch.setattr(session, "raster_bytes", lambda *_: 2.0 * 2**30)
-    geometry = SimpleNamespace(frame_shape=(512, 512), is_drawn=lambda waves: True)
-    bench: Any = SimpleNamespace(n=128, geometry=geometry)
-    looked: list[int] = []
-    monkeypatch.setattr(session.Session, "_first_cost", Cost())
-    monkeypatch.setattr(session.Session, "_inseparable", property(lambda _: looked.append(1)))
-    run = session.Session(bench, load_recipe(), 0)
-    with pytest.raises(MitsimError, match=r"calibration: would take about 2\.75 GiB"):
-        run.check_mask(Job(limits=Limits(memory_bytes=2.7 * 2**30)))
-    assert not looked
-    run.check_mask(Job(limits=Limits(memory_bytes=2.8 * 2**30)))
-    assert looked

@@ -14,7 +14,10 @@ from tests.ideal_sessions import Bench, bench, picture
 class FakeStore:
     """``count`` pairs of pictures under ``patterns``."""
 
-    def __init__(self, count: int = 24, patterns: str = "uniform", camera: Bench | None = None) -> None:
+    def __init__(
+        self, count: int = 24, patterns: str = "uniform", camera: Bench | None = None, photographs: int | None = None
+    ) -> None:
+        self.photographs = np.arange(count) % (photographs or count)
         runs = [(camera or bench()).run(patterns, picture(seed), seed) for seed in range(100, 100 + count)]
         self.folder, self.patterns = Path("pairs"), runs[0].patterns
         measured = [list(run.pattern_measurements()) for run in runs]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pickle
 import re
@@ -108,7 +109,7 @@ def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) ->
     trainer = training.Trainer(
         request, prepared, training.Sums.of(store, prepared, Job()), training.first_network(request, (16, 16))
     )
-    trainer.judge()
+    trainer.judge(trainer.judging)
     precisions = list[bool]()
     trainer.network.network.register_forward_hook(lambda module, *_: precisions.append(module.training))
     trainer.seconds_a_step()
@@ -366,10 +367,45 @@ def test_pairs_are_a_data_set_of_torch() -> None:
     assert_array_equal(truths[1, 0], store.truth(1))
 
 
+@pytest.mark.parametrize(("count", "files"), [(24, 24), (64, 40), (100, 3), (2000, 2000), (1200, 12), (9, 8)])
+def test_no_photograph_teaches_and_judges(count: int, files: int) -> None:
+    """Crops of one photograph stay on one side, for five seeds, and no side is empty; pairs beyond those that judge do
+    not teach either. (Planted: a permutation of pairs; one part for choosing and judging.)"""
+    photographs = np.arange(count) % files
+    for seed in range(5):
+        parts = training.part_photographs(photographs, seed)
+        shown = [set(photographs[part]) for part in parts]
+        assert all(len(part) for part in parts) and not any(a & b for a, b in itertools.combinations(shown, 2))
+        assert len(parts[0]) > count / 4 and max(map(len, parts[1:])) <= 48
+
+
+def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a store holds several crops of each. (Planted: the best of the curve stated; the curve of the pairs
+    that judge.)"""
+    store, asked = FakeStore(12, photographs=4), list[np.ndarray]()
+    judge = training.Trainer.judge
+
+    def note(trainer: Any, pairs: np.ndarray) -> float:
+        asked.append(store.photographs[pairs])
+        return judge(trainer, pairs)
+
+    monkeypatch.setattr(training.Trainer, "judge", note)
+    made = train_network(store, bench().calibrated(1), Training("unrolled", steps=2), tmp_path / "m.pt")
+    *looks, before, after = asked
+    assert len(looks) == len(made.curve) == 3 and {*np.concatenate(looks)}.isdisjoint({*before, *after})
+    summary = made.summary()
+    assert (summary["psnr_before_db"], summary["psnr_db"]) == (made.psnr_before_db, made.psnr_db)
+    assert made.psnr_db != max(value for _, value in made.curve)
+
+
 def test_trainings_that_are_refused(tmp_path: Path) -> None:
     factors, request = bench().calibrated(1), Training("unrolled", steps=2)
     with pytest.raises(MitsimError, match="holds 7 pairs; give at least 8"):
         train_network(FakeStore(7), factors, request, tmp_path / "m.pt")
+    with pytest.raises(MitsimError, match="its pairs show 2 photographs; give at least 3"):
+        train_network(FakeStore(8, photographs=2), factors, request, tmp_path / "m.pt")
     other = replace(factors, left=factors.left[:, :8])
     with pytest.raises(MitsimError, match="calibrate this camera"):
         train_network(FakeStore(8), other, request, tmp_path / "m.pt")

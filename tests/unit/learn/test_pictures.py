@@ -70,6 +70,13 @@ def test_pictures_of_a_folder_are_middle_squares_then_crops(tmp_path: Path) -> N
     assert all(still == 0 and step > 0 for still, step in steps), "turned by quarters"
 
 
+def test_equal_files_are_one_photograph(tmp_path: Path) -> None:
+    """By what they hold, whatever they are called. (Planted: names compared.)"""
+    for name, level in (("a.png", 10), ("b.png", 20), ("c.png", 10)):
+        Image.fromarray(np.full((16, 16), level, np.uint8)).save(tmp_path / name)
+    assert FolderPictures(tmp_path, 0).photographs == (0, 1, 0) and DrawnPictures(0).photographs == ()
+
+
 def test_a_picture_of_sixteen_bits_or_without_transparency_is_read(tmp_path: Path) -> None:
     save(tmp_path / "a.png", np.full((20, 20), 257 * 77, np.uint16))
     opaque = np.full((20, 20, 4), 77, np.uint8)

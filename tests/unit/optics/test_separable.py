@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import hadamard
 
-from mitsim.optics.terms import best_term, centre_terms, lacking, relative_difference, stripe_misfits
-from mitsim.reconstruct.estimate_factors import estimate_factors, stripe_sums
+from mitsim.optics.terms import best_term, centre_terms, lacking, relative_difference
+from mitsim.reconstruct.estimate_factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
 
@@ -115,19 +115,3 @@ def test_what_factors_lack_is_told_but_for_three_percent() -> None:
     lacks, rest = lacking(terms, left, right), dense(terms) - dense([(left, right)])
     assert lacks.residual == pytest.approx(np.linalg.norm(rest) / np.linalg.norm(dense(terms)), rel=1e-9)
     assert 0.01 < np.linalg.norm(dense(lacks.terms) - rest) / np.linalg.norm(rest) < 0.03
-
-
-@pytest.mark.parametrize("count", [1, 2, 9])
-def test_what_stripes_leave_is_what_their_responses_sum_up_to(count: int) -> None:
-    """Squares, by the sums of a session's own frames. (Planted: rows for columns; the other side's split.)"""
-    terms, signs = [(left, right[:, :4]) for left, right in random_terms(count, 6)], hadamard(8)[:4]
-    shown = [
-        [sum(np.outer(left @ h, right.sum(axis=1)) for left, right in terms) for h in signs.T],
-        [sum(np.outer(left.sum(axis=1), right @ h) for left, right in terms) for h in signs.T],
-    ]
-    sums = stripe_sums(shown[0][0], shown[1][0], 8)
-    for each, responses, (misfits, energies) in zip(sums, shown, stripe_misfits(terms, signs), strict=True):
-        for response in responses[1:]:
-            each.add(response)
-        np.testing.assert_allclose(energies, each.energies, rtol=1e-6)
-        np.testing.assert_allclose(misfits, each.misfits, rtol=1e-6, atol=1e-6 * energies.max())

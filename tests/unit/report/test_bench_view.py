@@ -42,7 +42,7 @@ def seen(shared_scene: Callable[..., Path], variant: str) -> BenchView:
         seen=250,
         depths=(340.0, 400.0),
         moves=(0.0, 3200.0),
-        trouble=None,
+        obstacles=(),
     )
     picture = Preview(np.full((8, 8, 1), 0.5), np.eye(4), 0.2)
     return BenchView(open_bench(shared_scene("seen")), layout, (picture, picture))
@@ -112,7 +112,7 @@ def test_words_state_what_the_numbers_do(seen: BenchView) -> None:
     assert above.facts["depth map"].startswith("dots:16x7 ")
     far = replace(seen, layout=replace(seen.layout, projector=np.array([-5.0, 20, -30])))
     assert far.facts["projector"] == "5 mm right of, 20 mm above, 30 mm behind the camera's sensor"
-    dark = replace(seen, layout=replace(seen.layout, depths=None, seen=0, trouble="no light"))
+    dark = replace(seen, layout=replace(seen.layout, depths=None, seen=0, obstacles=("no light",)))
     assert dark.facts["light is seen"] == "nowhere" and dark.warnings == ("no light",)
 
 
