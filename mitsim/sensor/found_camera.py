@@ -20,7 +20,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.field_docs import toml_value
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.emva import LEAST_DARK
-from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform
+from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform, saturation_of
 
 _DEAD = 0.5
 """Response over the median one below which a pixel is dead."""
@@ -38,12 +38,18 @@ _ROBUST = 1.4826
 _ROUNDED = 12**-0.5
 """Standard deviation of what rounding takes off a mean [DN], where no noise dithers it."""
 _CUT = 1e-3
-"""Part of dark readings that are 0 from which their spread is not that of offsets."""
+"""Part of dark readings that are 0 from which the black level is told by lit frames."""
+_FILLED = 0.9
+"""Part of the brightest mean from which a hot pixel is full."""
+_HIDES = 2.0
+"""Error of the offsets over that of what is seen of them from which they count as hidden."""
 _MOST_RESPONSE = 0.1
 """Largest relative spread of responses that a camera file states."""
 
 Images = Callable[[int], FloatArray]
 """Mean image (M, N) [DN] of the set of an index."""
+Places = npt.NDArray[np.intp]
+"""(M, N) flat index of the pixel that is read in place of each pixel."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,10 @@ class FoundCamera:
         the fit of means and variances.
     uneven
         part of the light by which it differs over the frame.
+    taken
+        the sets, with other pixels in place of defects.
+    filled
+        part of the pixels that dark current fills in the longest dark frames.
     notes
         what the frames do not tell.
     """
@@ -79,7 +89,9 @@ class FoundCamera:
     sensor: SensorModel
     errors: dict[str, float]
     transfer: Transfer = field(repr=False)
+    taken: Sequence[Taken] = field(repr=False)
     uneven: float
+    filled: float
     notes: tuple[str, ...]
 
     def toml(self) -> str:
@@ -93,8 +105,12 @@ class FoundCamera:
         return "\n".join(lines) + "\n"
 
 
-def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> FoundCamera:
-    """The camera that explains frames.
+def find_camera(
+    taken: Sequence[Taken], images: Images, stated: Stated, again: Callable[[Places], Sequence[Taken]]
+) -> FoundCamera:
+    """Find the camera that explains frames.
+
+    Hot and dead pixels are counted, and then read as other pixels of their row, so that they are in no other number.
 
     Parameters
     ----------
@@ -104,13 +120,15 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
         their mean images.
     stated
         what frames do not tell.
+    again
+        statistics of the same sets, with some pixels replaced.
 
     Raises
     ------
     MitsimError
         for light that is far from even, and where no camera file can state what was found.
     """
-    maps = _Maps.of(taken, images)
+    maps = _Maps.of(taken, images, again)
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
             f"light differs by {100 * maps.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
@@ -122,9 +140,11 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
             f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
             f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
         )
-    dead, offsets = float(maps.dead.mean()), maps.offsets()
-    transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
-    return _Findings(taken, maps, transfer, offsets, dead).camera(stated)
+    offsets = maps.offsets()
+    least = 1e-12 if stated.bits is None else 1 / maps.offset.size  # one pixel may have another code
+    spatial = float(offsets.values.sum()), max(math.hypot(*offsets.errors), least)
+    transfer = fit(maps.taken, stated.bits, maps.short, spatial)
+    return _Findings(maps.taken, maps, transfer, offsets, spatial).camera(stated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,89 +157,93 @@ class _Parts:
 
 @dataclass(frozen=True, eq=False)
 class _Maps:
-    """Mean images and what is amiss in them.
+    """Mean images, with defect pixels replaced, and counts of defects.
 
-    `dark` and `bright` tell nonuniformity, `long` is the longest in the dark; `dead` and `hot` (M, N) are defects,
-    `excess` (M, N) [DN] what is gathered in the dark over `seconds`, `contrast` (M, N) [DN] what light makes.
+    `dark` and `bright` tell nonuniformity, `short` the offsets; `excess` (M, N) [DN] is what is gathered in the dark
+    from the set `least` to the set `long`, `contrast` (M, N) [DN] what light makes. `dead`, `hot` and `filled` are parts
+    of the pixels, `beyond` [DN] is the mean excess of hot pixels over that of the others.
     """
 
     taken: Sequence[Taken]
     dark: int
     bright: int
     short: int
+    least: int
     long: int
     offset: FloatArray
     contrast: FloatArray
     excess: FloatArray | None
-    dead: npt.NDArray[np.bool_]
-    hot: npt.NDArray[np.bool_]
+    dead: float
+    hot: float
+    filled: float
+    beyond: float
     uneven: float
 
     @classmethod
-    def of(cls, taken: Sequence[Taken], images: Images) -> _Maps:
+    def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> _Maps:
         dark, bright = nonuniform(taken)
         unlit = [index for index, each in enumerate(taken) if not each.light]
         long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
+        least = min(unlit, key=lambda index: (taken[index].exposure_s, -taken[index].said.count))
         short = max(unlit, key=lambda index: (taken[index].said.count, -taken[index].exposure_s))
         offset = images(short)
         contrast = images(bright) - (offset if dark == short else images(dark))
         middle = float(np.median(contrast))
         noise = math.sqrt(_noise_left(taken, bright) + _noise_left(taken, dark))
         dead = contrast < _DEAD * middle if 10 * noise < middle else np.zeros(contrast.shape, bool)
-        hot, excess = np.zeros(contrast.shape, bool), None
-        if taken[long].exposure_s > taken[short].exposure_s:
-            excess = images(long) - offset
+        longest = images(long)
+        middle, full = float(np.median(longest)), float(taken[saturation_of(taken)[0]].said.pair.mean)
+        filled = hot = longest > middle + _FILLED * (full - middle)
+        excess, beyond = None, 0.0
+        if taken[long].exposure_s > taken[least].exposure_s:
+            excess = longest - (offset if least == short else images(least))
             middle = float(np.median(excess))
-            wide = _ROBUST * float(np.median(np.abs(excess - middle)))
             # Of few codes most readings are one number: noise is then what is left of it.
-            wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
-            if float(taken[short].said.pair.variance) < LEAST_DARK:
+            wide = math.sqrt(_noise_left(taken, long) + _noise_left(taken, least))
+            wide = max(wide, _ROBUST * float(np.median(np.abs(excess - middle))), 1e-9)
+            if float(taken[least].said.pair.variance) < LEAST_DARK:
                 wide = max(wide, _ROUNDED)
-            hot = excess > middle + _HOT * wide
-        surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
+            hot = hot | (excess > middle + _HOT * wide)
+            beyond = float(excess[hot].mean() - excess[~hot].mean()) if hot.any() else 0.0
+        dead &= ~hot
+        bad = dead | hot
+        if bad.any():
+            places = _places(bad)
+            taken = again(places)
+            offset, contrast = offset.flat[places], contrast.flat[places]
+            excess = None if excess is None else excess.flat[places]
+        surface = _surface(contrast)
         uneven = float(np.ptp(surface) / surface.mean())
         if uneven > _UNEVEN:
             contrast = contrast / (surface / surface.mean())
-        return cls(taken, dark, bright, short, long, offset, contrast, excess, dead, hot, uneven)
+        return cls(
+            taken, dark, bright, short, least, long, offset, contrast, excess, float(dead.mean()), float(hot.mean()),
+            float(filled.mean()), beyond, uneven,
+        )  # fmt: skip
 
     def offsets(self) -> _Parts:
-        """Of the offsets [DN^2], dark current's part at that exposure among them."""
+        """Return the spatial variances of the offsets [DN^2], with dark current's part at that exposure."""
         said = self.taken[self.short].said
-        return _spatial_parts(
-            self.offset, self.dead | self.hot, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count
-        )
+        return _spatial_parts(self.offset, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count)
 
     def responses(self) -> _Parts:
-        """Of the responses, over their mean."""
-        noise = _noise_left(self.taken, self.bright) + _noise_left(self.taken, self.dark)
-        rows = sum(
-            float(self.taken[index].said.pair.rows) / self.taken[index].said.count for index in (self.bright, self.dark)
+        """Return the spatial variances of the responses, over their squared mean."""
+        both = [self.taken[index].said for index in (self.bright, self.dark)]
+        noise, rows = (
+            sum(float(getattr(said.pair, name)) / said.count for said in both) for name in ("variance", "rows")
         )
-        found = _spatial_parts(self.contrast, self.dead | self.hot, noise, rows)
-        mean = float(self.contrast[~(self.dead | self.hot)].mean())
+        found, mean = _spatial_parts(self.contrast, noise, rows), float(self.contrast.mean())
         return _Parts(found.values / mean**2, found.errors / mean**2)
 
-    @property
-    def offset_spread(self) -> float:
-        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light,
-        if that is no chance."""
-        if self.taken[self.short].said.cut[0] < _CUT:
-            return float(self.offsets().values.sum())
-        lit = [each for each in self.taken if each.light and not any(each.said.cut)]
-        if not lit:
-            return float(self.offsets().values.sum())
-        darkest = min(lit, key=lambda each: float(each.said.pair.mean))
-        signal = float(darkest.said.pair.mean) - float(self.taken[self.short].said.pair.mean)
-        dead = float(self.dead.mean())
-        response = float(self.responses().values.sum()) + dead * (1 - dead)
-        found = float(darkest.said.stack.total) - response * signal**2
-        error = math.sqrt(2 / self.offset.size) * float(darkest.said.pair.variance) / darkest.said.count
-        return found if found > _SURE * error else 0.0
 
-
-def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
-    """Mean of an ``image`` (M, N) ``without`` some pixels (M, N)."""
-    return float(image[~without].mean())
+def _places(bad: npt.NDArray[np.bool_]) -> Places:
+    """Return for each of the ``bad`` pixels (M, N) a good one of its row, if there is one, drawn by chance."""
+    rng, (m, n) = np.random.default_rng(0), bad.shape
+    places, everywhere = np.arange(m * n).reshape(m, n), np.flatnonzero(~bad)
+    for row in np.flatnonzero(bad.any(axis=1)):
+        good = row * n + np.flatnonzero(~bad[row])
+        places[row, bad[row]] = rng.choice(good if good.size else everywhere, np.count_nonzero(bad[row]))
+    return places
 
 
 def _noise_left(taken: Sequence[Taken], index: int) -> float:
@@ -227,12 +251,12 @@ def _noise_left(taken: Sequence[Taken], index: int) -> float:
     return float(taken[index].said.pair.variance) / taken[index].said.count
 
 
-def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
+def _spatial_parts(image: FloatArray, noise: float, rows: float) -> _Parts:
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
     rows *= 1 - 1 / m  # of variances about the frame's mean, which hold a row of m less
-    about = np.where(without, 0.0, image - middle_of(image, without))
-    total = float(np.square(about).sum()) / (max(int(np.count_nonzero(~without)), 2) - 1) - noise
+    about = image - image.mean()
+    total = float(np.square(about).sum()) / (m * n - 1) - noise
     row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
     row -= (noise - rows) / n + rows
     column -= (noise - rows) / m
@@ -264,7 +288,7 @@ class _Findings:
     maps: _Maps
     transfer: Transfer
     offsets: _Parts
-    dead: float
+    spatial: tuple[float, float]
 
     def camera(self, stated: Stated) -> FoundCamera:
         """The camera, of what was ``stated`` and measured."""
@@ -273,7 +297,7 @@ class _Findings:
         found: dict[str, tuple[float, float]] = {"gain_dn_per_e": (gain, gain * gain_error)}
         found |= self._noise(gain, gain_error)
         found |= self._dark(gain, notes)
-        found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0])
+        found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0], notes)
         found |= self._responses()
         if stated.photons:
             response = self._response_error()
@@ -300,7 +324,8 @@ class _Findings:
         if any(bend):
             errors["linearity"] = transfer.error("bend")
         return FoundCamera(
-            validate(SensorModel, fields, "camera found"), errors, transfer, self.maps.uneven, tuple(notes)
+            validate(SensorModel, fields, "camera found"), errors, transfer, self.taken,
+            self.maps.uneven, self.maps.filled, tuple(notes),
         )
 
     def _noise(self, gain: float, gain_error: float) -> dict[str, tuple[float, float]]:
@@ -318,10 +343,17 @@ class _Findings:
         )
         still = math.sqrt(max(float(lines[0].sum() + lines[1]), 0.0))
         own_error = math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
+        black, black_error = transfer["black"], math.hypot(transfer.error("black"), still)
+        if black < -_SURE * black_error and max(each.said.cut[0] for each in self.taken if not each.light) > _CUT:
+            raise MitsimError(
+                f"frames: the black level is {black:.3g} +- {black_error:.1g} DN by the frames under light, so that dark "
+                "readings are cut at 0; a camera file states 0 or more; raise the black level (offset, pedestal) of the "
+                "camera, or subtract less from the frames"
+            )
         return {
             "read_noise_e": (own / gain, own_error / gain),
             "row_noise_e": (math.sqrt(shared) / gain, _root_error(shared, row_error) / gain),
-            "black_level_dn": (max(transfer["black"], 0.0), math.hypot(transfer.error("black"), still)),
+            "black_level_dn": (max(black, 0.0), black_error),
         }  # fmt: skip
 
     def _rows(self) -> tuple[float, float]:
@@ -345,49 +377,56 @@ class _Findings:
         if maps.excess is None:
             notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two or more")
             return dict.fromkeys(names, nothing)
-        seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
-        unit, count = gain * seconds, maps.excess.size
+        seconds = taken[maps.long].exposure_s - taken[maps.least].exposure_s
+        unit, count, (m, n) = gain * seconds, maps.excess.size, maps.excess.shape
         if not error:
             error = 0.5 / unit
             notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
-        cool, (m, n) = ~maps.hot, maps.excess.shape
-        middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
-        beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
-        both = taken[maps.long], taken[maps.short]
+        beyond = max(maps.beyond, 0.0) / unit
+        both = taken[maps.long], taken[maps.least]
         # As in `_spatial_parts`.
         rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both) * (1 - 1 / m)
-        # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
-        theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
-        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)
-        even = np.where(cool, maps.excess - middle, 0.0)
-        even -= even.mean(axis=1, keepdims=True)
-        variance = float(np.square(even[cool]).mean()) * n / (n - 1)
-        error_of_noise = math.hypot(math.sqrt(2 / count) * variance, math.sqrt(2 * part / count) * sum(theirs))
-        spread, spread_error = (variance - noise) / unit**2, error_of_noise / unit**2
-        base = mean - part * beyond
-        wide = math.sqrt(spread) if spread > _SURE * spread_error and base > 0 else 0.0
-        hot_error = math.sqrt((variance + sum(theirs)) / max(part * count, 1) + rows / m) / unit
-        base_error = math.hypot(error, wide / math.sqrt(count), part * hot_error)
+        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.least) - rows
+        even = maps.excess - maps.excess.mean(axis=1, keepdims=True)
+        variance = float(np.square(even).mean()) * n / (n - 1)
+        spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
+        wide = math.sqrt(spread) if spread > _SURE * spread_error and mean > 0 else 0.0
+        counted = sum(gain**2 * beyond * each.exposure_s / each.said.count for each in both)
+        hot_error = math.sqrt((variance + counted) / max(maps.hot * count, 1) + rows / m) / unit
         return dict(zip(names, (
-            (max(base, 0.0), base_error), (wide, _root_error(wide**2, spread_error)),
-            (part, math.sqrt(max(part, 1 / count) / count)), (beyond, hot_error if part else 0.0),
+            (max(mean, 0.0), math.hypot(error, wide / math.sqrt(count))), (wide, _root_error(wide**2, spread_error)),
+            (maps.hot, math.sqrt(max(maps.hot, 1 / count) / count)), (beyond, hot_error if maps.hot else 0.0),
         ), strict=True))  # fmt: skip
 
-    def _offsets(self, gain: float, gain_error: float, spread: float) -> dict[str, tuple[float, float]]:
-        """Offsets by pixel, row and column [e-]."""
-        values, errors = self.offsets.values.copy(), self.offsets.errors
+    def _offsets(
+        self, gain: float, gain_error: float, spread: float, notes: list[str]
+    ) -> dict[str, tuple[float, float]]:
+        """Return the offsets by pixel, row and column [e-].
+
+        Rounding and the ADC's end change the spread of mean readings; the fit gives that of the offsets.
+        """
+        (seen, seen_error), true, error = self.spatial, self.transfer["spatial"], self.transfer.error("spatial")
+        sure = seen > _SURE * seen_error and true > _SURE * error
+        values = self.offsets.values * (true / seen if sure else 0.0)
+        own = math.sqrt(max(error**2 - seen_error**2, 0.0)) / max(true, 1e-300) if sure else 0.0
+        hidden = not sure and error > _HIDES * seen_error
+        errors = np.full(3, error) if hidden else self.offsets.errors * (true / seen if sure else 1.0)
         values[0] -= (gain * spread * self.taken[self.maps.short].exposure_s) ** 2
-        wider = self.maps.offset_spread / values.sum() if values.sum() > 0 else 1.0
-        scale = wider if self.taken[self.maps.short].said.cut[0] >= _CUT and wider > 1 else 1.0
         found = {}
-        for name, value, error in zip(("pixel", "row", "column"), values * scale, errors * scale, strict=True):
-            kept = math.sqrt(value) / gain if value > _SURE * error else 0.0
-            found[f"dsnu_{name}_e"] = kept, math.hypot(_root_error(kept**2, error / gain**2), kept * gain_error)
+        for name, value, each in zip(("pixel", "row", "column"), values, errors, strict=True):
+            each = math.hypot(each, value * own)
+            kept = math.sqrt(value) / gain if value > _SURE * each else 0.0
+            found[f"dsnu_{name}_e"] = kept, math.hypot(_root_error(kept**2, each / gain**2), kept * gain_error)
+        if hidden:
+            notes.append(
+                "dsnu_*_e are hidden by rounding or by the ADC's end, and taken as 0; dsnu_pixel_e is below "
+                f"{found['dsnu_pixel_e'][1]:.2g} e-"
+            )
         return found
 
     def _responses(self) -> dict[str, tuple[float, float]]:
         """Responses by pixel, row and column, and dead pixels."""
-        found, (b1, b2), full = self.maps.responses(), self.transfer.values[5:], 1.0
+        found, (b1, b2), full = self.maps.responses(), self.transfer.values[5:7], 1.0
         if b1 or b2:
             light = self.transfer["response"] * self.taken[self.maps.bright].light
             end = self.transfer.saturation_dn or math.inf
@@ -398,7 +437,8 @@ class _Findings:
         for name, value, error in zip(("pixel", "row", "column"), found.values, found.errors, strict=True):
             kept = math.sqrt(value) / full if value > _SURE * error else 0.0
             numbers[f"prnu_{name}"] = kept, _root_error(kept**2, error / full**2)
-        numbers["dead_pixels"] = self.dead, math.sqrt(max(self.dead, 1 / self.maps.dead.size) / self.maps.dead.size)
+        dead, count = self.maps.dead, self.maps.offset.size
+        numbers["dead_pixels"] = dead, math.sqrt(max(dead, 1 / count) / count)
         return numbers
 
     def _response_error(self) -> float:
@@ -426,7 +466,7 @@ class _Findings:
         if transfer.saturation_dn is None:
             return {"full_well_e": (full, 0.0)}  # what is not told has no error
         # By gain, black level and both bends (`photon_transfer.NAMES`), whose errors are not independent.
-        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent])
+        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent, 0])
         return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 

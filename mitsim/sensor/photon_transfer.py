@@ -13,27 +13,29 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor.emva import HIDDEN, MOST_FITTED, Alike
+from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
-NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
-"""What is fitted: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
-unit of light, and the first two coefficients of linearity."""
-_STEPS = (1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0)
-"""Steps by which slopes are found, as parts of a number: where moments change by some of their errors."""
-_LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
-"""The same in the number's unit, at least: also where it is 0."""
+NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2", "spatial")
+"""Fitted numbers: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
+unit of light, the first two coefficients of linearity, and the variance of the pixels' offsets [DN^2]."""
+_DARK = NAMES.index("dark")
+_STEPS = np.array([1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-2])
+"""Relative steps of the numerical derivatives, which change moments by some of their errors."""
+_LEAST_STEPS = np.array([1e-15, 1e-3, 1e-2, 1e-4, 1e-15, 1e-3, 1e-3, 1e-5])
+"""Least steps in each number's unit, for numbers near 0."""
 _STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
 _TRIED, _SOLVED = 10, 25
 """Evaluations in which another beginning must be better, and those of a solution; chosen: a camera of 8 bits that no
 numbers fit takes 10 s."""
-_DITHERED = 0.64
-"""Variance [DN^2] below which rounding moves it: of 0.8 DN, as `mitsim.sensor.moments` has it."""
+_DITHERED = 0.44
+"""Variance [DN^2] below which rounding moves means: noise of 0.6 DN, which leaves 2e-3 of an offset's error."""
 _HALF = 0.5
 """Codes to which an offset is known whatever the noise hides."""
 _NODES = 9
@@ -82,7 +84,7 @@ class Transfer:
     Attributes
     ----------
     values, covariance
-        (7,) by :data:`NAMES`, and (7, 7) of their errors; 0: not fitted.
+        (8,) by :data:`NAMES`, and (8, 8) of their errors; 0: not fitted.
     saturation_dn
         mean of saturated frames; None where no frame is.
     saturates
@@ -169,8 +171,39 @@ def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
 # ---- the fit ---------------------------------------------------------------------------------------------------------
 
 
-def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: float = 0.0) -> Transfer:
-    """The camera that explains the ``taken`` sets.
+def average_moments(
+    electrons: npt.ArrayLike, exposure_s: float, model: SensorModel, spread: float, response: float = 0.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean and variance [DN] of pixels that differ, and the variance over pixels of their means.
+
+    An offset acts as another black level. The average over a normal law is a Gauss and Hermite sum, with one node for
+    offset and response: offsets matter in the dark, responses at saturation, and in between moments are straight.
+
+    Parameters
+    ----------
+    electrons
+        (...) expected photoelectrons.
+    exposure_s, model
+        time, and a sensor whose pixels are alike.
+    spread, response
+        standard deviations of the offsets [DN], and of the responses over their mean.
+    """
+    light = np.asarray(electrons, dtype=np.float64)
+    if not spread and not response:
+        return *frame_moments(light, exposure_s, model), np.zeros(light.shape)
+    places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+    lit = np.multiply.outer(np.maximum(1 + response * places, 0.0), light)
+    models = [model.model_copy(update={"black_level_dn": model.black_level_dn + place * spread}) for place in places]
+    found = [frame_moments(*each) for each in zip(lit, [exposure_s] * _NODES, models, strict=True)] if spread else [
+        frame_moments(lit, exposure_s, model)
+    ]  # fmt: skip
+    means, noises = (np.reshape(part, lit.shape) for part in zip(*found, strict=True))
+    mean, noise = (np.average(part, axis=0, weights=weights) for part in (means, noises))
+    return mean, noise, np.average(np.square(means - mean), axis=0, weights=weights)
+
+
+def fit(taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[float, float]) -> Transfer:
+    """Fit a camera to the ``taken`` sets.
 
     Parameters
     ----------
@@ -178,12 +211,10 @@ def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: flo
         sets of frames, a dark one among them.
     bits
         of the ADC; None: real numbers.
-    dead
-        part of the pixels that do not respond.
-    spread
-        standard deviation of the pixels' offsets [DN].
+    still, spatial
+        a dark set, and the variance over pixels of its mean image [DN^2] with its standard error.
     """
-    problem = _Problem.of(taken, bits, dead, spread)
+    problem = _Problem.of(taken, bits, still, spatial)
     steady = problem.begin()
     if steady.light_fits or steady.lit < 4:
         return steady.transfer("steady")
@@ -269,8 +300,9 @@ class _Problem:
     variance: FloatArray
     mean_error: FloatArray
     variance_error: FloatArray
-    spread: float
-    dead: float
+    still: int
+    spatial: tuple[float, float]
+    hidden: bool
     bits: int | None
     saturation_dn: float | None
     saturates: bool
@@ -279,7 +311,7 @@ class _Problem:
     start: FloatArray
 
     @classmethod
-    def of(cls, taken: Sequence[Taken], bits: int | None, dead: float, spread: float) -> _Problem:
+    def of(cls, taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[float, float]) -> _Problem:
         pairs = [each.said.pair for each in taken]
         light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
         mean, variance = (np.array([float(getattr(pair, name)) for pair in pairs]) for name in ("mean", "variance"))
@@ -289,7 +321,7 @@ class _Problem:
         if last is not None:
             used &= (light == 0) | (mean - dark <= MOST_FITTED * (mean[peak] - dark))
         top = math.inf if bits is None else 2.0**bits - 1
-        saturation = None if last is None else float(mean[last] - dead * dark) / (1 - dead)
+        saturation = None if last is None else float(mean[last])
         lamp = [
             (each.said.flicker / max(float(each.said.pair.mean) - dark, 1e-9)) ** 2 / each.said.count
             for each, lit in zip(taken, used & (light > 0), strict=True) if lit
@@ -297,13 +329,13 @@ class _Problem:
         errors = np.array([(each.said.mean_error, each.said.variance_error) for each in taken])
         # A set without any noise, of which few codes leave nothing, is known to a code's rounding.
         least = 1e-3 if bits is not None else 1e-6 * max(dark, 1.0)
-        # Offsets matter where an end of the ADC or its steps hide part of the noise: elsewhere moments are straight.
+        # Moments depend on the offsets where an end of the ADC or its steps hide part of the noise.
         hidden = bits is not None and (
             variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100
         )
         found = cls(
             light[used], time[used], mean[used], variance[used], np.maximum(errors[used, 0], least / 10),
-            np.maximum(errors[used, 1], least), spread if hidden else 0.0, dead, bits, saturation,
+            np.maximum(errors[used, 1], least), int(used[:still].sum()), spatial, hidden, bits, saturation,
             saturation is not None and saturation < top - 1, max(math.sqrt(np.mean(lamp)) if lamp else 0.0, _STEADY),
             used, np.zeros(len(NAMES)),
         )  # fmt: skip
@@ -328,12 +360,12 @@ class _Problem:
         if np.ptp(times) > 0:
             current = max(float(np.polyfit(times, self.mean[dark], 1)[0]) / gain, 0.0)
         read = math.sqrt(max(float(self.variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
-        return np.array([gain, read, self.mean[first], current, max(response, 1e-12), 0.0, 0.0])
+        return np.array([gain, read, self.mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
 
-    def moments(self, values: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Expected means and variances [DN], averaged over the pixels, of light ``scale`` times that stated."""
-        gain, read, black, current, response, *bends = (float(value) for value in values)
-        gain = max(gain, 1e-12)
+    def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return expected means and variances [DN] of all sets, and of the dark set the variance over its pixels."""
+        gain, read, black, current, response, *bends = (float(value) for value in values[:-1])
+        gain, spatial = max(gain, 1e-12), float(values[-1])
         end = self.saturation_dn if self.saturates else None
         if end is None and self.bits is not None:
             end = 2.0**self.bits - 1
@@ -345,35 +377,22 @@ class _Problem:
                 "full_well_e": full, "linearity": tuple(bends) if math.isfinite(full) else (),
             }
         )  # fmt: skip
-        leak = np.maximum(current, 0.0) * self.time
-        lit, noise = self._average(np.maximum(response * self.light * scale, 0.0) + leak, model)
-        if not self.dead:
-            return lit, noise
-        still, rest = self._average(leak, model)
-        return (1 - self.dead) * lit + self.dead * still, (1 - self.dead) * noise + self.dead * rest
-
-    def _average(self, electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-        """Moments of pixels whose offsets are spread: an offset is another black level."""
-        if not self.spread:
-            return frame_moments(electrons, 0.0, model)
-        places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
-        mean, variance = np.zeros_like(electrons), np.zeros_like(electrons)
-        for place, weight in zip(places, weights / weights.sum(), strict=True):
-            moved = model.model_copy(update={"black_level_dn": model.black_level_dn + place * self.spread})
-            first, second = frame_moments(electrons, 0.0, moved)
-            mean += weight * first
-            variance += weight * second
-        return mean, variance
+        electrons = np.maximum(response * self.light, 0.0) + np.maximum(current, 0.0) * self.time
+        if not self.hidden:
+            return *frame_moments(electrons, 0.0, model), spatial
+        spread = max(spatial, float(_LEAST_STEPS[-1]))
+        mean, noise, between = average_moments(electrons, 0.0, model, math.sqrt(spread))
+        return mean, noise, float(between[self.still]) * spatial / spread
 
     def begin(self) -> _Solution:
         """The fit of a linear camera, from other numbers too where the first ones lead nowhere: of few codes, variances
         rise and fall with the mean, and several cameras explain them where no dark noise is seen."""
         found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.variance.min() < HIDDEN
-        for part in _STARTS if self.variance.min() < _DITHERED else ():
+        for part in _STARTS if self.variance.min() < LEAST_DARK else ():
             best = min(found, key=lambda each: each.chi_square)
             if best.worse <= _FITS and not hidden:
                 break
-            start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
+            start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0, 1.0]
             found.append(replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED))
             if found[-1].chi_square < best.chi_square:
                 found.append(replace(self, start=found[-1].values).solve(bend=False, lamp=self.lamp))
@@ -391,69 +410,53 @@ class _Problem:
         return solution
 
     def solve(self, bend: bool, lamp: float, most: int = _SOLVED) -> _Solution:
-        """Least squares of means, variances, and of how far each set's light is off, of a ``lamp`` of such scatter."""
-        count, lit = len(self.light), self.light > 0
-        lights = int(np.count_nonzero(lit))
-        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
-        dark = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
-        free = np.array([True, True, True, dark, lights > 0, bend, bend])
-        fixed = self.start.copy()
-        fixed[3] = fixed[3] if free[3] else 0.0
+        """Fit means and variances by least squares, where the light of sets scatters by a part ``lamp``.
 
-        def take_apart(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            values, scale = fixed.copy(), np.ones(count)
-            values[free] = x[: free.sum()]
-            scale[lit] += lamp * x[free.sum() :]
-            return values, scale
+        The light of a set moves its mean and its variance together, as (signal, noise of light). The best deviation of
+        the light follows from what is left of both, so that it is no parameter.
+        """
+        lit = self.light > 0
+        dark = self.mean[~lit].min(), self.variance[~lit].min()
+        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
+        seen = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
+        free = np.array([True, True, True, seen, lit.any(), bend, bend, True])
+        values = np.where(free | (np.arange(len(NAMES)) != _DARK), self.start, 0.0)
+        errors = np.array([self.mean_error, self.variance_error])
+        by_light = lamp * lit * (np.array([self.mean, self.variance]) - np.array(dark)[:, None]) / errors
 
         def rest(x: FloatArray) -> FloatArray:
-            values, scale = take_apart(x)
-            mean, variance = self.moments(values, scale)
-            return np.concatenate([
-                (self.mean - mean) / self.mean_error, (self.variance - variance) / self.variance_error,
-                x[free.sum() :],
-            ])  # fmt: skip
+            values[free] = x
+            mean, variance, spatial = self.moments(values)
+            left = np.array([self.mean - mean, self.variance - variance]) / errors
+            light = (by_light * left).sum(axis=0) / (1 + np.square(by_light).sum(axis=0))
+            left -= by_light * light
+            return np.concatenate([*left, light[lit], [(self.spatial[0] - spatial) / self.spatial[1]]])
 
         def slopes(x: FloatArray) -> FloatArray:
-            here, found = rest(x), np.zeros((2 * count + lights, len(x)))
-            sizes = np.maximum(np.abs(fixed) * _STEPS, _LEAST_STEPS)
-            for column, index in enumerate(np.flatnonzero(free)):
-                step = max(abs(x[column]) * _STEPS[index], _LEAST_STEPS[index], sizes[index] * 1e-3)
-                moved = x.copy()
-                moved[column] += step
-                found[:, column] = (rest(moved) - here) / step
-            # Light of one set moves that set alone, so all are moved at once.
-            moved = x.copy()
-            size = 1e-3 / max(lamp, 1e-3)
-            moved[free.sum() :] += size
-            change = (rest(moved) - here) / size
-            for column, index in enumerate(np.flatnonzero(lit), free.sum()):
-                found[[index, count + index], column] = change[[index, count + index]]
-                found[2 * count + column - free.sum(), column] = 1.0
-            return found
+            steps, here = np.maximum(np.abs(x) * _STEPS[free], _LEAST_STEPS[free]), rest(x)
+            return np.stack([(rest(x + step) - here) / step.sum() for step in np.diag(steps)], axis=1)
 
-        begin = np.concatenate([fixed[free], np.zeros(lights)])
-        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most)
-        values, scale = take_apart(solved.x)
-        normal = solved.jac.T @ solved.jac
-        # Of what few codes hide, readings in the dark are known to half a code all the same.
-        span, code = float(np.ptp(self.time[~lit])), max(_HALF, values[1])
-        known = np.zeros((5, len(NAMES)))
-        known[0, [0, 3]] = np.array([values[3], values[0]]) * span / code
-        known[[1, 2, 3, 4], [1, 2, 5, 6]] = 1 / code, 1 / code, 1.0, 1.0
-        normal[: free.sum(), : free.sum()] += known[:, free].T @ known[:, free]
+        solved = scipy.optimize.least_squares(
+            rest, values[free], slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most
+        )
+        values[free] = solved.x
+        # Readings in the dark are known to half a code, and pixels to be alike to it, whatever few codes hide.
+        span, code = float(np.ptp(self.time[~lit])), max(_HALF, abs(values[1]))
+        known = np.diag([0.0, 1 / code, 1 / code, 0.0, 0.0, 1.0, 1.0, code**-2])
+        known[0, [0, _DARK]] = np.array([values[_DARK], values[0]]) * span / code
+        normal = solved.jac.T @ solved.jac + known[:, free].T @ known[:, free]
         size = np.sqrt(np.diagonal(normal))
-        inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size)
         covariance = np.zeros((len(NAMES), len(NAMES)))
-        covariance[np.ix_(free, free)] = inverse[: free.sum(), : free.sum()]
+        covariance[np.ix_(free, free)] = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+        covariance[np.ix_(free, free)] /= np.outer(size, size)
         values[1] = abs(values[1])
         # Means that are off tell of the lamp too: both parts of how far light is off.
-        left = (scale - 1)[lit] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
+        count = len(self.light)
+        left = lamp * solved.fun[2 * count : -1] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
             self.mean[lit] - values[2], 1e-9
         )
-        scatter = float(np.sqrt(np.square(left).sum() / max(lights - 1 - 2 * bend, 1)))
-        freedom = 2 * count - int(free.sum())
-        return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun, freedom)
+        scatter = float(np.sqrt(np.square(left).sum() / max(lit.sum() - 1 - 2 * bend, 1)))
+        return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun[:-1], 2 * count - int(free.sum()) + 1)
 
 
 _BASE = SensorModel(

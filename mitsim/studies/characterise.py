@@ -28,7 +28,7 @@ from mitsim.studies.emva_frames import Frames, draw_sessions
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 from mitsim.studies.emva_plots import figures_of
 from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
-from mitsim.studies.flat_frames import read_sets, remarks
+from mitsim.studies.flat_frames import read_again, read_sets, remarks
 from mitsim.studies.framework.findings import build_findings
 from mitsim.studies.framework.run import study_folder, write_figures
 
@@ -67,7 +67,8 @@ def characterise(
         bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
         source = f"simulated frames of {sensor.name}"
         stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
-        found = find_camera(taken, lambda index: np.mean([*frames.images(index)], axis=0), stated)
+        images = lambda index: np.mean([*frames.images(index)], axis=0)  # noqa: E731
+        found = find_camera(taken, images, stated, lambda places: frames.take(job, places))
         return _hold_against(frames, taken, found, {"asked": asdict(procedure), "camera": sensor.name}, folder)
 
     return _write(measure, output)
@@ -99,7 +100,10 @@ def characterise_frames(
         taken = [each.taken for each in sets]
         facts = listed.listed
         stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
-        found = find_camera(taken, lambda index: sets[index].mean_image(), stated)
+        found = find_camera(
+            taken, lambda index: sets[index].mean_image(), stated,
+            lambda places: read_again(listed, places, taken[0].said.shape),
+        )  # fmt: skip
         frames = Frames.as_taken(taken, found.sensor, found.transfer)
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)

@@ -21,9 +21,10 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor import emva
 from mitsim.sensor.chain import expose
-from mitsim.sensor.emva import Session
+from mitsim.sensor.emva import MOST_FITTED, Session
+from mitsim.sensor.found_camera import Places
 from mitsim.sensor.moments import frame_moments
-from mitsim.sensor.photon_transfer import Taken, Transfer, nonuniform, saturation_of
+from mitsim.sensor.photon_transfer import Taken, Transfer, average_moments, nonuniform, saturation_of
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 
@@ -37,6 +38,8 @@ _LONGEST_S = 10.0
 """Of a camera without dark current [s]."""
 _FILLED_BY_DARK = 0.01
 """Part of saturation that dark current may fill at the ladder's exposure."""
+_DITHERED, _CLEAR = 0.6, 8.0
+"""Noise of reading [DN], and deviations from 0, from which mean readings follow offsets."""
 _SESSIONS = 1000
 """Drawn statistics of sessions: they tell a standard error to 2 %."""
 
@@ -158,12 +161,17 @@ class Frames:
             light = np.full(self.shape, self.electrons[index])
             yield np.asarray(expose(light, float(self.exposure_s[index]), self.sensor, shot, read), dtype=np.float64)
 
-    def take(self, job: Job) -> list[Taken]:
-        """What the frames say, of all sets; ``job`` is told how far it is."""
+    def take(self, job: Job, places: Places | None = None) -> list[Taken]:
+        """Take the frames of all sets, with the pixel at ``places`` in place of each; ``job`` is told how far it is."""
         largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
         job.progress("frames", 0.0)
         with job.clock.stage("frames"):
-            said = in_threads(lambda index: emva.alike(self.images(index), largest), range(len(self.light)))
+            said = in_threads(
+                lambda index: emva.alike(
+                    (image if places is None else image.flat[places] for image in self.images(index)), largest
+                ),
+                range(len(self.light)),
+            )
         return [
             Taken(float(light), float(time), each)
             for light, time, each in zip(self.light, self.exposure_s, said, strict=True)
@@ -201,14 +209,20 @@ class Frames:
     def _expected_pair(self, index: int, part: float = 1.0) -> emva.Pair:
         """Of a set whose light is a ``part`` of what it should be."""
         time, light = float(self.exposure_s[index]), np.array([part * self.electrons[index], 0.0])
-        mean, variance = frame_moments(light, time, self.alike)
+        mean, variance, _ = average_moments(
+            light, time, self.alike, self.spread,
+            math.hypot(*self.sensor.response_parts) if light[0] > MOST_FITTED * capacity_of(self.sensor) else 0.0,
+        )  # fmt: skip
         dead = self.sensor.dead_pixels
         rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
         lit = [np.asarray((1 - dead) * moment[0] + dead * moment[1]) for moment in (mean, variance)]
         return emva.Pair(lit[0], lit[1], np.minimum(rows, lit[1]))
 
     def _expected_stack(self, mean: FloatArray, index: int) -> emva.Stack:
-        rows, columns, pixel = (self.slope(self.electrons[index]) ** 2 * part for part in self.parts(index))
+        rows, columns, pixel = (
+            self.offset_slope(index) ** 2 * still + self.slope(self.electrons[index]) ** 2 * (part - still)
+            for part, still in zip(self.parts(index), self.parts(index, 0.0), strict=True)
+        )
         m, n = self.shape
         parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
         return emva.Stack(mean, *(np.asarray(part) for part in parts))
@@ -224,22 +238,41 @@ class Frames:
         mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
         return self.sensor.model_copy(update={**dict.fromkeys(names, 0.0), "dark_current_e_per_s": mean})
 
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the pixels' offsets [DN], where rounding or the ADC's end changes it; else 0."""
+        sensor, gain = self.sensor, self.sensor.gain_dn_per_e
+        spread, noise = math.hypot(*sensor.offset_parts) * gain, sensor.superpixel_reading_noise_e * gain
+        clear = noise > _DITHERED and sensor.superpixel_black_level_dn > _CLEAR * math.hypot(noise, spread)
+        return 0.0 if sensor.bits is None or clear else spread
+
+    def offset_slope(self, index: int) -> float:
+        """Digital numbers for another electron of offset in the set of that ``index``, rms over the pixels."""
+        spread = self.spread
+        if not spread:
+            return self.sensor.gain_dn_per_e
+        *_, between = average_moments(self.electrons[[index]], float(self.exposure_s[index]), self.alike, spread)
+        return self.sensor.gain_dn_per_e * math.sqrt(float(between[0])) / spread
+
     def slope(self, electrons: float) -> float:
-        """Digital numbers for another electron, around so many ``electrons``."""
+        """Digital numbers for another electron of light, around so many ``electrons``."""
         if not self.sensor.linearity:
             return self.sensor.gain_dn_per_e
         around = np.array([electrons * 0.999, electrons * 1.001 + 1])
         mean, _ = frame_moments(around, float(self.exposure_s[self.dark]), self.alike)
         return float(np.diff(mean)[0] / np.diff(around)[0])
 
-    def parts(self, index: int) -> tuple[float, float, float]:
-        """Set spatial variances by row, column and pixel [e-^2] in the set of that ``index``."""
+    def parts(self, index: int, light: float = 1.0) -> tuple[float, float, float]:
+        """Spatial variances by row, column and pixel [e-^2] that are set, in the set of that ``index``.
+
+        ``light`` is a part of the set's.
+        """
         pixel, row, column = (part**2 for part in self.sensor.offset_parts)
         dark = dark_current_variance(self.sensor) * float(self.exposure_s[index]) ** 2
         _, row_response, column_response = (part**2 for part in self.sensor.response_parts)
         own = response_variance(self.sensor) - row_response - column_response
-        light = float(self.electrons[index]) ** 2
-        return row + row_response * light, column + column_response * light, pixel + dark + own * light
+        power = (light * float(self.electrons[index])) ** 2
+        return row + row_response * power, column + column_response * power, pixel + dark + own * power
 
 
 def draw_sessions(frames: Frames, expected: Session) -> Session:
@@ -301,20 +334,20 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
     shared = min(float(expected.pairs.rows[frames.dark]), *noise)
     sizes = {"row": (m - 1, n), "column": (n - 1, m), "pixel": ((m - 1) * (n - 1), 1)}
     squares: dict[str, list[FloatArray]] = {}
-    dark, bright = (frames.parts(index) for index in places)
+    dark, bright, still = (
+        np.array([row + pixel / n, column + pixel / m, pixel])
+        for row, column, pixel in (frames.parts(places[0]), frames.parts(places[1]), frames.parts(places[1], 0.0))
+    )
     slope = frames.slope(float(frames.electrons[frames.bright]))
+    offset_slopes = [frames.offset_slope(index) for index in places]
     for index, (name, (freedom, averaged)) in enumerate(sizes.items()):
-        of_pixel = dark[2] / averaged if averaged > 1 else 0.0
-        offset = (dark[index] + of_pixel) * frames.slope(0.0) ** 2
-        light = bright[index] - dark[index] + ((bright[2] - dark[2]) / averaged if averaged > 1 else 0.0)
-        light *= slope**2
-        left = ((noise - shared) / averaged + (shared if name == "row" else 0.0)) / counts
-        parts = np.sqrt([offset, light, *left])
-        products = _products(freedom, len(parts), rng)
-        squares[name] = [
-            freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
-            for used in ([0, 2], [0, 1, 3])
-        ]
+        left = np.sqrt(((noise - shared) / averaged + (shared if name == "row" else 0.0)) / counts)
+        products = _products(freedom, 4, rng)
+        light = slope * math.sqrt(max(bright[index] - still[index], 0.0))
+        offsets = [each * math.sqrt(part) for each, part in zip(offset_slopes, (dark[index], still[index]), strict=True)]
+        squares[name] = []
+        for part, used in (([offsets[0], left[0]], [0, 2]), ([offsets[1], light, left[1]], [0, 1, 3])):
+            squares[name].append(freedom * np.einsum("i,ijs,j->s", part, products[np.ix_(used, used)], part))
     stacks = []
     for side, name in enumerate(("dark_stack", "bright_stack")):
         row, column, pixel = (squares[part][side] for part in ("row", "column", "pixel"))

@@ -61,6 +61,8 @@ _CUT = 1e-3
 """Part of the dark readings that are 0 from which these are named as the cause."""
 _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 """Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
+_DUST = 1e-10
+"""Least standard error of a figure, above what rounding of the arithmetic leaves of no noise."""
 _WHOLE = 1e4
 """From which a headline has whole numbers."""
 MOST_OFF = 5.0
@@ -319,24 +321,24 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
         (count,) the same of drawn sessions, which tell its error.
     """
     sensor = frames.sensor
-    value, spread, centre = float(found), float(sessions.std()), float(sessions.mean())
+    value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
     given = _set(frames, name)
     # What the linear method makes of a camera that is not linear, and of rows that share noise, is not what is set.
     method = name in _BY_METHOD or bool(sensor.linearity)
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
-    bias = 0.0 if method or not spread or sensor.bits is None else (centre - given) / spread
+    bias = 0.0 if method or sensor.bits is None else (centre - given) / spread
     method |= abs(bias) > _BIASED
     if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
         bias = 0.0  # it is found as the standard's limit, as it should be
     if name == "saturation_capacity":
         spread = math.hypot(spread, frames.step / math.sqrt(12))
     against = centre if method else given
-    off = (value - against) / spread if spread else 0.0 if value == against else math.inf
+    off = (value - against) / spread
     symbol, unit = UNITS[name]
     scale = 100.0 if unit == "%" else 1.0
     if name.startswith(_SQUARES):
         root = math.sqrt(max(against, 0.0))
-        spread = spread / (2 * max(root, math.sqrt(spread))) if spread else 0.0
+        spread = spread / (2 * max(root, math.sqrt(spread)))
         given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
     expected = scale * centre if method else None
     return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off, bias)
