@@ -48,6 +48,8 @@ _MOST_RESPONSE = 0.1
 
 Images = Callable[[int], FloatArray]
 """Mean image (M, N) [DN] of the set of an index."""
+Parts = tuple[FloatArray, FloatArray]
+"""Spatial variances by pixel, row and column, and their standard errors; in the image's unit squared."""
 Places = npt.NDArray[np.intp]
 """(M, N) flat index of the pixel that is read in place of each pixel."""
 
@@ -76,12 +78,8 @@ class FoundCamera:
         standard error of each field that was measured, by name.
     transfer
         the fit of means and variances.
-    uneven
-        part of the light by which it differs over the frame.
-    taken
-        the sets, with other pixels in place of defects.
-    filled
-        part of the pixels that dark current fills in the longest dark frames.
+    maps
+        mean images, and the sets with other pixels in place of defects.
     notes
         what the frames do not tell.
     """
@@ -89,9 +87,7 @@ class FoundCamera:
     sensor: SensorModel
     errors: dict[str, float]
     transfer: Transfer = field(repr=False)
-    taken: Sequence[Taken] = field(repr=False)
-    uneven: float
-    filled: float
+    maps: Maps = field(repr=False)
     notes: tuple[str, ...]
 
     def toml(self) -> str:
@@ -128,40 +124,31 @@ def find_camera(
     MitsimError
         for light that is far from even, and where no camera file can state what was found.
     """
-    maps = _Maps.of(taken, images, again)
+    maps = Maps.of(taken, images, again)
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
             f"light differs by {100 * maps.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
             "possible; move the lamp away, or cut frames to what it lights evenly"
         )
-    wide = math.sqrt(max(*maps.responses().values, 0.0))
+    wide = math.sqrt(max(*maps.responses()[0], 0.0))
     if wide > _MOST_RESPONSE:
         raise MitsimError(
             f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
             f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
         )
-    offsets = maps.offsets()
+    values, errors = maps.offsets()
     least = 1e-12 if stated.bits is None else 1 / maps.offset.size  # one pixel may have another code
-    spatial = float(offsets.values.sum()), max(math.hypot(*offsets.errors), least)
-    transfer = fit(maps.taken, stated.bits, maps.short, spatial)
-    return _Findings(maps.taken, maps, transfer, offsets, spatial).camera(stated)
+    spatial = float(values.sum()), max(math.hypot(*errors), least)
+    return _Findings(maps, fit(maps.taken, stated.bits, maps.short, spatial), spatial).camera(stated)
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
-    """Spatial variances by pixel, row and column, and their standard errors; in the image's unit squared."""
-
-    values: FloatArray
-    errors: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Maps:
+class Maps:
     """Mean images, with defect pixels replaced, and counts of defects.
 
-    `dark` and `bright` tell nonuniformity, `short` the offsets; `excess` (M, N) [DN] is what is gathered in the dark
-    from the set `least` to the set `long`, `contrast` (M, N) [DN] what light makes. `dead`, `hot` and `filled` are parts
-    of the pixels, `beyond` [DN] is the mean excess of hot pixels over that of the others.
+    `dark` and `bright` show nonuniformity, and `short` the offsets. `excess` (M, N) [DN] is gathered in the dark from
+    the set `least` to the set `long`, and `contrast` (M, N) [DN] is made by light. `dead`, `hot` and `filled` are parts
+    of the pixels; `beyond` [DN] is the mean excess of hot pixels over that of the others.
     """
 
     taken: Sequence[Taken]
@@ -178,9 +165,10 @@ class _Maps:
     filled: float
     beyond: float
     uneven: float
+    surface: tuple[float, float, float]
 
     @classmethod
-    def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> _Maps:
+    def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> Maps:
         dark, bright = nonuniform(taken)
         unlit = [index for index, each in enumerate(taken) if not each.light]
         long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
@@ -213,27 +201,29 @@ class _Maps:
             offset, contrast = offset.flat[places], contrast.flat[places]
             excess = None if excess is None else excess.flat[places]
         surface = _surface(contrast)
-        uneven = float(np.ptp(surface) / surface.mean())
+        surface /= surface.mean()
+        uneven, parts = float(np.ptp(surface)), np.zeros(3)
         if uneven > _UNEVEN:
-            contrast = contrast / (surface / surface.mean())
+            contrast = contrast / surface
+            parts = np.roll(_spatial_parts(surface, 0.0, 0.0)[0], -1)
         return cls(
             taken, dark, bright, short, least, long, offset, contrast, excess, float(dead.mean()), float(hot.mean()),
-            float(filled.mean()), beyond, uneven,
+            float(filled.mean()), beyond, uneven, (float(parts[0]), float(parts[1]), float(parts[2])),
         )  # fmt: skip
 
-    def offsets(self) -> _Parts:
+    def offsets(self) -> Parts:
         """Return the spatial variances of the offsets [DN^2], with dark current's part at that exposure."""
         said = self.taken[self.short].said
         return _spatial_parts(self.offset, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count)
 
-    def responses(self) -> _Parts:
+    def responses(self) -> Parts:
         """Return the spatial variances of the responses, over their squared mean."""
         both = [self.taken[index].said for index in (self.bright, self.dark)]
         noise, rows = (
             sum(float(getattr(said.pair, name)) / said.count for said in both) for name in ("variance", "rows")
         )
-        found, mean = _spatial_parts(self.contrast, noise, rows), float(self.contrast.mean())
-        return _Parts(found.values / mean**2, found.errors / mean**2)
+        square = float(self.contrast.mean()) ** 2
+        return _spatial_parts(self.contrast / math.sqrt(square), noise / square, rows / square)
 
 
 def _places(bad: npt.NDArray[np.bool_]) -> Places:
@@ -251,7 +241,7 @@ def _noise_left(taken: Sequence[Taken], index: int) -> float:
     return float(taken[index].said.pair.variance) / taken[index].said.count
 
 
-def _spatial_parts(image: FloatArray, noise: float, rows: float) -> _Parts:
+def _spatial_parts(image: FloatArray, noise: float, rows: float) -> Parts:
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
     rows *= 1 - 1 / m  # of variances about the frame's mean, which hold a row of m less
@@ -266,7 +256,7 @@ def _spatial_parts(image: FloatArray, noise: float, rows: float) -> _Parts:
     errors = np.sqrt(2.0 / np.array([(m - 1) * (n - 1), m - 1, n - 1])) * (
         own / np.array([1.0, n, m]) + np.maximum([0.0, values[1] + rows, values[2]], 0.0)
     )
-    return _Parts(values, errors)
+    return values, errors
 
 
 def _surface(image: FloatArray) -> FloatArray:
@@ -284,10 +274,8 @@ def _surface(image: FloatArray) -> FloatArray:
 class _Findings:
     """All that was measured, as fields of a camera are made of it."""
 
-    taken: Sequence[Taken]
-    maps: _Maps
+    maps: Maps
     transfer: Transfer
-    offsets: _Parts
     spatial: tuple[float, float]
 
     def camera(self, stated: Stated) -> FoundCamera:
@@ -300,8 +288,10 @@ class _Findings:
         found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0], notes)
         found |= self._responses()
         if stated.photons:
-            response = self._response_error()
-            found["quantum_efficiency"] = transfer["response"], response * transfer["response"]
+            # The specimen's pixels are a part of the error.
+            mean = np.maximum(self.maps.responses()[0], 0) / [self.maps.offset.size, *self.maps.offset.shape]
+            error = math.hypot(transfer.error("response"), transfer["response"] * math.sqrt(mean.sum()))
+            found["quantum_efficiency"] = transfer["response"], error
             if transfer["response"] > 1 + _SURE * found["quantum_efficiency"][1]:
                 raise MitsimError(
                     f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
@@ -314,52 +304,40 @@ class _Findings:
             fields["linearity"] = tuple(_short(value) for value in bend)
         if "quantum_efficiency" in fields:
             fields["quantum_efficiency"] = min(fields["quantum_efficiency"], 1.0)
-        fields |= {
-            "name": stated.name,
-            "pixel_pitch_um": stated.pixel_pitch_um,
-            "source": stated.source,
-            "bits": stated.bits,
-        }
+        fields |= {name: getattr(stated, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
         errors = {name: error for name, (_, error) in found.items()}
         if any(bend):
             errors["linearity"] = transfer.error("bend")
-        return FoundCamera(
-            validate(SensorModel, fields, "camera found"), errors, transfer, self.taken,
-            self.maps.uneven, self.maps.filled, tuple(notes),
-        )
+        sensor = validate(SensorModel, fields, "camera found")
+        return FoundCamera(sensor, errors, transfer, self.maps, tuple(notes))
 
     def _noise(self, gain: float, gain_error: float) -> dict[str, tuple[float, float]]:
         """Noise of reading, of which rows share a part, and black level."""
         transfer = self.transfer
         read, error = transfer["read"], transfer.error("read")
-        if min(float(each.said.pair.variance) for each in self.taken if not each.light) < LEAST_DARK:
+        if min(float(each.said.pair.variance) for each in self.maps.taken if not each.light) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide it: an upper limit is known
         rows, row_error = self._rows()
-        shared = rows if rows > _SURE * row_error else 0.0
-        own = math.sqrt(max(read**2 - shared, 0.0))
-        lines = (
-            self.offsets.values[1:] / np.array(self.maps.offset.shape),
-            self.offsets.values[0] / self.maps.offset.size,
+        shared, shared_error = _root(rows, row_error)
+        own = math.sqrt(max(read**2 - shared**2, 0.0))
+        still = math.sqrt(
+            max(float((self.maps.offsets()[0] / [self.maps.offset.size, *self.maps.offset.shape]).sum()), 0)
         )
-        still = math.sqrt(max(float(lines[0].sum() + lines[1]), 0.0))
         own_error = math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
         black, black_error = transfer["black"], math.hypot(transfer.error("black"), still)
-        if black < -_SURE * black_error and max(each.said.cut[0] for each in self.taken if not each.light) > _CUT:
+        if black < -_SURE * black_error and max(each.said.cut[0] for each in self.maps.taken if not each.light) > _CUT:
             raise MitsimError(
-                f"frames: the black level is {black:.3g} +- {black_error:.1g} DN by the frames under light, so that dark "
-                "readings are cut at 0; a camera file states 0 or more; raise the black level (offset, pedestal) of the "
-                "camera, or subtract less from the frames"
+                f"frames: the black level is {black:.3g} +- {black_error:.1g} DN by the frames under light, so that "
+                "dark readings are cut at 0; a camera file states 0 or more; raise the black level (offset, pedestal) "
+                "of the camera, or subtract less from the frames"
             )
-        return {
-            "read_noise_e": (own / gain, own_error / gain),
-            "row_noise_e": (math.sqrt(shared) / gain, _root_error(shared, row_error) / gain),
-            "black_level_dn": (max(black, 0.0), black_error),
-        }  # fmt: skip
+        rest = {"row_noise_e": (shared / gain, shared_error / gain), "black_level_dn": (max(black, 0.0), black_error)}
+        return {"read_noise_e": (own / gain, own_error / gain), **rest}
 
     def _rows(self) -> tuple[float, float]:
         """Variance of the noise that rows share [DN^2], and its standard error, of all sets in the dark."""
         m, n = self.maps.offset.shape
-        pairs = [(each.said.pair, each.said.count) for each in self.taken if not each.light]
+        pairs = [(each.said.pair, each.said.count) for each in self.maps.taken if not each.light]
         values = np.array([float(pair.rows) for pair, _ in pairs])
         middle = max(float(np.median(values)), 0.0)
         errors = np.array([
@@ -370,13 +348,12 @@ class _Findings:
 
     def _dark(self, gain: float, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Dark current, its spread, and hot pixels."""
-        maps, taken = self.maps, self.taken
+        maps, taken = self.maps, self.maps.taken
         mean, error = self.transfer["dark"], self.transfer.error("dark")
-        nothing = (0.0, 0.0)
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if maps.excess is None:
             notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two or more")
-            return dict.fromkeys(names, nothing)
+            return dict.fromkeys(names, (0.0, 0.0))
         seconds = taken[maps.long].exposure_s - taken[maps.least].exposure_s
         unit, count, (m, n) = gain * seconds, maps.excess.size, maps.excess.shape
         if not error:
@@ -390,11 +367,11 @@ class _Findings:
         even = maps.excess - maps.excess.mean(axis=1, keepdims=True)
         variance = float(np.square(even).mean()) * n / (n - 1)
         spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
-        wide = math.sqrt(spread) if spread > _SURE * spread_error and mean > 0 else 0.0
+        wide, wide_error = _root(spread if mean > 0 else 0.0, spread_error)
         counted = sum(gain**2 * beyond * each.exposure_s / each.said.count for each in both)
         hot_error = math.sqrt((variance + counted) / max(maps.hot * count, 1) + rows / m) / unit
         return dict(zip(names, (
-            (max(mean, 0.0), math.hypot(error, wide / math.sqrt(count))), (wide, _root_error(wide**2, spread_error)),
+            (max(mean, 0.0), math.hypot(error, wide / math.sqrt(count))), (wide, wide_error),
             (maps.hot, math.sqrt(max(maps.hot, 1 / count) / count)), (beyond, hot_error if maps.hot else 0.0),
         ), strict=True))  # fmt: skip
 
@@ -407,16 +384,15 @@ class _Findings:
         """
         (seen, seen_error), true, error = self.spatial, self.transfer["spatial"], self.transfer.error("spatial")
         sure = seen > _SURE * seen_error and true > _SURE * error
-        values = self.offsets.values * (true / seen if sure else 0.0)
+        values = self.maps.offsets()[0] * (true / seen if sure else 0.0)
         own = math.sqrt(max(error**2 - seen_error**2, 0.0)) / max(true, 1e-300) if sure else 0.0
         hidden = not sure and error > _HIDES * seen_error
-        errors = np.full(3, error) if hidden else self.offsets.errors * (true / seen if sure else 1.0)
-        values[0] -= (gain * spread * self.taken[self.maps.short].exposure_s) ** 2
+        errors = np.full(3, error) if hidden else self.maps.offsets()[1] * (true / seen if sure else 1.0)
+        values[0] -= (gain * spread * self.maps.taken[self.maps.short].exposure_s) ** 2
         found = {}
         for name, value, each in zip(("pixel", "row", "column"), values, errors, strict=True):
-            each = math.hypot(each, value * own)
-            kept = math.sqrt(value) / gain if value > _SURE * each else 0.0
-            found[f"dsnu_{name}_e"] = kept, math.hypot(_root_error(kept**2, each / gain**2), kept * gain_error)
+            kept, kept_error = _root(value / gain**2, math.hypot(each, value * own) / gain**2)
+            found[f"dsnu_{name}_e"] = kept, math.hypot(kept_error, kept * gain_error)
         if hidden:
             notes.append(
                 "dsnu_*_e are hidden by rounding or by the ADC's end, and taken as 0; dsnu_pixel_e is below "
@@ -426,28 +402,18 @@ class _Findings:
 
     def _responses(self) -> dict[str, tuple[float, float]]:
         """Responses by pixel, row and column, and dead pixels."""
-        found, (b1, b2), full = self.maps.responses(), self.transfer.values[5:7], 1.0
+        (b1, b2), full = self.transfer.values[5:7], 1.0
         if b1 or b2:
-            light = self.transfer["response"] * self.taken[self.maps.bright].light
+            light = self.transfer["response"] * self.maps.taken[self.maps.bright].light
             end = self.transfer.saturation_dn or math.inf
             well = max((end - self.transfer["black"]) / self.transfer["gain"] / (1 + b1 + b2), 1.0)
             x = light / well
             full = (1 + 2 * b1 * x + 3 * b2 * x**2) / (1 + b1 * x + b2 * x**2)
-        numbers = {}
-        for name, value, error in zip(("pixel", "row", "column"), found.values, found.errors, strict=True):
-            kept = math.sqrt(value) / full if value > _SURE * error else 0.0
-            numbers[f"prnu_{name}"] = kept, _root_error(kept**2, error / full**2)
         dead, count = self.maps.dead, self.maps.offset.size
-        numbers["dead_pixels"] = dead, math.sqrt(max(dead, 1 / count) / count)
-        return numbers
-
-    def _response_error(self) -> float:
-        """Relative standard error of the response to light: that of the fit, and of this specimen's pixels."""
-        m, n = self.maps.contrast.shape
-        pixel, row, column = np.maximum(self.maps.responses().values, 0)
-        return math.hypot(
-            self.transfer.error("response") / self.transfer["response"], math.sqrt(pixel / m / n + row / m + column / n)
-        )
+        return {"dead_pixels": (dead, math.sqrt(max(dead, 1 / count) / count))} | {
+            f"prnu_{name}": _root(value / full**2, error / full**2)
+            for name, value, error in zip(("pixel", "row", "column"), *self.maps.responses(), strict=True)
+        }
 
     def _end(self, stated: Stated, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Full well: where frames saturate, or where the ADC does."""
@@ -470,9 +436,10 @@ class _Findings:
         return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 
-def _root_error(square: float, error: float) -> float:
-    """Standard error of the root of a ``square`` that is known with an ``error``; of 0 what it may be at most."""
-    return error / (2 * max(math.sqrt(max(square, 0.0)), math.sqrt(error))) if error > 0 else 0.0
+def _root(square: float, error: float) -> tuple[float, float]:
+    """Return the root of a ``square`` with its standard error; 0 and the largest likely root where it may be chance."""
+    root = math.sqrt(square) if square > _SURE * error else 0.0
+    return root, error / (2 * root) if root else math.sqrt(max(square, 0.0) + error)
 
 
 def _short(value: float) -> float:

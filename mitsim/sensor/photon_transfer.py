@@ -44,8 +44,10 @@ _CUT = 1e-4
 """Part of the numbers at the ADC's end from which a set does not count as below saturation."""
 _STEADY = 1e-5
 """Least relative scatter that a lamp is taken to have: below what means of a million pixels tell."""
+_CHANCE = 1e-3
+"""Significance from which light is off by more than is known."""
 _FITS = 2.0
-"""Chi-square over its degrees of freedom from which light is off by more than is known."""
+"""Chi-square over its degrees of freedom from which other beginnings of the fit are tried."""
 _TELLS = 9.0
 """By how much less chi-square variances must have before they tell a bent camera from a drifting lamp: three standard
 errors."""
@@ -216,7 +218,7 @@ def fit(taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[flo
     """
     problem = _Problem.of(taken, bits, still, spatial)
     steady = problem.begin()
-    if steady.light_fits or steady.lit < 4:
+    if steady.light_fits or len(steady.lights) < 4:
         return steady.transfer("steady")
     bent = problem.solve(bend=True, lamp=problem.lamp)
     explains = bent.light_fits
@@ -232,7 +234,11 @@ def fit(taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[flo
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """What a fit came to: parameters, their covariance, and squares of what is left, of variances and of light."""
+    """Fitted numbers with their covariance, and what is left, in standard errors.
+
+    `left` (2, count) is of means and variances, `lights` (lit sets,) of how far the light is off; the light of sets
+    scatters by a part `lamp`, and by a part `scatter` about the fit.
+    """
 
     problem: _Problem
     values: FloatArray
@@ -240,51 +246,39 @@ class _Solution:
     bend: bool
     lamp: float
     scatter: float
-    rest: FloatArray
+    left: FloatArray
+    lights: FloatArray
     freedom: int
 
     @property
-    def lit(self) -> int:
-        """Lit sets that were used."""
-        return int(np.count_nonzero(self.problem.light))
-
-    @property
     def chi_square(self) -> float:
-        """Of all that is left."""
-        return float(np.square(self.rest).sum())
+        """Return the sum of squares of all that is left."""
+        return float(np.square(self.left).sum() + np.square(self.lights).sum())
 
     @property
     def variance_chi_square(self) -> float:
-        """Of the lit sets' variances."""
-        count = len(self.problem.light)
-        return float(np.square(self.rest[count : 2 * count][self.problem.light > 0]).sum())
-
-    @property
-    def light_chi_square(self) -> float:
-        """Of the lit sets' means, and of how far their light is off."""
-        count = len(self.problem.light)
-        return float(
-            np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
-        )
+        """Return the sum of squares of the lit sets' variances."""
+        return float(np.square(self.left[1, self.problem.light > 0]).sum())
 
     @property
     def worse(self) -> float:
         """Chi-square over its degrees of freedom, of all or of lit sets' variances: readings of one code always fit."""
-        return max(self.chi_square / max(self.freedom, 1), self.variance_chi_square / max(self.lit - 2, 1))
+        return max(self.chi_square / max(self.freedom, 1), self.variance_chi_square / max(len(self.lights) - 2, 1))
 
     @property
     def light_fits(self) -> bool:
-        """Whether light is off by no more than is known."""
-        return self.light_chi_square <= _FITS * max(self.lit - 2, 1)
+        """Return True if light is off by no more than is known."""
+        off = np.square(self.left[0, self.problem.light > 0]).sum() + np.square(self.lights).sum()
+        return bool(off <= scipy.stats.chi2.isf(_CHANCE, max(len(self.lights) - 2, 1)))
 
     def transfer(self, light: Light) -> Transfer:
-        """The camera, under such ``light``."""
+        """Return the camera under such ``light``."""
         problem = self.problem
         found = Transfer(
             self.values, self.covariance * max(self.worse, 1.0), problem.saturation_dn,
             problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full((len(problem.used), 2), np.nan),
         )  # fmt: skip
-        found.off[problem.used] = self.rest[: 2 * len(problem.light)].reshape(2, -1).T
+        found.off[problem.used] = self.left.T
         response = NAMES.index("response")
         found.covariance[response, response] += (found.light_error * found["response"]) ** 2
         return found
@@ -292,14 +286,15 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Sets below saturation, as arrays (count,) each, and where the others say that saturation is."""
+    """Sets below saturation, and where the others say that saturation is.
+
+    `light` and `time` (count,), `measured` means and variances and their `errors` (2, count).
+    """
 
     light: FloatArray
     time: FloatArray
-    mean: FloatArray
-    variance: FloatArray
-    mean_error: FloatArray
-    variance_error: FloatArray
+    measured: FloatArray
+    errors: FloatArray
     still: int
     spatial: tuple[float, float]
     hidden: bool
@@ -312,60 +307,48 @@ class _Problem:
 
     @classmethod
     def of(cls, taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[float, float]) -> _Problem:
-        pairs = [each.said.pair for each in taken]
-        light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
-        mean, variance = (np.array([float(getattr(pair, name)) for pair in pairs]) for name in ("mean", "variance"))
+        said = [each.said for each in taken]
+        light, time = np.array([(each.light, each.exposure_s) for each in taken]).T
+        mean, variance = measured = np.array([(float(each.pair.mean), float(each.pair.variance)) for each in said]).T
+        cut, flicker = np.array([each.cut for each in said]).T, np.array([each.flicker for each in said])
         dark = float(mean[light == 0].min())
         peak, last = saturation_of(taken)
-        used = np.array([each.said.cut[1] < _CUT for each in taken]) | (light == 0)
+        used = (cut[1] < _CUT) | (light == 0)
         if last is not None:
             used &= (light == 0) | (mean - dark <= MOST_FITTED * (mean[peak] - dark))
-        top = math.inf if bits is None else 2.0**bits - 1
         saturation = None if last is None else float(mean[last])
-        lamp = [
-            (each.said.flicker / max(float(each.said.pair.mean) - dark, 1e-9)) ** 2 / each.said.count
-            for each, lit in zip(taken, used & (light > 0), strict=True) if lit
-        ]  # fmt: skip
-        errors = np.array([(each.said.mean_error, each.said.variance_error) for each in taken])
+        lamp = np.square(flicker / np.maximum(mean - dark, 1e-9)) / np.array([each.count for each in said])
+        lit = used & (light > 0)
         # A set without any noise, of which few codes leave nothing, is known to a code's rounding.
         least = 1e-3 if bits is not None else 1e-6 * max(dark, 1.0)
+        errors = np.array([(each.mean_error, each.variance_error) for each in said]).T
         # Moments depend on the offsets where an end of the ADC or its steps hide part of the noise.
-        hidden = bits is not None and (
-            variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100
-        )
         found = cls(
-            light[used], time[used], mean[used], variance[used], np.maximum(errors[used, 0], least / 10),
-            np.maximum(errors[used, 1], least), int(used[:still].sum()), spatial, hidden, bits, saturation,
-            saturation is not None and saturation < top - 1, max(math.sqrt(np.mean(lamp)) if lamp else 0.0, _STEADY),
-            used, np.zeros(len(NAMES)),
+            light[used], time[used], measured[:, used], np.maximum(errors[:, used], [[least / 10], [least]]),
+            int(used[:still].sum()), spatial,
+            bits is not None and (variance.min() < _DITHERED or cut[0].max() > _CUT / 100), bits,
+            saturation, saturation is not None and saturation < (math.inf if bits is None else 2.0**bits - 2),
+            max(math.sqrt(lamp[lit].mean()) if lit.any() else 0.0, _STEADY), used, np.zeros(len(NAMES)),
         )  # fmt: skip
         return replace(found, start=found._start())
 
     def _start(self) -> FloatArray:
-        """Numbers near enough to begin at: lines through what is not cut."""
-        lit = self.light > 0
-        dark = ~lit
-        first = int(np.argmin(np.where(dark, self.time, np.inf)))
-        signal, noise = self.mean[lit], self.variance[lit]
-        if np.count_nonzero(lit) > 1:
-            gain = float(np.polyfit(signal, noise, 1, w=1 / self.variance_error[lit])[0])
-        else:
-            gain = 0.0
+        """Return numbers near enough to begin at: lines through what is not cut."""
+        lit, (mean, variance) = self.light > 0, self.measured
+        first = int(np.argmin(np.where(lit, np.inf, self.time)))
+        signal, noise, times = mean[lit] - mean[first], variance[lit], self.time[~lit]
+        gain = float(np.polyfit(signal, noise, 1, w=1 / self.errors[1, lit])[0]) if lit.sum() > 1 else 0.0
         if not gain > 0:
-            gain = max(float((noise.sum() - self.variance[first]) / max((signal - self.mean[first]).sum(), 1e-9)), 1e-9)
-        response = (
-            float((self.light[lit] * (signal - self.mean[first])).sum() / np.square(self.light[lit]).sum()) / gain
-        )
-        times, current = self.time[dark], 0.0
-        if np.ptp(times) > 0:
-            current = max(float(np.polyfit(times, self.mean[dark], 1)[0]) / gain, 0.0)
-        read = math.sqrt(max(float(self.variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
-        return np.array([gain, read, self.mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
+            gain = max(float((noise.sum() - variance[first]) / max(signal.sum(), 1e-9)), 1e-9)
+        response = float((self.light[lit] * signal).sum() / np.square(self.light[lit]).sum()) / gain
+        current = max(float(np.polyfit(times, mean[~lit], 1)[0]) / gain, 0.0) if np.ptp(times) > 0 else 0.0
+        read = math.sqrt(max(float(variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
+        return np.array([gain, read, mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
 
     def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Return expected means and variances [DN] of all sets, and of the dark set the variance over its pixels."""
         gain, read, black, current, response, *bends = (float(value) for value in values[:-1])
-        gain, spatial = max(gain, 1e-12), float(values[-1])
+        gain, response, spatial = max(abs(gain), 1e-12), abs(response), float(values[-1])
         end = self.saturation_dn if self.saturates else None
         if end is None and self.bits is not None:
             end = 2.0**self.bits - 1
@@ -377,7 +360,7 @@ class _Problem:
                 "full_well_e": full, "linearity": tuple(bends) if math.isfinite(full) else (),
             }
         )  # fmt: skip
-        electrons = np.maximum(response * self.light, 0.0) + np.maximum(current, 0.0) * self.time
+        electrons = response * self.light + np.maximum(current, 0.0) * self.time
         if not self.hidden:
             return *frame_moments(electrons, 0.0, model), spatial
         spread = max(spatial, float(_LEAST_STEPS[-1]))
@@ -387,8 +370,8 @@ class _Problem:
     def begin(self) -> _Solution:
         """The fit of a linear camera, from other numbers too where the first ones lead nowhere: of few codes, variances
         rise and fall with the mean, and several cameras explain them where no dark noise is seen."""
-        found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.variance.min() < HIDDEN
-        for part in _STARTS if self.variance.min() < LEAST_DARK else ():
+        found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.measured[1].min() < HIDDEN
+        for part in _STARTS if self.measured[1].min() < LEAST_DARK else ():
             best = min(found, key=lambda each: each.chi_square)
             if best.worse <= _FITS and not hidden:
                 break
@@ -416,18 +399,16 @@ class _Problem:
         the light follows from what is left of both, so that it is no parameter.
         """
         lit = self.light > 0
-        dark = self.mean[~lit].min(), self.variance[~lit].min()
         # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
-        seen = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
+        seen = np.ptp(self.time[~lit]) > 0 and self.measured[1, ~lit].max() > HIDDEN
         free = np.array([True, True, True, seen, lit.any(), bend, bend, True])
         values = np.where(free | (np.arange(len(NAMES)) != _DARK), self.start, 0.0)
-        errors = np.array([self.mean_error, self.variance_error])
-        by_light = lamp * lit * (np.array([self.mean, self.variance]) - np.array(dark)[:, None]) / errors
+        by_light = lamp * lit * (self.measured - self.measured[:, ~lit].min(axis=1, keepdims=True)) / self.errors
 
         def rest(x: FloatArray) -> FloatArray:
             values[free] = x
             mean, variance, spatial = self.moments(values)
-            left = np.array([self.mean - mean, self.variance - variance]) / errors
+            left = (self.measured - [mean, variance]) / self.errors
             light = (by_light * left).sum(axis=0) / (1 + np.square(by_light).sum(axis=0))
             left -= by_light * light
             return np.concatenate([*left, light[lit], [(self.spatial[0] - spatial) / self.spatial[1]]])
@@ -449,14 +430,14 @@ class _Problem:
         covariance = np.zeros((len(NAMES), len(NAMES)))
         covariance[np.ix_(free, free)] = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
         covariance[np.ix_(free, free)] /= np.outer(size, size)
-        values[1] = abs(values[1])
-        # Means that are off tell of the lamp too: both parts of how far light is off.
+        values[[0, 1, 4]] = np.abs(values[[0, 1, 4]])
         count = len(self.light)
-        left = lamp * solved.fun[2 * count : -1] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
-            self.mean[lit] - values[2], 1e-9
-        )
-        scatter = float(np.sqrt(np.square(left).sum() / max(lit.sum() - 1 - 2 * bend, 1)))
-        return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun[:-1], 2 * count - int(free.sum()) + 1)
+        left, lights = solved.fun[: 2 * count].reshape(2, count), solved.fun[2 * count : -1]
+        # Means that are off show the lamp too: both parts of how far light is off.
+        off = lamp * lights + (left[0] * self.errors[0])[lit] / np.maximum(self.measured[0, lit] - values[2], 1e-9)
+        scatter = float(np.sqrt(np.square(off).sum() / max(lit.sum() - 1 - 2 * bend, 1)))
+        freedom = 2 * count - int(free.sum()) + 1
+        return _Solution(self, values, covariance, bend, lamp, scatter, left, lights, freedom)
 
 
 _BASE = SensorModel(

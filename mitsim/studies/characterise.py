@@ -104,7 +104,7 @@ def characterise_frames(
             taken, lambda index: sets[index].mean_image(), stated,
             lambda places: read_again(listed, places, taken[0].said.shape),
         )  # fmt: skip
-        frames = Frames.as_taken(taken, found.sensor, found.transfer)
+        frames = Frames.as_taken(taken, found)
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)
         return _hold_against(
@@ -122,11 +122,8 @@ def _hold_against(
     spread, figures = emva.figures(draw_sessions(frames, expected)), emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     sensor = frames.sensor
-    names = [
-        name
-        for name in UNITS
-        if name in figures and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")
-    ]
+    names = [name for name in UNITS if name in figures and name in spread]
+    names = [name for name in names if sensor.states_efficiency or name != "quantum_efficiency"]
     rows = tuple(row_of(frames, name, figures[name], spread[name]) for name in names)
     fields = fields_of(found, None if what.get("real") else sensor)
     return Characterisation(

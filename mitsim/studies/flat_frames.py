@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -71,7 +70,9 @@ class FlatSet:
 
     def mean_image(self) -> FloatArray:
         """Return the mean (M, N) [DN] of the frames, which are read again."""
-        total = 0.0 + sum(values.astype(np.float64) for _, values in _numbers(self.flats, self.listed))
+        total = 0.0 + sum(
+            read_image(self.flats.folder / name, self.flats.wanted).astype(np.float64) for name in self.listed.files
+        )
         return np.asarray(total / len(self.listed.files))
 
     @property
@@ -103,10 +104,8 @@ def read_sets(flats: FlatFrames, job: Job) -> list[FlatSet]:
     Cost(memory_bytes=2 * 8 * _FLOATS * math.prod(shape)).check(where, job.limits)
     job.progress("frames", 0.0)
     with job.clock.stage("frames"):
-        sets = [
-            FlatSet(flats, listed, taken)
-            for listed, taken in zip(flats.sets, read_again(flats, None, shape), strict=True)
-        ]
+        taken = read_again(flats, None, shape)
+    sets = [FlatSet(flats, *each) for each in zip(flats.sets, taken, strict=True)]
     _check_twice(where, sets)
     _check_light(where, sets)
     _check_noise(where, sets)
@@ -126,27 +125,21 @@ def read_again(flats: FlatFrames, places: Places | None, shape: tuple[int, int])
     return in_threads(lambda each: _read_set(flats, each, places, shape), flats.sets)
 
 
-def _numbers(flats: FlatFrames, listed: DarkSet) -> Iterator[tuple[Path, npt.NDArray[np.generic]]]:
-    for name in listed.files:
-        yield flats.folder / name, read_image(flats.folder / name, flats.wanted)
-
-
 def _read_set(flats: FlatFrames, listed: DarkSet, places: Places | None, shape: tuple[int, int]) -> Taken:
     facts = flats.listed
     largest = math.inf if facts.bits is None else 2.0**facts.bits - 1
 
     def frames() -> Iterator[npt.NDArray[np.generic]]:
-        for path, values in _numbers(flats, listed):
+        for path in (flats.folder / name for name in listed.files):
+            values = read_image(path, flats.wanted)
             if values.shape != shape:
                 sizes = " and ".join(f"{m} x {n}" for m, n in (shape, values.shape[:2]))
                 raise MitsimError(f"frame {path}: frames have {sizes} pixels; give frames of one size")
             if facts.bits is not None:
                 least, most = float(values.min()), float(values.max())
                 if least < 0 or most > largest:
-                    raise MitsimError(
-                        f"frame {path}: holds {least if least < 0 else most:g}, and numbers of {facts.bits} bits "
-                        f"are 0 to {largest:g}; correct bits"
-                    )
+                    held = f"{least if least < 0 else most:g}, and numbers of {facts.bits} bits are 0 to {largest:g}"
+                    raise MitsimError(f"frame {path}: holds {held}; correct bits")
                 if values.dtype.kind == "f" and np.any(values != np.rint(values)):
                     raise MitsimError(f"frame {path}: holds numbers that are not whole; leave bits out")
             yield values if places is None else values.flat[places]
@@ -189,22 +182,13 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
                 "frames of a set with one exposure, under a steady lamp"
             )
     for each in dark.values():
-        if each.taken.said.flicker > _UNEQUAL * max(brightest - float(each.taken.said.pair.mean), 0.0):
-            raise MitsimError(
-                f"{where}: {each.name} are listed as dark and differ by {each.taken.said.flicker:.3g} DN; cover the "
-                "camera, and take them again"
-            )
-    if all(each.taken.said.cut[1] for each in lit):
-        part = min(each.taken.said.cut[1] for each in lit)
-        raise MitsimError(
-            f"{where}: all sets under light hold saturated numbers, {100 * part:.3g} % of them at least; expose "
-            "some for less"
-        )
-    full = float(sets[saturation_of([each.taken for each in sets])[0]].taken.said.pair.mean)
-    for each in lit:
-        said = each.taken.said
-        if not said.cut[1] and float(said.pair.mean) <= full and not float(said.pair.variance):
-            raise MitsimError(f"{where}: {each.name} show no noise, which is below a code; take them at a higher gain")
+        flicker, room = each.taken.said.flicker, max(brightest - float(each.taken.said.pair.mean), 0.0)
+        if flicker > _UNEQUAL * room:
+            what = f"{each.name} are listed as dark and differ by {flicker:.3g} DN"
+            raise MitsimError(f"{where}: {what}; cover the camera, and take them again")
+    if part := min(each.taken.said.cut[1] for each in lit):
+        what = f"all sets under light hold saturated numbers, {100 * part:.3g} % of them at least"
+        raise MitsimError(f"{where}: {what}; expose some for less")
     for name, response, _ in _responses(sets):
         if not 1 / _SWAPPED < response < _SWAPPED:
             raise MitsimError(
@@ -214,20 +198,24 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
 
 
 def _responses(sets: Sequence[FlatSet]) -> list[tuple[str, float, str]]:
-    """Return the sets whose response to light is not that of the others: name, ratio, and the set they may be of.
+    """Return the sets whose response to light is not that of the others: name, ratio, and which exposure they fit.
 
     Logarithms of responses follow a robust line over light, because a camera bends and a lamp drifts smoothly.
     """
     dark = {each.taken.exposure_s: float(each.taken.said.pair.mean) for each in sets if not each.taken.light}
     peak = sets[saturation_of([each.taken for each in sets])[0]]
-    lit = [(each, float(each.taken.said.pair.mean) - dark[each.taken.exposure_s]) for each in sets if each.taken.light]
     full = float(peak.taken.said.pair.mean) - dark[peak.taken.exposure_s]
-    used = [(each, signal) for each, signal in lit if LINEAR[0] * full < signal < MOST_FITTED * full]
+    lit = [
+        (each.name, each.taken.light, float(each.taken.said.pair.mean) - dark[each.taken.exposure_s])
+        for each in sets if each.taken.light
+    ]  # fmt: skip
+    used = [each for each in lit if LINEAR[0] * full < each[2] < MOST_FITTED * full]
     if len(used) < 3:
         return []
-    names, light = [each.name for each, _ in used], np.array([each.taken.light for each, _ in used])
-    response = np.log([signal / each.taken.light for each, signal in used])
-    slope, level = scipy.stats.theilslopes(response, light)[:2] if np.ptp(light) else (0.0, float(np.median(response)))
+    names, light = [each[0] for each in used], np.array([each[1] for each in used])
+    response = np.log([each[2] for each in used]) - np.log(light)
+    slope = scipy.stats.theilslopes(response, light)[0] if np.ptp(light) else 0.0
+    level = float(np.median(response - slope * light))
     off, about = response - level - slope * light, response - np.median(response)
     limit = max(_SURE * 1.4826 * float(np.median(np.abs(off))), _OUT)
     off = np.where(np.abs(about) > math.log(_SWAPPED), about, np.where(np.abs(off) > limit, off, 0.0))
@@ -235,12 +223,13 @@ def _responses(sets: Sequence[FlatSet]) -> list[tuple[str, float, str]]:
     for index in np.flatnonzero(off):
         apart = np.abs(np.log(light / light[index]) - off[index])
         of = int(apart.argmin())
-        found.append((names[index], math.exp(off[index]), names[of] if of != index and apart[of] < limit else ""))
+        as_of = f", as if they were of the exposure of {names[of]}"
+        found.append((names[index], math.exp(off[index]), as_of if of != index and apart[of] < limit else ""))
     return found
 
 
 def _comb(taken: Sequence[Taken]) -> tuple[float, float, int]:
-    """Return the largest amplitude of a pattern in the codes of a lit set that nothing cuts, its period and that set."""
+    """Return the largest amplitude of a pattern in the codes of lit sets that nothing cuts, its period and the set."""
     dark = min(float(each.said.pair.mean) for each in taken if not each.light)
     full = dark + MOST_FITTED * (float(taken[saturation_of(taken)[0]].said.pair.mean) - dark)
     return max(
@@ -255,8 +244,8 @@ def _check_noise(where: str, sets: Sequence[FlatSet]) -> None:
     amplitude, period, _ = _comb([each.taken for each in sets])
     if amplitude > _SCALED:
         raise MitsimError(
-            f"{where}: all numbers are {period:.3g} apart, so they were scaled after the ADC; divide them by "
-            f"{period:.3g}, and state the bits that are left of {sets[0].flats.listed.bits}"
+            f"{where}: all numbers are {period:.3g} apart, so they were scaled after the ADC, or a bit of it is stuck; "
+            f"divide by {period:.3g}, and state the bits that are left of {sets[0].flats.listed.bits}"
         )
     mixed = float(np.median([max(map(abs, _correlations(each.taken.said))) for each in sets]))
     if mixed > _MIXED:
@@ -278,11 +267,11 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     transfer, size = found.transfer, math.prod(sets[0].taken.said.shape)
     used = [
         (each, off, taken.said)
-        for each, off, taken in zip(sets, transfer.off, found.taken, strict=True) if np.isfinite(off[0])
+        for each, off, taken in zip(sets, transfer.off, found.maps.taken, strict=True) if np.isfinite(off[0])
     ]  # fmt: skip
     widened = math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1))
     smooth, smoothed = max((max(map(abs, _correlations(said))), each.name) for each, _, said in used)
-    amplitude, period, combed = _comb(found.taken)
+    amplitude, period, combed = _comb(found.maps.taken)
     bent, curved = max(
         (abs(off[1]) * said.variance_error / max(float(said.pair.variance), LEAST_DARK), each.name)
         for each, off, said in used if abs(off[1]) > _SURE or each is used[0][0]
@@ -294,7 +283,7 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     noise = math.sqrt(transfer["read"] ** 2 + max(transfer["spatial"], 0.0) + 1 / 12)
     cut = max(said.cut[0] for each, _, said in used if not each.taken.light)
     zero = scipy.special.ndtr((0.5 - transfer["black"]) / noise)
-    dead = found.sensor.dead_pixels
+    dead, filled, uneven = found.sensor.dead_pixels, found.maps.filled, found.maps.uneven
     known = (
         "gain and noise hold; quantum_efficiency, saturation_capacity and linearity are known to that, as their "
         "standard errors say; take the frames again under a steady lamp"
@@ -303,45 +292,37 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
         "undecided": "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts: "
         "linearity, gain, full_well and quantum_efficiency of the camera found have the difference in their standard "
         "errors; take more frames in each set, or measure the lamp at each and list it as light",
-        "drifts": "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not as "
-        f"listed, by {100 * transfer.lamp:.2g} %; {known}",
+        "drifts": "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not "
+        f"as listed, by {100 * transfer.lamp:.2g} %; {known}",
     }.get(transfer.light, f"light scatters by {100 * transfer.lamp:.2g} % about what exposures say; {known}")
+    off_light = 1.0 if transfer.light in ("undecided", "drifts") else transfer.lamp
     table = [
-        (smooth, 0.0,
-         f"noise of neighbouring pixels is correlated by {smooth:.2g} in {smoothed}: frames were compressed, smoothed, "
-         "scaled or demosaiced, and gain and noise are of those pictures, not of the camera; give raw frames"),
-        (amplitude, _COMB,
-         f"codes are missing or too frequent with a period of {period:.3g} DN, by an amplitude of {amplitude:.2g} in "
-         f"{sets[combed].name}: numbers were scaled after the ADC, or a bit of it is stuck; gain, noise, black level and dsnu_* "
-         "are of these numbers, not of the camera; give raw frames"),
-        *((abs(math.log(ratio)), 0.0,
-           f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures"
-           + (f", as if they were of the exposure of {of}" if of else "")
-           + ": sets were exchanged or repeated, or gain or lamp was another one; correct exposure_s, light or files of "
-           "the list, or leave the set out") for name, ratio, of in _responses(sets)),
-        (bent, _STRAIGHT,
-         f"variances do not rise with means as those of counted electrons: {curved} is off by {100 * bent:.0f} %; a "
-         f"gamma curve, compression, missing codes or automatic gain does that; standard errors are widened by "
-         f"{widened:.2g}"),
-        (moved, _STILL,
-         f"dark means do not rise with exposure: {moving} is off by {moved:.2g} DN; the black level or the temperature "
-         "drifts, or frames are listed at another exposure; black_level_dn and dark_current_e_per_s are not to be "
-         f"trusted, standard errors are widened by {widened:.2g}"),
-        (cut - 1.1 * zero, _DARK_CUT,
-         f"{100 * cut:.2g} % of dark readings are 0 DN, and {100 * zero:.2g} % would be if pixels differed as little as "
-         "noise: some pixels have a black level below 0, which moves black_level_dn, read_noise_e and dsnu_*; raise the "
-         "black level of the camera"),
-        (found.filled, 0.0,
-         f"{round(found.filled * size)} hot pixels ({100 * found.filled:.2g} %) are full in the longest dark frames: "
-         "the figures of EMVA 1288 have them, the camera found counts them as hot_pixels with at least "
-         "hot_dark_current_e_per_s, and its other numbers are those of the other pixels"),
-        (dead, _DEAD,
-         f"{100 * dead:.2g} % of the pixels show less than half of the light of most: dead columns, dust, or light that "
-         "does not fill the frame; the camera found counts them as dead_pixels"),
-        (transfer.lamp if transfer.light != "undecided" else 1.0, _STEADY if transfer.light != "drifts" else 0.0, light),
-        (found.uneven, _EVEN,
-         f"light differs by {100 * found.uneven:.0f} % over the frame, and EMVA 1288 allows {100 * _EVEN:.0f} %: the "
-         "figures prnu_* hold it; in the camera found a surface of second degree is taken off"),
+        (smooth, 0.0, f"noise of neighbouring pixels is correlated by {smooth:.2g} in {smoothed}: frames were "
+         "compressed, smoothed, scaled or demosaiced, and gain and noise are of those pictures; give raw frames"),
+        (amplitude, _COMB, f"codes are missing or too frequent with a period of {period:.3g} DN, by an amplitude of "
+         f"{amplitude:.2g} in {sets[combed].name}: numbers were scaled after the ADC, or a bit of it is stuck; gain, "
+         "noise, black level and dsnu_* are of those numbers; give raw frames"),
+        *((1.0, 0.0, f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures{as_of}: sets "
+           "were exchanged or repeated, or gain or lamp was another one; correct exposure_s, light or files of the "
+           "list, or leave the set out") for name, ratio, as_of in _responses(sets)),
+        (bent, _STRAIGHT, f"variances do not rise with means as those of counted electrons: {curved} is off by "
+         f"{100 * bent:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are widened "
+         f"by {widened:.2g}"),
+        (moved, _STILL, f"dark means do not rise with exposure: {moving} is off by {moved:.2g} DN; the black level or "
+         "the temperature drifts, or frames are listed at another exposure; black_level_dn and dark_current_e_per_s "
+         f"are not to be trusted, standard errors are widened by {widened:.2g}"),
+        (cut - 1.1 * zero, _DARK_CUT, f"{100 * cut:.2g} % of dark readings are 0 DN, and {100 * zero:.2g} % would be "
+         "if pixels differed by a normal law: some have a black level below 0, which moves black_level_dn, "
+         "read_noise_e and dsnu_*; raise the black level of the camera"),
+        (filled, 0.0, f"{round(filled * size)} hot pixels ({100 * filled:.2g} %) are full in the longest dark frames: "
+         "the figures of EMVA 1288 have them; in the camera found hot_dark_current_e_per_s is a lower limit, and the "
+         "other numbers are without them"),
+        (dead, _DEAD, f"{100 * dead:.2g} % of the pixels show less than half of the light of most: dead columns, dust, "
+         "or light that does not fill the frame; the camera found counts them as dead_pixels"),
+        (off_light, _STEADY, light),
+        (uneven, _EVEN, f"light differs by {100 * uneven:.0f} % over the frame, and EMVA 1288 allows "
+         f"{100 * _EVEN:.0f} %: the figures prnu_* hold it; in the camera found a surface of second degree is taken "
+         "off"),
     ]  # fmt: skip
     return tuple(line for value, limit, line in table if value > limit)
 

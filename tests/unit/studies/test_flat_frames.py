@@ -170,7 +170,7 @@ NO_CAMERA: dict[str, tuple[dict[str, Any], str]] = {
     "a gamma curve of 8 bits": ({"read": lambda frame: np.rint(gamma(frame) / 16), "bits": 8}, "a gamma curve"),
     "a vignetted lamp": ({"light": vignetted}, "light differs by 33 % over the frame"),
     "colour filters": ({"light": behind_filters}, "give the frames of one colour behind filters"),
-    "shifted numbers": ({"read": lambda frame: 16 * frame, "bits": 16}, "multiples of 16"),
+    "shifted numbers": ({"read": lambda frame: 16 * frame, "bits": 16}, "all numbers are 16 apart"),
 }  # fmt: skip
 
 
