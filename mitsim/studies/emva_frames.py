@@ -293,6 +293,7 @@ def _under_lamp(frames: Frames, pairs: emva.Pair, rng: np.random.Generator) -> e
         for side in (-1, 1)
     ]
     off = each * rng.standard_normal(pairs.mean.shape) + every * rng.standard_normal((_SESSIONS, 1))
+    off = np.maximum(off, -0.9)  # there is some light
     mean, variance = (
         getattr(pairs, name) + off * (getattr(sides[1], name) - getattr(sides[0], name)) / (2 * step)
         for name in ("mean", "variance")

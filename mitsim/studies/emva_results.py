@@ -221,12 +221,12 @@ class Characterisation:
             )
             for row in self.rows
         ]
-        fields = [
+        fields: list[tuple[str, ...]] = [
             (row.name, row.unit, _text(row.set), *_rounded(row), _text(row.deviations, ".1f")) for row in self.fields
         ]
         found = ("found", "std. error", "off by")
         head = ("figure", "symbol", "unit", "camera" if self.real else "set", "expected", *found)
-        of_fields = ("camera found", "unit", "set", *found)
+        of_fields: tuple[str, ...] = ("camera found", "unit", "set", *found)
         if self.real:  # nothing is set
             of_fields, fields = ((*of_fields[:2], *of_fields[3:5]), [(*row[:2], *row[3:5]) for row in fields])
         figure = "the camera has" if self.real else "the one set"

@@ -189,7 +189,7 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
     if part := min(each.taken.said.cut[1] for each in lit):
         what = f"all sets under light hold saturated numbers, {100 * part:.3g} % of them at least"
         raise MitsimError(f"{where}: {what}; expose some for less")
-    for name, response, _ in _responses(sets):
+    for name, response, _ in _responses(sets, [each.taken for each in sets]):
         if not 1 / _SWAPPED < response < _SWAPPED:
             raise MitsimError(
                 f"{where}: {name} are {response:.3g} times as bright as most sets are at their exposures; correct "
@@ -197,23 +197,21 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
             )
 
 
-def _responses(sets: Sequence[FlatSet]) -> list[tuple[str, float, str]]:
+def _responses(sets: Sequence[FlatSet], taken: Sequence[Taken]) -> list[tuple[str, float, str]]:
     """Return the sets whose response to light is not that of the others: name, ratio, and which exposure they fit.
 
     Logarithms of responses follow a robust line over light, because a camera bends and a lamp drifts smoothly.
     """
-    dark = {each.taken.exposure_s: float(each.taken.said.pair.mean) for each in sets if not each.taken.light}
-    peak = sets[saturation_of([each.taken for each in sets])[0]]
-    full = float(peak.taken.said.pair.mean) - dark[peak.taken.exposure_s]
-    lit = [
-        (each.name, each.taken.light, float(each.taken.said.pair.mean) - dark[each.taken.exposure_s])
-        for each in sets if each.taken.light
-    ]  # fmt: skip
-    used = [each for each in lit if LINEAR[0] * full < each[2] < MOST_FITTED * full]
-    if len(used) < 3:
+    dark = {each.exposure_s: float(each.said.pair.mean) for each in taken if not each.light}
+    signals = np.array([float(each.said.pair.mean) - dark[each.exposure_s] for each in taken])
+    light = np.array([each.light for each in taken])
+    full = np.max(signals, where=np.array([not each.said.cut[1] for each in taken]), initial=0.0)
+    used = (light > 0) & (signals > LINEAR[0] * full) & (signals < LINEAR[1] * full)
+    used |= (signals >= LINEAR[1] * full) & (light < np.max(light, where=used, initial=0.0) * LINEAR[1])
+    if used.sum() < 3:
         return []
-    names, light = [each[0] for each in used], np.array([each[1] for each in used])
-    response = np.log([each[2] for each in used]) - np.log(light)
+    names, light = [each.name for each, use in zip(sets, used, strict=True) if use], light[used]
+    response = np.log(signals[used] / light)
     slope = scipy.stats.theilslopes(response, light)[0] if np.ptp(light) else 0.0
     level = float(np.median(response - slope * light))
     off, about = response - level - slope * light, response - np.median(response)
@@ -304,7 +302,7 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
          "noise, black level and dsnu_* are of those numbers; give raw frames"),
         *((1.0, 0.0, f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures{as_of}: sets "
            "were exchanged or repeated, or gain or lamp was another one; correct exposure_s, light or files of the "
-           "list, or leave the set out") for name, ratio, as_of in _responses(sets)),
+           "list, or leave the set out") for name, ratio, as_of in _responses(sets, found.maps.taken)),
         (bent, _STRAIGHT, f"variances do not rise with means as those of counted electrons: {curved} is off by "
          f"{100 * bent:.0f} %; a gamma curve, compression or automatic gain does that; standard errors are widened "
          f"by {widened:.2g}"),
