@@ -181,7 +181,7 @@ class Maps:
         dead = contrast < _DEAD * middle if 10 * noise < middle else np.zeros(contrast.shape, bool)
         longest = images(long)
         middle, full = float(np.median(longest)), float(taken[saturation_of(taken)[0]].said.pair.mean)
-        filled = hot = longest > middle + _FILLED * (full - middle)
+        filled, hot = longest > middle + _FILLED * (full - middle), np.zeros(contrast.shape, bool)
         excess, beyond = None, 0.0
         if taken[long].exposure_s > taken[least].exposure_s:
             excess = longest - (offset if least == short else images(least))
@@ -191,9 +191,9 @@ class Maps:
             wide = max(wide, _ROBUST * float(np.median(np.abs(excess - middle))), 1e-9)
             if float(taken[least].said.pair.variance) < LEAST_DARK:
                 wide = max(wide, _ROUNDED)
-            hot = hot | (excess > middle + _HOT * wide)
+            hot = excess > middle + _HOT * wide
             beyond = float(excess[hot].mean() - excess[~hot].mean()) if hot.any() else 0.0
-        dead &= ~hot
+        dead = (dead | filled) & ~hot  # pixels that are full at every exposure show no light
         bad = dead | hot
         if bad.any():
             places = _places(bad)

@@ -109,6 +109,12 @@ def read_sets(flats: FlatFrames, job: Job) -> list[FlatSet]:
     _check_twice(where, sets)
     _check_light(where, sets)
     _check_noise(where, sets)
+    for name, response, _ in _responses(sets, [each.taken for each in sets]):
+        if not 1 / _SWAPPED < response < _SWAPPED:
+            raise MitsimError(
+                f"{where}: {name} are {response:.3g} times as bright as most sets are at their exposures; correct "
+                "exposure_s, light or files of the list"
+            )
     return sets
 
 
@@ -189,12 +195,6 @@ def _check_light(where: str, sets: Sequence[FlatSet]) -> None:
     if part := min(each.taken.said.cut[1] for each in lit):
         what = f"all sets under light hold saturated numbers, {100 * part:.3g} % of them at least"
         raise MitsimError(f"{where}: {what}; expose some for less")
-    for name, response, _ in _responses(sets, [each.taken for each in sets]):
-        if not 1 / _SWAPPED < response < _SWAPPED:
-            raise MitsimError(
-                f"{where}: {name} are {response:.3g} times as bright as most sets are at their exposures; correct "
-                "exposure_s, light or files of the list"
-            )
 
 
 def _responses(sets: Sequence[FlatSet], taken: Sequence[Taken]) -> list[tuple[str, float, str]]:
@@ -297,7 +297,7 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     table = [
         (smooth, 0.0, f"noise of neighbouring pixels is correlated by {smooth:.2g} in {smoothed}: frames were "
          "compressed, smoothed, scaled or demosaiced, and gain and noise are of those pictures; give raw frames"),
-        (amplitude, _COMB, f"codes are missing or too frequent with a period of {period:.3g} DN, by an amplitude of "
+        (amplitude, _COMB, f"codes are missing or too frequent with a period of {period:.2g} DN, by an amplitude of "
          f"{amplitude:.2g} in {sets[combed].name}: numbers were scaled after the ADC, or a bit of it is stuck; gain, "
          "noise, black level and dsnu_* are of those numbers; give raw frames"),
         *((1.0, 0.0, f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures{as_of}: sets "
@@ -313,8 +313,8 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
          "if pixels differed by a normal law: some have a black level below 0, which moves black_level_dn, "
          "read_noise_e and dsnu_*; raise the black level of the camera"),
         (filled, 0.0, f"{round(filled * size)} hot pixels ({100 * filled:.2g} %) are full in the longest dark frames: "
-         "the figures of EMVA 1288 have them; in the camera found hot_dark_current_e_per_s is a lower limit, and the "
-         "other numbers are without them"),
+         "the figures of EMVA 1288 have them; in the camera found they count as hot_pixels, with at least "
+         "hot_dark_current_e_per_s, or as dead_pixels if full at every exposure, and are in no other number"),
         (dead, _DEAD, f"{100 * dead:.2g} % of the pixels show less than half of the light of most: dead columns, dust, "
          "or light that does not fill the frame; the camera found counts them as dead_pixels"),
         (off_light, _STEADY, light),
