@@ -164,10 +164,7 @@ class Frames:
         job.progress("frames", 0.0)
         with job.clock.stage("frames"):
             said = in_threads(lambda index: emva.alike(self.images(index, places), largest), range(len(self.light)))
-        return [
-            Taken(float(light), float(time), each)
-            for light, time, each in zip(self.light, self.exposure_s, said, strict=True)
-        ]
+        return [Taken(*each) for each in zip(self.light.tolist(), self.exposure_s.tolist(), said, strict=True)]
 
     def session(self, taken: list[Taken]) -> Session:
         """The statistics of sets that were ``taken``, for figures."""
@@ -287,7 +284,7 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
 def _under_lamp(frames: Frames, pairs: emva.Pair, rng: np.random.Generator) -> emva.Pair:
     """Drawn ``pairs`` (sessions, S) of sets whose light is off, each by its part and all by another."""
     each, every = frames.lamp
-    step = max(frames.lamp)
+    step = min(max(frames.lamp), 0.5)
     sides = [
         emva.pairs_of([frames._expected_pair(index, 1 + side * step) for index in range(len(frames.light))])
         for side in (-1, 1)

@@ -161,9 +161,8 @@ class Characterisation:
             noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
             black = sensor.superpixel_black_level_dn
             why = f"a black level of {black:.3g} DN and rounding to whole DN hide part of a noise of {noise:.2g} DN"
-            off.insert(
-                0, f"the procedure does not find {of}, but {found}: {why}; raise black_level_dn or gain_dn_per_e"
-            )
+            what = f"the procedure does not find {of}, but {found}"
+            off.insert(0, f"{what}: {why}; raise black_level_dn or gain_dn_per_e")
         return (*self.about, *off)
 
     def payload(self) -> dict[str, Any]:
