@@ -106,7 +106,7 @@ def find_camera(
 ) -> FoundCamera:
     """Find the camera that explains frames.
 
-    Hot and dead pixels are counted, and then read as other pixels of their row, so that they are in no other number.
+    Hot and dead pixels are counted, and then read as other pixels, so that they are in no other number.
 
     Parameters
     ----------
@@ -169,6 +169,7 @@ class Maps:
 
     @classmethod
     def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> Maps:
+        """Find the defects of sets that were ``taken``, and replace them; arguments are those of `find_camera`."""
         dark, bright = nonuniform(taken)
         unlit = [index for index, each in enumerate(taken) if not each.light]
         long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
@@ -227,12 +228,9 @@ class Maps:
 
 
 def _places(bad: npt.NDArray[np.bool_]) -> Places:
-    """Return for each of the ``bad`` pixels (M, N) a good one of its row, if there is one, drawn by chance."""
-    rng, (m, n) = np.random.default_rng(0), bad.shape
-    places, everywhere = np.arange(m * n).reshape(m, n), np.flatnonzero(~bad)
-    for row in np.flatnonzero(bad.any(axis=1)):
-        good = row * n + np.flatnonzero(~bad[row])
-        places[row, bad[row]] = rng.choice(good if good.size else everywhere, np.count_nonzero(bad[row]))
+    """Return for each of the ``bad`` pixels (M, N) a good one anywhere, drawn by chance: rows gain no common noise."""
+    places = np.arange(bad.size).reshape(bad.shape)
+    places[bad] = np.random.default_rng(0).choice(np.flatnonzero(~bad), np.count_nonzero(bad))
     return places
 
 
@@ -344,7 +342,8 @@ class _Findings:
             math.sqrt(2 / m / (count - 1)) * ((float(pair.variance) - middle) / n + middle) for pair, count in pairs
         ])  # fmt: skip
         weight = 1 / np.maximum(errors, 1e-12) ** 2
-        return float((values * weight).sum() / weight.sum()), float(weight.sum() ** -0.5)
+        share = (1 - self.maps.hot - self.maps.dead) ** 2  # the others were read in other rows
+        return float((values * weight).sum() / weight.sum() / share), float(weight.sum() ** -0.5 / share)
 
     def _dark(self, gain: float, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Dark current, its spread, and hot pixels."""

@@ -215,13 +215,13 @@ class Characterisation:
                 row.unit,
                 _text(row.set),
                 _text(row.expected),
-                *_rounded(row),
+                *_digits(row),
                 _text(row.deviations, ".1f"),
             )
             for row in self.rows
         ]
         fields: list[tuple[str, ...]] = [
-            (row.name, row.unit, _text(row.set), *_rounded(row), _text(row.deviations, ".1f")) for row in self.fields
+            (row.name, row.unit, _text(row.set), *_digits(row), _text(row.deviations, ".1f")) for row in self.fields
         ]
         found = ("found", "std. error", "off by")
         head = ("figure", "symbol", "unit", "camera" if self.real else "set", "expected", *found)
@@ -253,7 +253,7 @@ class Characterisation:
         return [*lines, "", *text_table(camera.head, camera.rows), *camera.notes]
 
 
-def _rounded(row: Row | FieldRow) -> tuple[str, str]:
+def _digits(row: Row | FieldRow) -> tuple[str, str]:
     """Return the number found and its standard error, to the digits that are known."""
     return round_to_error(row.found, row.standard_error), round_to_error(row.standard_error, row.standard_error)
 
