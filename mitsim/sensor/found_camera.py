@@ -169,7 +169,13 @@ class Maps:
 
     @classmethod
     def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> Maps:
-        """Find the defects of sets that were ``taken``, and replace them; arguments are those of `find_camera`."""
+        """Find the defects, and replace them.
+
+        Parameters
+        ----------
+        taken, images, again
+            as :func:`find_camera` takes them.
+        """
         dark, bright = nonuniform(taken)
         unlit = [index for index, each in enumerate(taken) if not each.light]
         long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
