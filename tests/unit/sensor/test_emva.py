@@ -125,7 +125,7 @@ def test_linearity_is_the_least_and_the_largest_relative_deviation() -> None:
 def test_missing_codes_make_a_pattern_of_known_amplitude() -> None:
     """floor(1.5 n) leaves two of three codes, of amplitude |1 + w| / 2 = 1/2; bit 2 at 0 one of 1 / (4 sin(pi/8)).
 
-    (Planted: codes folded at 2^15 + 1, where a period of 8 DN is none.)
+    (Planted: the power of the pattern in place of its amplitude.)
     """
     noisy = [np.rint(np.random.default_rng(k).normal(1000, 12, (64, 64))) for k in range(2)]
     assert alike(noisy, 4095).comb[0] < 6 / 64

@@ -185,7 +185,7 @@ def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_i
 def test_rounding_shows_offsets_by_its_slope() -> None:
     """Of noise s [DN] at a code's middle, the slope of mean readings is 1 - 2 exp(-2 pi^2 s^2) + 2 exp(-8 pi^2 s^2).
 
-    (Planted: weights of the nodes not normalised; the variance of single nodes in place of that between them.)
+    (Planted: all nodes with the same weight.)
     """
     model = sensor(bits=8, gain_dn_per_e=0.02, read_noise_e=12.0, black_level_dn=5.0, full_well_e=11_000.0)
     wave = [math.exp(-2 * (math.pi * k * 0.24) ** 2) for k in (1, 2)]

@@ -222,8 +222,7 @@ def test_numbers_that_no_camera_reads_are_flagged_with_what_is_wrong(name: str, 
 def test_sets_and_hot_pixels_are_named_and_good_frames_are_not(tmp_path: Path) -> None:
     """Neighbouring sets exchanged, each named with the exposure that it fits; hot pixels that are full in the dark.
 
-    (Planted: responses compared with their median, not robustly: nothing is named; hot pixels left in the statistics:
-    the black level is 60 errors off.)
+    (Planted: hot pixels left in the statistics.)
     """
     folder = write_flats(tmp_path / "a", camera("saturating ADC"), side=64, steps=10, stack=4)
     assert not characterise_frames(load_flats(folder)).about
@@ -258,7 +257,7 @@ def test_offsets_that_rounding_hides_are_found_or_said_to_be_hidden(
 ) -> None:
     """Of 8 bits, offsets of 4 e- are 0.08 DN: mean readings show a third to twice of them, or half where cut at 0.
 
-    (Planted: the fit's variance of offsets replaced by that of mean readings: 40 errors off.)
+    (Planted: the fit's variance of offsets replaced by that of mean readings.)
     """
     few = {"bits": 8, "full_well_e": 11_000.0, "gain_dn_per_e": 0.02, "dsnu_pixel_e": 4.0}
     model = camera("plain").model_copy(
