@@ -124,7 +124,8 @@ def _hold_against(
     sensor = frames.sensor
     names = [name for name in UNITS if name in figures and name in spread]
     names = [name for name in names if sensor.states_efficiency or name != "quantum_efficiency"]
-    rows = tuple(row_of(frames, name, figures[name], spread[name]) for name in names)
+    bend = found.transfer.error("bend") if what.get("real") else 0.0  # what is expected is then known to that
+    rows = tuple(row_of(frames, name, figures[name], spread[name], bend) for name in names)
     fields = fields_of(found, None if what.get("real") else sensor)
     return Characterisation(
         frames=frames, session=session, expected=expected, rows=rows, found=found, fields=fields, output=output, **what

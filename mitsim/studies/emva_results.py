@@ -289,7 +289,7 @@ def _set(frames: Frames, name: str) -> float:
     }[name]
 
 
-def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> Row:
+def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
     """A figure as it is shown.
 
     Parameters
@@ -302,6 +302,8 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
         the figure.
     sessions
         (count,) the same of drawn sessions, which tell its error.
+    bend
+        standard error of the linearity that is expected.
     """
     sensor = frames.sensor
     value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
@@ -313,6 +315,7 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
     method |= abs(bias) > _BIASED
     if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
         bias = 0.0  # it is found as the standard's limit, as it should be
+    spread = math.hypot(spread, bend if name.startswith("linearity") else 0.0)
     if name == "saturation_capacity":
         spread = math.hypot(spread, frames.step / math.sqrt(12))
     against = centre if method else given
