@@ -20,7 +20,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.field_docs import toml_value
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.emva import LEAST_DARK
-from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform
+from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform, saturation_of
 
 _DEAD = 0.5
 """Response over the median one below which a pixel is dead."""
@@ -38,12 +38,20 @@ _ROBUST = 1.4826
 _ROUNDED = 12**-0.5
 """Standard deviation of what rounding takes off a mean [DN], where no noise dithers it."""
 _CUT = 1e-3
-"""Part of dark readings that are 0 from which their spread is not that of offsets."""
+"""Part of dark readings that are 0 from which the black level is told by lit frames."""
+_FILLED = 0.9
+"""Part of the brightest mean from which a hot pixel is full."""
+_HIDES = 2.0
+"""Error of the offsets over that of what is seen of them from which they count as hidden."""
 _MOST_RESPONSE = 0.1
 """Largest relative spread of responses that a camera file states."""
 
 Images = Callable[[int], FloatArray]
 """Mean image (M, N) [DN] of the set of an index."""
+Parts = tuple[FloatArray, FloatArray]
+"""Spatial variances by pixel, row and column, and their standard errors; in the image's unit squared."""
+Places = npt.NDArray[np.intp]
+"""(M, N) flat index of the pixel that is read in place of each pixel."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +78,8 @@ class FoundCamera:
         standard error of each field that was measured, by name.
     transfer
         the fit of means and variances.
-    uneven
-        part of the light by which it differs over the frame.
+    maps
+        mean images, and the sets with other pixels in place of defects.
     notes
         what the frames do not tell.
     """
@@ -79,7 +87,7 @@ class FoundCamera:
     sensor: SensorModel
     errors: dict[str, float]
     transfer: Transfer = field(repr=False)
-    uneven: float
+    maps: Maps = field(repr=False)
     notes: tuple[str, ...]
 
     def toml(self) -> str:
@@ -93,8 +101,12 @@ class FoundCamera:
         return "\n".join(lines) + "\n"
 
 
-def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> FoundCamera:
-    """The camera that explains frames.
+def find_camera(
+    taken: Sequence[Taken], images: Images, stated: Stated, again: Callable[[Places], Sequence[Taken]]
+) -> FoundCamera:
+    """Find the camera that explains frames.
+
+    Hot and dead pixels are counted, and then read as other pixels, so that they are in no other number.
 
     Parameters
     ----------
@@ -104,122 +116,128 @@ def find_camera(taken: Sequence[Taken], images: Images, stated: Stated) -> Found
         their mean images.
     stated
         what frames do not tell.
+    again
+        statistics of the same sets, with some pixels replaced.
 
     Raises
     ------
     MitsimError
         for light that is far from even, and where no camera file can state what was found.
     """
-    maps = _Maps.of(taken, images)
+    maps = Maps.of(taken, images, again)
     if maps.uneven > _MOST_UNEVEN:
         raise MitsimError(
             f"light differs by {100 * maps.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
             "possible; move the lamp away, or cut frames to what it lights evenly"
         )
-    wide = math.sqrt(max(*maps.responses().values, 0.0))
+    wide = math.sqrt(max(*maps.responses()[0], 0.0))
     if wide > _MOST_RESPONSE:
         raise MitsimError(
             f"responses of pixels differ by {100 * wide:.0f} %, and a camera file states at most "
             f"{100 * _MOST_RESPONSE:.0f} %; give the frames of one colour behind filters, and light that is even"
         )
-    dead, offsets = float(maps.dead.mean()), maps.offsets()
-    transfer = fit(taken, stated.bits, dead, math.sqrt(max(maps.offset_spread, 0.0)))
-    return _Findings(taken, maps, transfer, offsets, dead).camera(stated)
+    values, errors = maps.offsets()
+    least = 1e-12 if stated.bits is None else 1 / maps.offset.size  # one pixel may have another code
+    spatial = float(values.sum()), max(math.hypot(*errors), least)
+    return _Findings(maps, fit(maps.taken, stated.bits, maps.short, spatial), spatial).camera(stated)
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
-    """Spatial variances by pixel, row and column, and their standard errors; in the image's unit squared."""
+class Maps:
+    """Mean images, with defect pixels replaced, and counts of defects.
 
-    values: FloatArray
-    errors: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Maps:
-    """Mean images and what is amiss in them.
-
-    `dark` and `bright` tell nonuniformity, `long` is the longest in the dark; `dead` and `hot` (M, N) are defects,
-    `excess` (M, N) [DN] what is gathered in the dark over `seconds`, `contrast` (M, N) [DN] what light makes.
+    `dark` and `bright` show nonuniformity, and `short` the offsets. `excess` (M, N) [DN] is gathered in the dark from
+    the set `least` to the set `long`, and `contrast` (M, N) [DN] is made by light. `dead`, `hot` and `filled` are parts
+    of the pixels; `beyond` [DN] is the mean excess of hot pixels over that of the others.
     """
 
     taken: Sequence[Taken]
     dark: int
     bright: int
     short: int
+    least: int
     long: int
     offset: FloatArray
     contrast: FloatArray
     excess: FloatArray | None
-    dead: npt.NDArray[np.bool_]
-    hot: npt.NDArray[np.bool_]
+    dead: float
+    hot: float
+    filled: float
+    beyond: float
     uneven: float
+    surface: tuple[float, float, float]
 
     @classmethod
-    def of(cls, taken: Sequence[Taken], images: Images) -> _Maps:
+    def of(cls, taken: Sequence[Taken], images: Images, again: Callable[[Places], Sequence[Taken]]) -> Maps:
+        """Find the defects, and replace them.
+
+        Parameters
+        ----------
+        taken, images, again
+            as :func:`find_camera` takes them.
+        """
         dark, bright = nonuniform(taken)
         unlit = [index for index, each in enumerate(taken) if not each.light]
         long = max(unlit, key=lambda index: (taken[index].exposure_s, taken[index].said.count))
+        least = min(unlit, key=lambda index: (taken[index].exposure_s, -taken[index].said.count))
         short = max(unlit, key=lambda index: (taken[index].said.count, -taken[index].exposure_s))
         offset = images(short)
         contrast = images(bright) - (offset if dark == short else images(dark))
         middle = float(np.median(contrast))
         noise = math.sqrt(_noise_left(taken, bright) + _noise_left(taken, dark))
         dead = contrast < _DEAD * middle if 10 * noise < middle else np.zeros(contrast.shape, bool)
-        hot, excess = np.zeros(contrast.shape, bool), None
-        if taken[long].exposure_s > taken[short].exposure_s:
-            excess = images(long) - offset
+        longest = images(long)
+        middle, full = float(np.median(longest)), float(taken[saturation_of(taken)[0]].said.pair.mean)
+        filled, hot = longest > middle + _FILLED * (full - middle), np.zeros(contrast.shape, bool)
+        excess, beyond = None, 0.0
+        if taken[long].exposure_s > taken[least].exposure_s:
+            excess = longest - (offset if least == short else images(least))
             middle = float(np.median(excess))
-            wide = _ROBUST * float(np.median(np.abs(excess - middle)))
             # Of few codes most readings are one number: noise is then what is left of it.
-            wide = max(wide, math.sqrt(_noise_left(taken, long) + _noise_left(taken, short)), 1e-9)
-            if float(taken[short].said.pair.variance) < LEAST_DARK:
+            wide = math.sqrt(_noise_left(taken, long) + _noise_left(taken, least))
+            wide = max(wide, _ROBUST * float(np.median(np.abs(excess - middle))), 1e-9)
+            if float(taken[least].said.pair.variance) < LEAST_DARK:
                 wide = max(wide, _ROUNDED)
             hot = excess > middle + _HOT * wide
-        surface = _surface(np.where(dead, middle_of(contrast, dead), contrast))
-        uneven = float(np.ptp(surface) / surface.mean())
+            beyond = float(excess[hot].mean() - excess[~hot].mean()) if hot.any() else 0.0
+        dead = (dead | filled) & ~hot  # pixels that are full at every exposure show no light
+        bad = dead | hot
+        if bad.any():
+            places = _places(bad)
+            taken = again(places)
+            offset, contrast = offset.flat[places], contrast.flat[places]
+            excess = None if excess is None else excess.flat[places]
+        surface = _surface(contrast)
+        surface /= surface.mean()
+        uneven, parts = float(np.ptp(surface)), np.zeros(3)
         if uneven > _UNEVEN:
-            contrast = contrast / (surface / surface.mean())
-        return cls(taken, dark, bright, short, long, offset, contrast, excess, dead, hot, uneven)
+            contrast = contrast / surface
+            parts = np.roll(_spatial_parts(surface, 0.0, 0.0)[0], -1)
+        return cls(
+            taken, dark, bright, short, least, long, offset, contrast, excess, float(dead.mean()), float(hot.mean()),
+            float(filled.mean()), beyond, uneven, (float(parts[0]), float(parts[1]), float(parts[2])),
+        )  # fmt: skip
 
-    def offsets(self) -> _Parts:
-        """Of the offsets [DN^2], dark current's part at that exposure among them."""
+    def offsets(self) -> Parts:
+        """Return the spatial variances of the offsets [DN^2], with dark current's part at that exposure."""
         said = self.taken[self.short].said
-        return _spatial_parts(
-            self.offset, self.dead | self.hot, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count
+        return _spatial_parts(self.offset, _noise_left(self.taken, self.short), float(said.pair.rows) / said.count)
+
+    def responses(self) -> Parts:
+        """Return the spatial variances of the responses, over their squared mean."""
+        both = [self.taken[index].said for index in (self.bright, self.dark)]
+        noise, rows = (
+            sum(float(getattr(said.pair, name)) / said.count for said in both) for name in ("variance", "rows")
         )
-
-    def responses(self) -> _Parts:
-        """Of the responses, over their mean."""
-        noise = _noise_left(self.taken, self.bright) + _noise_left(self.taken, self.dark)
-        rows = sum(
-            float(self.taken[index].said.pair.rows) / self.taken[index].said.count for index in (self.bright, self.dark)
-        )
-        found = _spatial_parts(self.contrast, self.dead | self.hot, noise, rows)
-        mean = float(self.contrast[~(self.dead | self.hot)].mean())
-        return _Parts(found.values / mean**2, found.errors / mean**2)
-
-    @property
-    def offset_spread(self) -> float:
-        """Variance of the offsets [DN^2]: of dark frames; where those are cut at 0, of the darkest ones under light,
-        if that is no chance."""
-        if self.taken[self.short].said.cut[0] < _CUT:
-            return float(self.offsets().values.sum())
-        lit = [each for each in self.taken if each.light and not any(each.said.cut)]
-        if not lit:
-            return float(self.offsets().values.sum())
-        darkest = min(lit, key=lambda each: float(each.said.pair.mean))
-        signal = float(darkest.said.pair.mean) - float(self.taken[self.short].said.pair.mean)
-        dead = float(self.dead.mean())
-        response = float(self.responses().values.sum()) + dead * (1 - dead)
-        found = float(darkest.said.stack.total) - response * signal**2
-        error = math.sqrt(2 / self.offset.size) * float(darkest.said.pair.variance) / darkest.said.count
-        return found if found > _SURE * error else 0.0
+        square = float(self.contrast.mean()) ** 2
+        return _spatial_parts(self.contrast / math.sqrt(square), noise / square, rows / square)
 
 
-def middle_of(image: FloatArray, without: npt.NDArray[np.bool_]) -> float:
-    """Mean of an ``image`` (M, N) ``without`` some pixels (M, N)."""
-    return float(image[~without].mean())
+def _places(bad: npt.NDArray[np.bool_]) -> Places:
+    """Return for each of the ``bad`` pixels (M, N) a good one anywhere, drawn by chance: rows gain no common noise."""
+    places = np.arange(bad.size).reshape(bad.shape)
+    places[bad] = np.random.default_rng(0).choice(np.flatnonzero(~bad), np.count_nonzero(bad))
+    return places
 
 
 def _noise_left(taken: Sequence[Taken], index: int) -> float:
@@ -227,12 +245,12 @@ def _noise_left(taken: Sequence[Taken], index: int) -> float:
     return float(taken[index].said.pair.variance) / taken[index].said.count
 
 
-def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: float, rows: float) -> _Parts:
+def _spatial_parts(image: FloatArray, noise: float, rows: float) -> Parts:
     """Spatial variances of an ``image`` (M, N) [DN], in which ``noise`` is left, of which rows share a part."""
     m, n = image.shape
     rows *= 1 - 1 / m  # of variances about the frame's mean, which hold a row of m less
-    about = np.where(without, 0.0, image - middle_of(image, without))
-    total = float(np.square(about).sum()) / (max(int(np.count_nonzero(~without)), 2) - 1) - noise
+    about = image - image.mean()
+    total = float(np.square(about).sum()) / (m * n - 1) - noise
     row, column = (float(np.square(about.mean(axis=k)).mean()) for k in (1, 0))
     row -= (noise - rows) / n + rows
     column -= (noise - rows) / m
@@ -242,7 +260,7 @@ def _spatial_parts(image: FloatArray, without: npt.NDArray[np.bool_], noise: flo
     errors = np.sqrt(2.0 / np.array([(m - 1) * (n - 1), m - 1, n - 1])) * (
         own / np.array([1.0, n, m]) + np.maximum([0.0, values[1] + rows, values[2]], 0.0)
     )
-    return _Parts(values, errors)
+    return values, errors
 
 
 def _surface(image: FloatArray) -> FloatArray:
@@ -260,11 +278,9 @@ def _surface(image: FloatArray) -> FloatArray:
 class _Findings:
     """All that was measured, as fields of a camera are made of it."""
 
-    taken: Sequence[Taken]
-    maps: _Maps
+    maps: Maps
     transfer: Transfer
-    offsets: _Parts
-    dead: float
+    spatial: tuple[float, float]
 
     def camera(self, stated: Stated) -> FoundCamera:
         """The camera, of what was ``stated`` and measured."""
@@ -273,11 +289,13 @@ class _Findings:
         found: dict[str, tuple[float, float]] = {"gain_dn_per_e": (gain, gain * gain_error)}
         found |= self._noise(gain, gain_error)
         found |= self._dark(gain, notes)
-        found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0])
+        found |= self._offsets(gain, gain_error, found["dark_current_spread_e_per_s"][0], notes)
         found |= self._responses()
         if stated.photons:
-            response = self._response_error()
-            found["quantum_efficiency"] = transfer["response"], response * transfer["response"]
+            # The specimen's pixels are a part of the error.
+            mean = np.maximum(self.maps.responses()[0], 0) / [self.maps.offset.size, *self.maps.offset.shape]
+            error = math.hypot(transfer.error("response"), transfer["response"] * math.sqrt(mean.sum()))
+            found["quantum_efficiency"] = transfer["response"], error
             if transfer["response"] > 1 + _SURE * found["quantum_efficiency"][1]:
                 raise MitsimError(
                     f"photons_per_s: light makes {transfer['response']:.3g} electrons a photon; at most 1 is possible, "
@@ -290,124 +308,117 @@ class _Findings:
             fields["linearity"] = tuple(_short(value) for value in bend)
         if "quantum_efficiency" in fields:
             fields["quantum_efficiency"] = min(fields["quantum_efficiency"], 1.0)
-        fields |= {
-            "name": stated.name,
-            "pixel_pitch_um": stated.pixel_pitch_um,
-            "source": stated.source,
-            "bits": stated.bits,
-        }
+        fields |= {name: getattr(stated, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
         errors = {name: error for name, (_, error) in found.items()}
         if any(bend):
             errors["linearity"] = transfer.error("bend")
-        return FoundCamera(
-            validate(SensorModel, fields, "camera found"), errors, transfer, self.maps.uneven, tuple(notes)
-        )
+        sensor = validate(SensorModel, fields, "camera found")
+        return FoundCamera(sensor, errors, transfer, self.maps, tuple(notes))
 
     def _noise(self, gain: float, gain_error: float) -> dict[str, tuple[float, float]]:
         """Noise of reading, of which rows share a part, and black level."""
         transfer = self.transfer
         read, error = transfer["read"], transfer.error("read")
-        if min(float(each.said.pair.variance) for each in self.taken if not each.light) < LEAST_DARK:
+        if min(float(each.said.pair.variance) for each in self.maps.taken if not each.light) < LEAST_DARK:
             error = max(error, math.sqrt(LEAST_DARK - 1 / 12) - read)  # few codes hide it: an upper limit is known
         rows, row_error = self._rows()
-        shared = rows if rows > _SURE * row_error else 0.0
-        own = math.sqrt(max(read**2 - shared, 0.0))
-        lines = (
-            self.offsets.values[1:] / np.array(self.maps.offset.shape),
-            self.offsets.values[0] / self.maps.offset.size,
+        shared, shared_error = _root(rows, row_error)
+        own = math.sqrt(max(read**2 - shared**2, 0.0))
+        still = math.sqrt(
+            max(float((self.maps.offsets()[0] / [self.maps.offset.size, *self.maps.offset.shape]).sum()), 0)
         )
-        still = math.sqrt(max(float(lines[0].sum() + lines[1]), 0.0))
         own_error = math.hypot(error, own * gain_error, row_error / max(2 * own, 1e-9) if shared else 0.0)
-        return {
-            "read_noise_e": (own / gain, own_error / gain),
-            "row_noise_e": (math.sqrt(shared) / gain, _root_error(shared, row_error) / gain),
-            "black_level_dn": (max(transfer["black"], 0.0), math.hypot(transfer.error("black"), still)),
-        }  # fmt: skip
+        black, black_error = transfer["black"], math.hypot(transfer.error("black"), still)
+        if black < -_SURE * black_error and max(each.said.cut[0] for each in self.maps.taken if not each.light) > _CUT:
+            raise MitsimError(
+                f"frames: the black level is {black:.3g} +- {black_error:.1g} DN by the frames under light, so that "
+                "dark readings are cut at 0; a camera file states 0 or more; raise the black level (offset, pedestal) "
+                "of the camera, or subtract less from the frames"
+            )
+        rest = {"row_noise_e": (shared / gain, shared_error / gain), "black_level_dn": (max(black, 0.0), black_error)}
+        return {"read_noise_e": (own / gain, own_error / gain), **rest}
 
     def _rows(self) -> tuple[float, float]:
         """Variance of the noise that rows share [DN^2], and its standard error, of all sets in the dark."""
         m, n = self.maps.offset.shape
-        pairs = [(each.said.pair, each.said.count) for each in self.taken if not each.light]
+        pairs = [(each.said.pair, each.said.count) for each in self.maps.taken if not each.light]
         values = np.array([float(pair.rows) for pair, _ in pairs])
         middle = max(float(np.median(values)), 0.0)
         errors = np.array([
             math.sqrt(2 / m / (count - 1)) * ((float(pair.variance) - middle) / n + middle) for pair, count in pairs
         ])  # fmt: skip
         weight = 1 / np.maximum(errors, 1e-12) ** 2
-        return float((values * weight).sum() / weight.sum()), float(weight.sum() ** -0.5)
+        share = (1 - self.maps.hot - self.maps.dead) ** 2  # the others were read in other rows
+        return float((values * weight).sum() / weight.sum() / share), float(weight.sum() ** -0.5 / share)
 
     def _dark(self, gain: float, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Dark current, its spread, and hot pixels."""
-        maps, taken = self.maps, self.taken
+        maps, taken = self.maps, self.maps.taken
         mean, error = self.transfer["dark"], self.transfer.error("dark")
-        nothing = (0.0, 0.0)
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if maps.excess is None:
             notes.append("dark current is not told by dark frames of one exposure, and taken as 0; take two or more")
-            return dict.fromkeys(names, nothing)
-        seconds = taken[maps.long].exposure_s - taken[maps.short].exposure_s
-        unit, count = gain * seconds, maps.excess.size
+            return dict.fromkeys(names, (0.0, 0.0))
+        seconds = taken[maps.long].exposure_s - taken[maps.least].exposure_s
+        unit, count, (m, n) = gain * seconds, maps.excess.size, maps.excess.shape
         if not error:
             error = 0.5 / unit
             notes.append(f"dark current is hidden by rounding, and taken as 0; it is below {error:.2g} e-/s")
-        cool, (m, n) = ~maps.hot, maps.excess.shape
-        middle, part = float(maps.excess[cool].mean()), float(maps.hot.mean())
-        beyond = max(float(maps.excess[maps.hot].mean()) - middle, 0.0) / unit if part else 0.0
-        both = taken[maps.long], taken[maps.short]
+        beyond = max(maps.beyond, 0.0) / unit
+        both = taken[maps.long], taken[maps.least]
         # As in `_spatial_parts`.
         rows = sum(max(float(each.said.pair.rows), 0.0) / each.said.count for each in both) * (1 - 1 / m)
-        # Counts of hot pixels are in the noise of all, and none of those that are compared is hot.
-        theirs = [gain**2 * beyond * each.exposure_s / each.said.count for each in both]
-        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.short) - rows - part * sum(theirs)
-        even = np.where(cool, maps.excess - middle, 0.0)
-        even -= even.mean(axis=1, keepdims=True)
-        variance = float(np.square(even[cool]).mean()) * n / (n - 1)
-        error_of_noise = math.hypot(math.sqrt(2 / count) * variance, math.sqrt(2 * part / count) * sum(theirs))
-        spread, spread_error = (variance - noise) / unit**2, error_of_noise / unit**2
-        base = mean - part * beyond
-        wide = math.sqrt(spread) if spread > _SURE * spread_error and base > 0 else 0.0
-        hot_error = math.sqrt((variance + sum(theirs)) / max(part * count, 1) + rows / m) / unit
-        base_error = math.hypot(error, wide / math.sqrt(count), part * hot_error)
+        noise = _noise_left(taken, maps.long) + _noise_left(taken, maps.least) - rows
+        even = maps.excess - maps.excess.mean(axis=1, keepdims=True)
+        variance = float(np.square(even).mean()) * n / (n - 1)
+        spread, spread_error = (variance - noise) / unit**2, math.sqrt(2 / count) * variance / unit**2
+        wide, wide_error = _root(spread if mean > 0 else 0.0, spread_error)
+        counted = sum(gain**2 * beyond * each.exposure_s / each.said.count for each in both)
+        hot_error = math.sqrt((variance + counted) / max(maps.hot * count, 1) + rows / m) / unit
         return dict(zip(names, (
-            (max(base, 0.0), base_error), (wide, _root_error(wide**2, spread_error)),
-            (part, math.sqrt(max(part, 1 / count) / count)), (beyond, hot_error if part else 0.0),
+            (max(mean, 0.0), math.hypot(error, wide / math.sqrt(count))), (wide, wide_error),
+            (maps.hot, math.sqrt(max(maps.hot, 1 / count) / count)), (beyond, hot_error if maps.hot else 0.0),
         ), strict=True))  # fmt: skip
 
-    def _offsets(self, gain: float, gain_error: float, spread: float) -> dict[str, tuple[float, float]]:
-        """Offsets by pixel, row and column [e-]."""
-        values, errors = self.offsets.values.copy(), self.offsets.errors
-        values[0] -= (gain * spread * self.taken[self.maps.short].exposure_s) ** 2
-        wider = self.maps.offset_spread / values.sum() if values.sum() > 0 else 1.0
-        scale = wider if self.taken[self.maps.short].said.cut[0] >= _CUT and wider > 1 else 1.0
+    def _offsets(
+        self, gain: float, gain_error: float, spread: float, notes: list[str]
+    ) -> dict[str, tuple[float, float]]:
+        """Return the offsets by pixel, row and column [e-].
+
+        Rounding and the ADC's end change the spread of mean readings; the fit gives that of the offsets.
+        """
+        (seen, seen_error), true, error = self.spatial, self.transfer["spatial"], self.transfer.error("spatial")
+        sure = seen > _SURE * seen_error and true > _SURE * error
+        values = self.maps.offsets()[0] * (true / seen if sure else 0.0)
+        own = math.sqrt(max(error**2 - seen_error**2, 0.0)) / max(true, 1e-300) if sure else 0.0
+        hidden = not sure and error > _HIDES * seen_error
+        errors = np.full(3, error) if hidden else self.maps.offsets()[1] * (true / seen if sure else 1.0)
+        values[0] -= (gain * spread * self.maps.taken[self.maps.short].exposure_s) ** 2
         found = {}
-        for name, value, error in zip(("pixel", "row", "column"), values * scale, errors * scale, strict=True):
-            kept = math.sqrt(value) / gain if value > _SURE * error else 0.0
-            found[f"dsnu_{name}_e"] = kept, math.hypot(_root_error(kept**2, error / gain**2), kept * gain_error)
+        for name, value, each in zip(("pixel", "row", "column"), values, errors, strict=True):
+            kept, kept_error = _root(value / gain**2, math.hypot(each, value * own) / gain**2)
+            found[f"dsnu_{name}_e"] = kept, math.hypot(kept_error, kept * gain_error)
+        if hidden:
+            notes.append(
+                "dsnu_*_e are hidden by rounding or by the ADC's end, and taken as 0; dsnu_pixel_e is below "
+                f"{found['dsnu_pixel_e'][1]:.2g} e-"
+            )
         return found
 
     def _responses(self) -> dict[str, tuple[float, float]]:
         """Responses by pixel, row and column, and dead pixels."""
-        found, (b1, b2), full = self.maps.responses(), self.transfer.values[5:], 1.0
+        (b1, b2), full = self.transfer.values[5:7], 1.0
         if b1 or b2:
-            light = self.transfer["response"] * self.taken[self.maps.bright].light
+            light = self.transfer["response"] * self.maps.taken[self.maps.bright].light
             end = self.transfer.saturation_dn or math.inf
             well = max((end - self.transfer["black"]) / self.transfer["gain"] / (1 + b1 + b2), 1.0)
             x = light / well
             full = (1 + 2 * b1 * x + 3 * b2 * x**2) / (1 + b1 * x + b2 * x**2)
-        numbers = {}
-        for name, value, error in zip(("pixel", "row", "column"), found.values, found.errors, strict=True):
-            kept = math.sqrt(value) / full if value > _SURE * error else 0.0
-            numbers[f"prnu_{name}"] = kept, _root_error(kept**2, error / full**2)
-        numbers["dead_pixels"] = self.dead, math.sqrt(max(self.dead, 1 / self.maps.dead.size) / self.maps.dead.size)
-        return numbers
-
-    def _response_error(self) -> float:
-        """Relative standard error of the response to light: that of the fit, and of this specimen's pixels."""
-        m, n = self.maps.contrast.shape
-        pixel, row, column = np.maximum(self.maps.responses().values, 0)
-        return math.hypot(
-            self.transfer.error("response") / self.transfer["response"], math.sqrt(pixel / m / n + row / m + column / n)
-        )
+        dead, count = self.maps.dead, self.maps.offset.size
+        return {"dead_pixels": (dead, math.sqrt(max(dead, 1 / count) / count))} | {
+            f"prnu_{name}": _root(value / full**2, error / full**2)
+            for name, value, error in zip(("pixel", "row", "column"), *self.maps.responses(), strict=True)
+        }
 
     def _end(self, stated: Stated, notes: list[str]) -> dict[str, tuple[float, float]]:
         """Full well: where frames saturate, or where the ADC does."""
@@ -426,13 +437,14 @@ class _Findings:
         if transfer.saturation_dn is None:
             return {"full_well_e": (full, 0.0)}  # what is not told has no error
         # By gain, black level and both bends (`photon_transfer.NAMES`), whose errors are not independent.
-        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent])
+        slopes = np.array([1 / transfer["gain"], 0, 1 / (end - transfer["black"]), 0, 0, 1 / bent, 1 / bent, 0])
         return {"full_well_e": (full, full * math.sqrt(slopes @ transfer.covariance @ slopes))}
 
 
-def _root_error(square: float, error: float) -> float:
-    """Standard error of the root of a ``square`` that is known with an ``error``; of 0 what it may be at most."""
-    return error / (2 * max(math.sqrt(max(square, 0.0)), math.sqrt(error))) if error > 0 else 0.0
+def _root(square: float, error: float) -> tuple[float, float]:
+    """Return the root of a ``square`` with its standard error; 0 and the largest likely root where it may be chance."""
+    root = math.sqrt(square) if square > _SURE * error else 0.0
+    return root, error / (2 * root) if root else math.sqrt(max(square, 0.0) + error)
 
 
 def _short(value: float) -> float:

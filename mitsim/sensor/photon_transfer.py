@@ -13,27 +13,29 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import scipy
 
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.sensor import SensorModel
-from mitsim.sensor.emva import HIDDEN, MOST_FITTED, Alike
+from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
-NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2")
-"""What is fitted: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
-unit of light, and the first two coefficients of linearity."""
-_STEPS = (1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0)
-"""Steps by which slopes are found, as parts of a number: where moments change by some of their errors."""
-_LEAST_STEPS = (0.0, 1e-3, 1e-2, 1e-4, 0.0, 1e-3, 1e-3)
-"""The same in the number's unit, at least: also where it is 0."""
+NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2", "spatial")
+"""Fitted numbers: K [DN/e-], noise of reading [DN], black level [DN], dark electrons a second, photoelectrons for a
+unit of light, the first two coefficients of linearity, and the variance of the pixels' offsets [DN^2]."""
+_DARK = NAMES.index("dark")
+_STEPS = np.array([1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-2])
+"""Relative steps of the numerical derivatives, which change moments by some of their errors."""
+_LEAST_STEPS = np.array([1e-15, 1e-3, 1e-2, 1e-4, 1e-15, 1e-3, 1e-3, 1e-5])
+"""Least steps in each number's unit, for numbers near 0."""
 _STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
 """Parts of the gain that straight lines give: rounding of next to no noise makes variances too large, up to twice."""
 _TRIED, _SOLVED = 10, 25
 """Evaluations in which another beginning must be better, and those of a solution; chosen: a camera of 8 bits that no
 numbers fit takes 10 s."""
-_DITHERED = 0.64
-"""Variance [DN^2] below which rounding moves it: of 0.8 DN, as `mitsim.sensor.moments` has it."""
+_DITHERED = 0.44
+"""Variance [DN^2] below which rounding moves means: noise of 0.6 DN, which leaves 2e-3 of an offset's error."""
 _HALF = 0.5
 """Codes to which an offset is known whatever the noise hides."""
 _NODES = 9
@@ -42,8 +44,10 @@ _CUT = 1e-4
 """Part of the numbers at the ADC's end from which a set does not count as below saturation."""
 _STEADY = 1e-5
 """Least relative scatter that a lamp is taken to have: below what means of a million pixels tell."""
+_CHANCE = 1e-3
+"""Significance from which light is off by more than is known."""
 _FITS = 2.0
-"""Chi-square over its degrees of freedom from which light is off by more than is known."""
+"""Chi-square over its degrees of freedom from which other beginnings of the fit are tried."""
 _TELLS = 9.0
 """By how much less chi-square variances must have before they tell a bent camera from a drifting lamp: three standard
 errors."""
@@ -82,7 +86,7 @@ class Transfer:
     Attributes
     ----------
     values, covariance
-        (7,) by :data:`NAMES`, and (7, 7) of their errors; 0: not fitted.
+        (8,) by :data:`NAMES`, and (8, 8) of their errors; 0: not fitted.
     saturation_dn
         mean of saturated frames; None where no frame is.
     saturates
@@ -169,8 +173,39 @@ def nonuniform(taken: Sequence[Taken]) -> tuple[int, int]:
 # ---- the fit ---------------------------------------------------------------------------------------------------------
 
 
-def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: float = 0.0) -> Transfer:
-    """The camera that explains the ``taken`` sets.
+def average_moments(
+    electrons: npt.ArrayLike, exposure_s: float, model: SensorModel, spread: float, response: float = 0.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean and variance [DN] of pixels that differ, and the variance over pixels of their means.
+
+    An offset acts as another black level. The average over a normal law is a Gauss and Hermite sum, with one node for
+    offset and response: offsets matter in the dark, responses at saturation, and in between moments are straight.
+
+    Parameters
+    ----------
+    electrons
+        (...) expected photoelectrons.
+    exposure_s, model
+        time, and a sensor whose pixels are alike.
+    spread, response
+        standard deviations of the offsets [DN], and of the responses over their mean.
+    """
+    light = np.asarray(electrons, dtype=np.float64)
+    if not spread and not response:
+        return *frame_moments(light, exposure_s, model), np.zeros(light.shape)
+    places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+    lit = np.multiply.outer(np.maximum(1 + response * places, 0.0), light)
+    models = [model.model_copy(update={"black_level_dn": model.black_level_dn + place * spread}) for place in places]
+    found = [frame_moments(*each) for each in zip(lit, [exposure_s] * _NODES, models, strict=True)] if spread else [
+        frame_moments(lit, exposure_s, model)
+    ]  # fmt: skip
+    means, noises = (np.reshape(part, lit.shape) for part in zip(*found, strict=True))
+    mean, noise = (np.average(part, axis=0, weights=weights) for part in (means, noises))
+    return mean, noise, np.average(np.square(means - mean), axis=0, weights=weights)
+
+
+def fit(taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[float, float]) -> Transfer:
+    """Fit a camera to the ``taken`` sets.
 
     Parameters
     ----------
@@ -178,14 +213,12 @@ def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: flo
         sets of frames, a dark one among them.
     bits
         of the ADC; None: real numbers.
-    dead
-        part of the pixels that do not respond.
-    spread
-        standard deviation of the pixels' offsets [DN].
+    still, spatial
+        a dark set, and the variance over pixels of its mean image [DN^2] with its standard error.
     """
-    problem = _Problem.of(taken, bits, dead, spread)
+    problem = _Problem.of(taken, bits, still, spatial)
     steady = problem.begin()
-    if steady.light_fits or steady.lit < 4:
+    if steady.light_fits or len(steady.lights) < 4:
         return steady.transfer("steady")
     bent = problem.solve(bend=True, lamp=problem.lamp)
     explains = bent.light_fits
@@ -201,7 +234,11 @@ def fit(taken: Sequence[Taken], bits: int | None, dead: float = 0.0, spread: flo
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """What a fit came to: parameters, their covariance, and squares of what is left, of variances and of light."""
+    """Fitted numbers with their covariance, and what is left, in standard errors.
+
+    `left` (2, count) is of means and variances, `lights` (lit sets,) of how far the light is off; the light of sets
+    scatters by a part `lamp`, and by a part `scatter` about the fit.
+    """
 
     problem: _Problem
     values: FloatArray
@@ -209,51 +246,39 @@ class _Solution:
     bend: bool
     lamp: float
     scatter: float
-    rest: FloatArray
+    left: FloatArray
+    lights: FloatArray
     freedom: int
 
     @property
-    def lit(self) -> int:
-        """Lit sets that were used."""
-        return int(np.count_nonzero(self.problem.light))
-
-    @property
     def chi_square(self) -> float:
-        """Of all that is left."""
-        return float(np.square(self.rest).sum())
+        """Return the sum of squares of all that is left."""
+        return float(np.square(self.left).sum() + np.square(self.lights).sum())
 
     @property
     def variance_chi_square(self) -> float:
-        """Of the lit sets' variances."""
-        count = len(self.problem.light)
-        return float(np.square(self.rest[count : 2 * count][self.problem.light > 0]).sum())
-
-    @property
-    def light_chi_square(self) -> float:
-        """Of the lit sets' means, and of how far their light is off."""
-        count = len(self.problem.light)
-        return float(
-            np.square(self.rest[:count][self.problem.light > 0]).sum() + np.square(self.rest[2 * count :]).sum()
-        )
+        """Return the sum of squares of the lit sets' variances."""
+        return float(np.square(self.left[1, self.problem.light > 0]).sum())
 
     @property
     def worse(self) -> float:
         """Chi-square over its degrees of freedom, of all or of lit sets' variances: readings of one code always fit."""
-        return max(self.chi_square / max(self.freedom, 1), self.variance_chi_square / max(self.lit - 2, 1))
+        return max(self.chi_square / max(self.freedom, 1), self.variance_chi_square / max(len(self.lights) - 2, 1))
 
     @property
     def light_fits(self) -> bool:
-        """Whether light is off by no more than is known."""
-        return self.light_chi_square <= _FITS * max(self.lit - 2, 1)
+        """Return True if light is off by no more than is known."""
+        off = np.square(self.left[0, self.problem.light > 0]).sum() + np.square(self.lights).sum()
+        return bool(off <= scipy.stats.chi2.isf(_CHANCE, max(len(self.lights) - 2, 1)))
 
     def transfer(self, light: Light) -> Transfer:
-        """The camera, under such ``light``."""
+        """Return the camera under such ``light``."""
         problem = self.problem
         found = Transfer(
             self.values, self.covariance * max(self.worse, 1.0), problem.saturation_dn,
             problem.saturates, self.lamp, light, self.chi_square, self.freedom, np.full((len(problem.used), 2), np.nan),
         )  # fmt: skip
-        found.off[problem.used] = self.rest[: 2 * len(problem.light)].reshape(2, -1).T
+        found.off[problem.used] = self.left.T
         response = NAMES.index("response")
         found.covariance[response, response] += (found.light_error * found["response"]) ** 2
         return found
@@ -261,16 +286,18 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Sets below saturation, as arrays (count,) each, and where the others say that saturation is."""
+    """Sets below saturation, and where the others say that saturation is.
+
+    `light` and `time` (count,), `measured` means and variances and their `errors` (2, count).
+    """
 
     light: FloatArray
     time: FloatArray
-    mean: FloatArray
-    variance: FloatArray
-    mean_error: FloatArray
-    variance_error: FloatArray
-    spread: float
-    dead: float
+    measured: FloatArray
+    errors: FloatArray
+    still: int
+    spatial: tuple[float, float]
+    hidden: bool
     bits: int | None
     saturation_dn: float | None
     saturates: bool
@@ -279,61 +306,49 @@ class _Problem:
     start: FloatArray
 
     @classmethod
-    def of(cls, taken: Sequence[Taken], bits: int | None, dead: float, spread: float) -> _Problem:
-        pairs = [each.said.pair for each in taken]
-        light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
-        mean, variance = (np.array([float(getattr(pair, name)) for pair in pairs]) for name in ("mean", "variance"))
+    def of(cls, taken: Sequence[Taken], bits: int | None, still: int, spatial: tuple[float, float]) -> _Problem:
+        said = [each.said for each in taken]
+        light, time = np.array([(each.light, each.exposure_s) for each in taken]).T
+        mean, variance = measured = np.array([(float(each.pair.mean), float(each.pair.variance)) for each in said]).T
+        cut, flicker = np.array([each.cut for each in said]).T, np.array([each.flicker for each in said])
         dark = float(mean[light == 0].min())
         peak, last = saturation_of(taken)
-        used = np.array([each.said.cut[1] < _CUT for each in taken]) | (light == 0)
+        used = (cut[1] < _CUT) | (light == 0)
         if last is not None:
             used &= (light == 0) | (mean - dark <= MOST_FITTED * (mean[peak] - dark))
-        top = math.inf if bits is None else 2.0**bits - 1
-        saturation = None if last is None else float(mean[last] - dead * dark) / (1 - dead)
-        lamp = [
-            (each.said.flicker / max(float(each.said.pair.mean) - dark, 1e-9)) ** 2 / each.said.count
-            for each, lit in zip(taken, used & (light > 0), strict=True) if lit
-        ]  # fmt: skip
-        errors = np.array([(each.said.mean_error, each.said.variance_error) for each in taken])
+        saturation = None if last is None else float(mean[last])
+        lamp = np.square(flicker / np.maximum(mean - dark, 1e-9)) / np.array([each.count for each in said])
+        lit = used & (light > 0)
         # A set without any noise, of which few codes leave nothing, is known to a code's rounding.
         least = 1e-3 if bits is not None else 1e-6 * max(dark, 1.0)
-        # Offsets matter where an end of the ADC or its steps hide part of the noise: elsewhere moments are straight.
-        hidden = bits is not None and (
-            variance.min() < _DITHERED or max(each.said.cut[0] for each in taken) > _CUT / 100
-        )
+        errors = np.array([(each.mean_error, each.variance_error) for each in said]).T
+        # Moments depend on the offsets where an end of the ADC or its steps hide part of the noise.
         found = cls(
-            light[used], time[used], mean[used], variance[used], np.maximum(errors[used, 0], least / 10),
-            np.maximum(errors[used, 1], least), spread if hidden else 0.0, dead, bits, saturation,
-            saturation is not None and saturation < top - 1, max(math.sqrt(np.mean(lamp)) if lamp else 0.0, _STEADY),
-            used, np.zeros(len(NAMES)),
+            light[used], time[used], measured[:, used], np.maximum(errors[:, used], [[least / 10], [least]]),
+            int(used[:still].sum()), spatial,
+            bits is not None and (variance.min() < _DITHERED or cut[0].max() > _CUT / 100), bits,
+            saturation, saturation is not None and saturation < (math.inf if bits is None else 2.0**bits - 2),
+            max(math.sqrt(lamp[lit].mean()) if lit.any() else 0.0, _STEADY), used, np.zeros(len(NAMES)),
         )  # fmt: skip
         return replace(found, start=found._start())
 
     def _start(self) -> FloatArray:
-        """Numbers near enough to begin at: lines through what is not cut."""
-        lit = self.light > 0
-        dark = ~lit
-        first = int(np.argmin(np.where(dark, self.time, np.inf)))
-        signal, noise = self.mean[lit], self.variance[lit]
-        if np.count_nonzero(lit) > 1:
-            gain = float(np.polyfit(signal, noise, 1, w=1 / self.variance_error[lit])[0])
-        else:
-            gain = 0.0
+        """Return numbers near enough to begin at: lines through what is not cut."""
+        lit, (mean, variance) = self.light > 0, self.measured
+        first = int(np.argmin(np.where(lit, np.inf, self.time)))
+        signal, noise, times = mean[lit] - mean[first], variance[lit], self.time[~lit]
+        gain = float(np.polyfit(signal, noise, 1, w=1 / self.errors[1, lit])[0]) if lit.sum() > 1 else 0.0
         if not gain > 0:
-            gain = max(float((noise.sum() - self.variance[first]) / max((signal - self.mean[first]).sum(), 1e-9)), 1e-9)
-        response = (
-            float((self.light[lit] * (signal - self.mean[first])).sum() / np.square(self.light[lit]).sum()) / gain
-        )
-        times, current = self.time[dark], 0.0
-        if np.ptp(times) > 0:
-            current = max(float(np.polyfit(times, self.mean[dark], 1)[0]) / gain, 0.0)
-        read = math.sqrt(max(float(self.variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
-        return np.array([gain, read, self.mean[first], current, max(response, 1e-12), 0.0, 0.0])
+            gain = max(float((noise.sum() - variance[first]) / max(signal.sum(), 1e-9)), 1e-9)
+        response = float((self.light[lit] * signal).sum() / np.square(self.light[lit]).sum()) / gain
+        current = max(float(np.polyfit(times, mean[~lit], 1)[0]) / gain, 0.0) if np.ptp(times) > 0 else 0.0
+        read = math.sqrt(max(float(variance[first]) - current * times.min() * gain**2 - 1 / 12, 0.01))
+        return np.array([gain, read, mean[first], current, max(response, 1e-12), 0.0, 0.0, self.spatial[0]])
 
-    def moments(self, values: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Expected means and variances [DN], averaged over the pixels, of light ``scale`` times that stated."""
-        gain, read, black, current, response, *bends = (float(value) for value in values)
-        gain = max(gain, 1e-12)
+    def moments(self, values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return expected means and variances [DN] of all sets, and of the dark set the variance over its pixels."""
+        gain, read, black, current, response, *bends = (float(value) for value in values[:-1])
+        gain, response, spatial = max(abs(gain), 1e-12), abs(response), float(values[-1])
         end = self.saturation_dn if self.saturates else None
         if end is None and self.bits is not None:
             end = 2.0**self.bits - 1
@@ -345,35 +360,22 @@ class _Problem:
                 "full_well_e": full, "linearity": tuple(bends) if math.isfinite(full) else (),
             }
         )  # fmt: skip
-        leak = np.maximum(current, 0.0) * self.time
-        lit, noise = self._average(np.maximum(response * self.light * scale, 0.0) + leak, model)
-        if not self.dead:
-            return lit, noise
-        still, rest = self._average(leak, model)
-        return (1 - self.dead) * lit + self.dead * still, (1 - self.dead) * noise + self.dead * rest
-
-    def _average(self, electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-        """Moments of pixels whose offsets are spread: an offset is another black level."""
-        if not self.spread:
-            return frame_moments(electrons, 0.0, model)
-        places, weights = np.polynomial.hermite_e.hermegauss(_NODES)
-        mean, variance = np.zeros_like(electrons), np.zeros_like(electrons)
-        for place, weight in zip(places, weights / weights.sum(), strict=True):
-            moved = model.model_copy(update={"black_level_dn": model.black_level_dn + place * self.spread})
-            first, second = frame_moments(electrons, 0.0, moved)
-            mean += weight * first
-            variance += weight * second
-        return mean, variance
+        electrons = response * self.light + np.maximum(current, 0.0) * self.time
+        if not self.hidden:
+            return *frame_moments(electrons, 0.0, model), spatial
+        spread = max(spatial, float(_LEAST_STEPS[-1]))
+        mean, noise, between = average_moments(electrons, 0.0, model, math.sqrt(spread))
+        return mean, noise, float(between[self.still]) * spatial / spread
 
     def begin(self) -> _Solution:
         """The fit of a linear camera, from other numbers too where the first ones lead nowhere: of few codes, variances
         rise and fall with the mean, and several cameras explain them where no dark noise is seen."""
-        found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.variance.min() < HIDDEN
-        for part in _STARTS if self.variance.min() < _DITHERED else ():
+        found, hidden = [self.solve(bend=False, lamp=self.lamp)], self.measured[1].min() < HIDDEN
+        for part in _STARTS if self.measured[1].min() < LEAST_DARK else ():
             best = min(found, key=lambda each: each.chi_square)
             if best.worse <= _FITS and not hidden:
                 break
-            start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0]
+            start = self.start * [part, 0.5, 1.0, 0.0, 1 / part, 0.0, 0.0, 1.0]
             found.append(replace(self, start=start).solve(bend=False, lamp=self.lamp, most=_TRIED))
             if found[-1].chi_square < best.chi_square:
                 found.append(replace(self, start=found[-1].values).solve(bend=False, lamp=self.lamp))
@@ -391,69 +393,51 @@ class _Problem:
         return solution
 
     def solve(self, bend: bool, lamp: float, most: int = _SOLVED) -> _Solution:
-        """Least squares of means, variances, and of how far each set's light is off, of a ``lamp`` of such scatter."""
-        count, lit = len(self.light), self.light > 0
-        lights = int(np.count_nonzero(lit))
-        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
-        dark = np.ptp(self.time[~lit]) > 0 and self.variance[~lit].max() > HIDDEN
-        free = np.array([True, True, True, dark, lights > 0, bend, bend])
-        fixed = self.start.copy()
-        fixed[3] = fixed[3] if free[3] else 0.0
+        """Fit means and variances by least squares, where the light of sets scatters by a part ``lamp``.
 
-        def take_apart(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            values, scale = fixed.copy(), np.ones(count)
-            values[free] = x[: free.sum()]
-            scale[lit] += lamp * x[free.sum() :]
-            return values, scale
+        The light of a set moves its mean and its variance together, as (signal, noise of light). The best deviation of
+        the light follows from what is left of both, so that it is no parameter.
+        """
+        lit = self.light > 0
+        # Where all readings in the dark are one code, and only rarely the next, their mean tells no current.
+        seen = np.ptp(self.time[~lit]) > 0 and self.measured[1, ~lit].max() > HIDDEN
+        free = np.array([True, True, True, seen, lit.any(), bend, bend, True])
+        values = np.where(free | (np.arange(len(NAMES)) != _DARK), self.start, 0.0)
+        by_light = lamp * lit * (self.measured - self.measured[:, ~lit].min(axis=1, keepdims=True)) / self.errors
 
         def rest(x: FloatArray) -> FloatArray:
-            values, scale = take_apart(x)
-            mean, variance = self.moments(values, scale)
-            return np.concatenate([
-                (self.mean - mean) / self.mean_error, (self.variance - variance) / self.variance_error,
-                x[free.sum() :],
-            ])  # fmt: skip
+            values[free] = x
+            mean, variance, spatial = self.moments(values)
+            left = (self.measured - [mean, variance]) / self.errors
+            light = (by_light * left).sum(axis=0) / (1 + np.square(by_light).sum(axis=0))
+            left -= by_light * light
+            return np.concatenate([*left, light[lit], [(self.spatial[0] - spatial) / self.spatial[1]]])
 
         def slopes(x: FloatArray) -> FloatArray:
-            here, found = rest(x), np.zeros((2 * count + lights, len(x)))
-            sizes = np.maximum(np.abs(fixed) * _STEPS, _LEAST_STEPS)
-            for column, index in enumerate(np.flatnonzero(free)):
-                step = max(abs(x[column]) * _STEPS[index], _LEAST_STEPS[index], sizes[index] * 1e-3)
-                moved = x.copy()
-                moved[column] += step
-                found[:, column] = (rest(moved) - here) / step
-            # Light of one set moves that set alone, so all are moved at once.
-            moved = x.copy()
-            size = 1e-3 / max(lamp, 1e-3)
-            moved[free.sum() :] += size
-            change = (rest(moved) - here) / size
-            for column, index in enumerate(np.flatnonzero(lit), free.sum()):
-                found[[index, count + index], column] = change[[index, count + index]]
-                found[2 * count + column - free.sum(), column] = 1.0
-            return found
+            steps, here = np.maximum(np.abs(x) * _STEPS[free], _LEAST_STEPS[free]), rest(x)
+            return np.stack([(rest(x + step) - here) / step.sum() for step in np.diag(steps)], axis=1)
 
-        begin = np.concatenate([fixed[free], np.zeros(lights)])
-        solved = scipy.optimize.least_squares(rest, begin, slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most)
-        values, scale = take_apart(solved.x)
-        normal = solved.jac.T @ solved.jac
-        # Of what few codes hide, readings in the dark are known to half a code all the same.
-        span, code = float(np.ptp(self.time[~lit])), max(_HALF, values[1])
-        known = np.zeros((5, len(NAMES)))
-        known[0, [0, 3]] = np.array([values[3], values[0]]) * span / code
-        known[[1, 2, 3, 4], [1, 2, 5, 6]] = 1 / code, 1 / code, 1.0, 1.0
-        normal[: free.sum(), : free.sum()] += known[:, free].T @ known[:, free]
-        size = np.sqrt(np.diagonal(normal))
-        inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True) / np.outer(size, size)
-        covariance = np.zeros((len(NAMES), len(NAMES)))
-        covariance[np.ix_(free, free)] = inverse[: free.sum(), : free.sum()]
-        values[1] = abs(values[1])
-        # Means that are off tell of the lamp too: both parts of how far light is off.
-        left = (scale - 1)[lit] + (solved.fun[:count] * self.mean_error)[lit] / np.maximum(
-            self.mean[lit] - values[2], 1e-9
+        solved = scipy.optimize.least_squares(
+            rest, values[free], slopes, x_scale="jac", xtol=1e-10, ftol=1e-10, max_nfev=most
         )
-        scatter = float(np.sqrt(np.square(left).sum() / max(lights - 1 - 2 * bend, 1)))
-        freedom = 2 * count - int(free.sum())
-        return _Solution(self, values, covariance, bend, lamp, scatter, solved.fun, freedom)
+        values[free] = solved.x
+        # Readings in the dark are known to half a code, and pixels to be alike to it, whatever few codes hide.
+        span, code = float(np.ptp(self.time[~lit])), max(_HALF, abs(values[1]))
+        known = np.diag([0.0, 1 / code, 1 / code, 0.0, 0.0, 1.0, 1.0, code**-2])
+        known[0, [0, _DARK]] = np.array([values[_DARK], values[0]]) * span / code
+        normal = solved.jac.T @ solved.jac + known[:, free].T @ known[:, free]
+        size = np.sqrt(np.diagonal(normal))
+        covariance = np.zeros((len(NAMES), len(NAMES)))
+        covariance[np.ix_(free, free)] = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+        covariance[np.ix_(free, free)] /= np.outer(size, size)
+        values[[0, 1, 4]] = np.abs(values[[0, 1, 4]])
+        count = len(self.light)
+        left, lights = solved.fun[: 2 * count].reshape(2, count), solved.fun[2 * count : -1]
+        # Means that are off show the lamp too: both parts of how far light is off.
+        off = lamp * lights + (left[0] * self.errors[0])[lit] / np.maximum(self.measured[0, lit] - values[2], 1e-9)
+        scatter = float(np.sqrt(np.square(off).sum() / max(lit.sum() - 1 - 2 * bend, 1)))
+        freedom = 2 * count - int(free.sum()) + 1
+        return _Solution(self, values, covariance, bend, lamp, scatter, left, lights, freedom)
 
 
 _BASE = SensorModel(

@@ -28,7 +28,7 @@ from mitsim.studies.emva_frames import Frames, draw_sessions
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 from mitsim.studies.emva_plots import figures_of
 from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
-from mitsim.studies.flat_frames import read_sets, remarks
+from mitsim.studies.flat_frames import read_again, read_sets, remarks
 from mitsim.studies.framework.findings import build_findings
 from mitsim.studies.framework.run import study_folder, write_figures
 
@@ -67,7 +67,8 @@ def characterise(
         bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
         source = f"simulated frames of {sensor.name}"
         stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
-        found = find_camera(taken, lambda index: np.mean([*frames.images(index)], axis=0), stated)
+        images = lambda index: np.mean([*frames.images(index)], axis=0)  # noqa: E731
+        found = find_camera(taken, images, stated, lambda places: frames.take(job, places))
         return _hold_against(frames, taken, found, {"asked": asdict(procedure), "camera": sensor.name}, folder)
 
     return _write(measure, output)
@@ -99,8 +100,11 @@ def characterise_frames(
         taken = [each.taken for each in sets]
         facts = listed.listed
         stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
-        found = find_camera(taken, lambda index: sets[index].mean_image(), stated)
-        frames = Frames.as_taken(taken, found.sensor, found.transfer)
+        found = find_camera(
+            taken, lambda index: sets[index].mean_image(), stated,
+            lambda places: read_again(listed, places, taken[0].said.shape),
+        )  # fmt: skip
+        frames = Frames.as_taken(taken, found)
         asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
         about = remarks(sets, found)
         return _hold_against(
@@ -118,12 +122,10 @@ def _hold_against(
     spread, figures = emva.figures(draw_sessions(frames, expected)), emva.figures(session)
     # Without a quantum efficiency light is counted in electrons, and there is none to find.
     sensor = frames.sensor
-    names = [
-        name
-        for name in UNITS
-        if name in figures and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")
-    ]
-    rows = tuple(row_of(frames, name, figures[name], spread[name]) for name in names)
+    names = [name for name in UNITS if name in figures and name in spread]
+    names = [name for name in names if sensor.states_efficiency or name != "quantum_efficiency"]
+    bend = found.transfer.error("bend") if what.get("real") else 0.0  # what is expected is then known to that
+    rows = tuple(row_of(frames, name, figures[name], spread[name], bend) for name in names)
     fields = fields_of(found, None if what.get("real") else sensor)
     return Characterisation(
         frames=frames, session=session, expected=expected, rows=rows, found=found, fields=fields, output=output, **what

@@ -21,9 +21,10 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor import emva
 from mitsim.sensor.chain import expose
-from mitsim.sensor.emva import Session
+from mitsim.sensor.emva import MOST_FITTED, Session
+from mitsim.sensor.found_camera import FoundCamera, Places
 from mitsim.sensor.moments import frame_moments
-from mitsim.sensor.photon_transfer import Taken, Transfer, nonuniform, saturation_of
+from mitsim.sensor.photon_transfer import Taken, average_moments, nonuniform, saturation_of
 from mitsim.sensor.specimen import dark_current_variance, mean_dark_current, response_variance
 from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 
@@ -37,6 +38,8 @@ _LONGEST_S = 10.0
 """Of a camera without dark current [s]."""
 _FILLED_BY_DARK = 0.01
 """Part of saturation that dark current may fill at the ladder's exposure."""
+_DITHERED, _CLEAR = 0.6, 8.0
+"""Noise of reading [DN], and deviations from 0, from which mean readings follow offsets."""
 _SESSIONS = 1000
 """Drawn statistics of sessions: they tell a standard error to 2 %."""
 
@@ -67,6 +70,8 @@ class Frames:
         root of every draw.
     lamp
         relative errors of the light: of each set, and of all.
+    surface
+        relative variances of light that is uneven, by row, column and pixel.
     """
 
     sensor: SensorModel
@@ -80,6 +85,7 @@ class Frames:
     saturates: bool = True
     seed: int = 0
     lamp: tuple[float, float] = (0.0, 0.0)
+    surface: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def of(cls, sensor: SensorModel, procedure: Procedure, capacity: float) -> Frames:
@@ -111,21 +117,14 @@ class Frames:
         return cls(sensor, side, light, electrons, exposures, counts, bright + 1, bright, seed=procedure.seed)
 
     @classmethod
-    def as_taken(cls, taken: list[Taken], sensor: SensorModel, transfer: Transfer) -> Frames:
-        """Those of a real camera.
-
-        Parameters
-        ----------
-        taken
-            sets of its frames.
-        sensor, transfer
-            the camera that was found in them, and the fit that it is of.
-        """
+    def as_taken(cls, taken: list[Taken], found: FoundCamera) -> Frames:
+        """Return those of a real camera, of which sets were ``taken`` and which was ``found`` in them."""
+        sensor, transfer = found.sensor, found.transfer
         light, time = (np.array([getattr(each, name) for each in taken]) for name in ("light", "exposure_s"))
         return cls(
             sensor, taken[0].said.shape, light, transfer["response"] * light, time,
             np.array([each.said.count for each in taken]), *nonuniform(taken), saturation_of(taken)[1] is not None,
-            lamp=(transfer.lamp, transfer.light_error),
+            lamp=(transfer.lamp, transfer.light_error), surface=found.maps.surface,
         )  # fmt: skip
 
     @property
@@ -151,31 +150,26 @@ class Frames:
         capacity = capacity_of(self.sensor)
         return float(np.diff(levels)[np.searchsorted(levels[1:-1], capacity)])
 
-    def images(self, index: int) -> Iterator[FloatArray]:
-        """Frames of the set of that ``index``, one after the other."""
+    def images(self, index: int, places: Places | None = None) -> Iterator[FloatArray]:
+        """Yield the frames of the set of that ``index``, with the pixel at ``places`` (M, N) in place of each."""
         for number in range(self.counts[index]):
             shot, read = (stream(self.seed, "characterise", noise, index, number) for noise in ("shot", "read"))
             light = np.full(self.shape, self.electrons[index])
-            yield np.asarray(expose(light, float(self.exposure_s[index]), self.sensor, shot, read), dtype=np.float64)
+            image = np.asarray(expose(light, float(self.exposure_s[index]), self.sensor, shot, read), dtype=np.float64)
+            yield image if places is None else image.flat[places]
 
-    def take(self, job: Job) -> list[Taken]:
-        """What the frames say, of all sets; ``job`` is told how far it is."""
+    def take(self, job: Job, places: Places | None = None) -> list[Taken]:
+        """Take the frames of all sets, with the pixel at ``places`` in place of each; ``job`` is told how far it is."""
         largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
         job.progress("frames", 0.0)
         with job.clock.stage("frames"):
-            said = in_threads(lambda index: emva.alike(self.images(index), largest), range(len(self.light)))
-        return [
-            Taken(float(light), float(time), each)
-            for light, time, each in zip(self.light, self.exposure_s, said, strict=True)
-        ]
+            said = in_threads(lambda index: emva.alike(self.images(index, places), largest), range(len(self.light)))
+        return [Taken(*each) for each in zip(self.light.tolist(), self.exposure_s.tolist(), said, strict=True)]
 
     def session(self, taken: list[Taken]) -> Session:
         """The statistics of sets that were ``taken``, for figures."""
-        return self._session(
-            emva.pairs_of([each.said.pair for each in taken]),
-            taken[self.dark].said.stack,
-            taken[self.bright].said.stack,
-        )
+        stacks = (taken[index].said.stack for index in (self.dark, self.bright))
+        return self._session(emva.pairs_of([each.said.pair for each in taken]), *stacks)
 
     def expect(self) -> Session:
         """The same statistics as closed forms expect them of all specimens; nonuniformity as it was set."""
@@ -184,34 +178,29 @@ class Frames:
         return self._session(pairs, *stacks)
 
     def _session(self, pairs: emva.Pair, dark: emva.Stack, bright: emva.Stack) -> Session:
-        rounded = self.sensor.bits is not None
         return Session(
-            self.shape,
-            self.light,
-            self.exposure_s,
-            pairs,
-            self.dark,
-            self.bright,
-            dark,
-            bright,
-            self.saturates,
-            rounded,
-        )
+            self.shape, self.light, self.exposure_s, pairs, self.dark, self.bright, dark, bright, self.saturates,
+            self.sensor.bits is not None,
+        )  # fmt: skip
 
     def _expected_pair(self, index: int, part: float = 1.0) -> emva.Pair:
         """Of a set whose light is a ``part`` of what it should be."""
         time, light = float(self.exposure_s[index]), np.array([part * self.electrons[index], 0.0])
-        mean, variance = frame_moments(light, time, self.alike)
+        mean, variance, _ = average_moments(
+            light, time, self.alike, self.spread,
+            math.hypot(*self.sensor.response_parts) if light[0] > MOST_FITTED * capacity_of(self.sensor) else 0.0,
+        )  # fmt: skip
         dead = self.sensor.dead_pixels
         rows = (self.sensor.superpixel_row_noise_e * self.sensor.gain_dn_per_e) ** 2
         lit = [np.asarray((1 - dead) * moment[0] + dead * moment[1]) for moment in (mean, variance)]
         return emva.Pair(lit[0], lit[1], np.minimum(rows, lit[1]))
 
     def _expected_stack(self, mean: FloatArray, index: int) -> emva.Stack:
-        rows, columns, pixel = (self.slope(self.electrons[index]) ** 2 * part for part in self.parts(index))
+        still, parts = self.parts(index, 0.0), self.parts(index)
+        slopes = self.offset_slope(index), self.slope(self.electrons[index])
+        rows, columns, pixel = slopes[0] ** 2 * still + slopes[1] ** 2 * (parts - still)
         m, n = self.shape
-        parts = rows + columns + pixel, rows + pixel / n, columns + pixel / m
-        return emva.Stack(mean, *(np.asarray(part) for part in parts))
+        return emva.Stack(mean, rows + columns + pixel, rows + pixel / n, columns + pixel / m)
 
     @property
     def alike(self) -> SensorModel:
@@ -224,22 +213,41 @@ class Frames:
         mean = self.sensor.dark_current_e_per_s + self.sensor.hot_pixels * self.sensor.hot_dark_current_e_per_s
         return self.sensor.model_copy(update={**dict.fromkeys(names, 0.0), "dark_current_e_per_s": mean})
 
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the pixels' offsets [DN], where rounding or the ADC's end changes it; else 0."""
+        sensor, gain = self.sensor, self.sensor.gain_dn_per_e
+        spread, noise = math.hypot(*sensor.offset_parts) * gain, sensor.superpixel_reading_noise_e * gain
+        clear = noise > _DITHERED and sensor.superpixel_black_level_dn > _CLEAR * math.hypot(noise, spread)
+        return 0.0 if sensor.bits is None or clear else spread
+
+    def offset_slope(self, index: int) -> float:
+        """Digital numbers for another electron of offset in the set of that ``index``, rms over the pixels."""
+        spread = self.spread
+        if not spread:
+            return self.sensor.gain_dn_per_e
+        *_, between = average_moments(self.electrons[[index]], float(self.exposure_s[index]), self.alike, spread)
+        return self.sensor.gain_dn_per_e * math.sqrt(float(between[0])) / spread
+
     def slope(self, electrons: float) -> float:
-        """Digital numbers for another electron, around so many ``electrons``."""
+        """Digital numbers for another electron of light, around so many ``electrons``."""
         if not self.sensor.linearity:
             return self.sensor.gain_dn_per_e
         around = np.array([electrons * 0.999, electrons * 1.001 + 1])
         mean, _ = frame_moments(around, float(self.exposure_s[self.dark]), self.alike)
         return float(np.diff(mean)[0] / np.diff(around)[0])
 
-    def parts(self, index: int) -> tuple[float, float, float]:
-        """Set spatial variances by row, column and pixel [e-^2] in the set of that ``index``."""
-        pixel, row, column = (part**2 for part in self.sensor.offset_parts)
-        dark = dark_current_variance(self.sensor) * float(self.exposure_s[index]) ** 2
-        _, row_response, column_response = (part**2 for part in self.sensor.response_parts)
-        own = response_variance(self.sensor) - row_response - column_response
-        light = float(self.electrons[index]) ** 2
-        return row + row_response * light, column + column_response * light, pixel + dark + own * light
+    def parts(self, index: int, light: float = 1.0) -> FloatArray:
+        """Return the spatial variances (row, column, pixel) [e-^2] that are set, in the set of that ``index``.
+
+        ``light`` is a part of the set's.
+        """
+        sensor, (pixel, row, column) = self.sensor, np.square(self.sensor.offset_parts)
+        dark = dark_current_variance(sensor) * float(self.exposure_s[index]) ** 2
+        _, rows, columns = np.square(sensor.response_parts)
+        responses = np.array([rows, columns, response_variance(sensor) - rows - columns]) + self.surface
+        still = np.array([row, column, pixel + dark])
+        return np.asarray(still + (light * float(self.electrons[index])) ** 2 * responses)
 
 
 def draw_sessions(frames: Frames, expected: Session) -> Session:
@@ -276,12 +284,13 @@ def draw_sessions(frames: Frames, expected: Session) -> Session:
 def _under_lamp(frames: Frames, pairs: emva.Pair, rng: np.random.Generator) -> emva.Pair:
     """Drawn ``pairs`` (sessions, S) of sets whose light is off, each by its part and all by another."""
     each, every = frames.lamp
-    step = max(frames.lamp)
+    step = min(max(frames.lamp), 0.5)
     sides = [
         emva.pairs_of([frames._expected_pair(index, 1 + side * step) for index in range(len(frames.light))])
         for side in (-1, 1)
     ]
     off = each * rng.standard_normal(pairs.mean.shape) + every * rng.standard_normal((_SESSIONS, 1))
+    off = np.maximum(off, -0.9)  # there is some light
     mean, variance = (
         getattr(pairs, name) + off * (getattr(sides[1], name) - getattr(sides[0], name)) / (2 * step)
         for name in ("mean", "variance")
@@ -301,19 +310,17 @@ def _drawn_stacks(frames: Frames, expected: Session, rng: np.random.Generator) -
     shared = min(float(expected.pairs.rows[frames.dark]), *noise)
     sizes = {"row": (m - 1, n), "column": (n - 1, m), "pixel": ((m - 1) * (n - 1), 1)}
     squares: dict[str, list[FloatArray]] = {}
-    dark, bright = (frames.parts(index) for index in places)
-    slope = frames.slope(float(frames.electrons[frames.bright]))
+    own = np.array([[1, 0, 1 / n], [0, 1, 1 / m], [0, 0, 1]])  # a pixel's part is in means of rows and columns
+    dark, bright, still = (own @ frames.parts(*each) for each in ((places[0],), (places[1],), (places[1], 0.0)))
+    light = frames.slope(float(frames.electrons[frames.bright])) * np.sqrt(np.maximum(bright - still, 0.0))
+    offsets = [frames.offset_slope(place) * np.sqrt(part) for place, part in zip(places, (dark, still), strict=True)]
     for index, (name, (freedom, averaged)) in enumerate(sizes.items()):
-        of_pixel = dark[2] / averaged if averaged > 1 else 0.0
-        offset = (dark[index] + of_pixel) * frames.slope(0.0) ** 2
-        light = bright[index] - dark[index] + ((bright[2] - dark[2]) / averaged if averaged > 1 else 0.0)
-        light *= slope**2
-        left = ((noise - shared) / averaged + (shared if name == "row" else 0.0)) / counts
-        parts = np.sqrt([offset, light, *left])
-        products = _products(freedom, len(parts), rng)
+        left = np.sqrt(((noise - shared) / averaged + (shared if name == "row" else 0.0)) / counts)
+        products = _products(freedom, 4, rng)
+        sides = [[offsets[0][index], left[0]], [offsets[1][index], light[index], left[1]]]
         squares[name] = [
-            freedom * np.einsum("i,ijs,j->s", parts[used], products[np.ix_(used, used)], parts[used])
-            for used in ([0, 2], [0, 1, 3])
+            freedom * np.einsum("i,ijs,j->s", part, products[np.ix_(used, used)], part)
+            for part, used in zip(sides, ([0, 2], [0, 1, 3]), strict=True)
         ]
     stacks = []
     for side, name in enumerate(("dark_stack", "bright_stack")):

@@ -55,12 +55,10 @@ _BIASED, _MISLEADS = 0.5, 1.0
 """Standard errors by which the procedure's own bias by the ADC moves a figure, from which it is held against what is
 expected of it, and from which it is flagged: with less, 98 of 100 found figures are still within three standard errors
 of the value set."""
-_DITHERED = 0.8
-"""Noise of reading [DN] below which rounding is named as the cause: above, it is white to 1e-5."""
-_CUT = 1e-3
-"""Part of the dark readings that are 0 from which these are named as the cause."""
 _BY_METHOD = ("saturation_capacity", "linearity_min", "linearity_max")
 """Figures that depend on the steps of light and on their noise, and have no value that a camera file sets."""
+_DUST = 1e-10
+"""Least standard error of a figure, above what rounding of the arithmetic leaves of no noise."""
 _WHOLE = 1e4
 """From which a headline has whole numbers."""
 MOST_OFF = 5.0
@@ -158,24 +156,14 @@ class Characterisation:
             if row.deviations is not None and not abs(row.deviations) <= MOST_OFF
         ]
         if biased:
-            of = "the camera" if self.real else "what is set"
+            of, sensor = "the camera" if self.real else "what is set", self.frames.sensor
             found = ", ".join(f"{row.name} {row.expected:.5g} {row.unit} for {row.set:.5g}" for row in biased)
-            off.insert(0, f"the procedure does not find {of}, but {found}: {self._cause}")
+            noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
+            black = sensor.superpixel_black_level_dn
+            why = f"a black level of {black:.3g} DN and rounding to whole DN hide part of a noise of {noise:.2g} DN"
+            what = f"the procedure does not find {of}, but {found}"
+            off.insert(0, f"{what}: {why}; raise black_level_dn or gain_dn_per_e")
         return (*self.about, *off)
-
-    @property
-    def _cause(self) -> str:
-        """Why the procedure's figures are biased, and what to do."""
-        sensor = self.frames.sensor
-        noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
-        cut = math.erfc((sensor.superpixel_black_level_dn - 0.5) / (noise * math.sqrt(2))) / 2 if noise else 0.0
-        if cut > _CUT:
-            return f"{cut:.2g} of all dark readings are 0 DN, which hides their noise; raise black_level_dn"
-        if noise < _DITHERED:
-            return (
-                f"rounding to whole DN is no noise of 1/12 DN^2 beside {noise:.2g} DN in the dark; raise gain_dn_per_e"
-            )
-        return "the ADC's ends or steps hide part of the noise; raise black_level_dn or lower gain_dn_per_e"
 
     def payload(self) -> dict[str, Any]:
         """What the command line reports as JSON."""
@@ -187,7 +175,7 @@ class Characterisation:
             "figures": [asdict(row) for row in self.rows],
             "camera_found": [asdict(row) for row in self.fields],
             "light": {
-                "uneven": self.found.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
+                "uneven": self.found.maps.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
                 "seen": transfer.light,
                 "chi_square": transfer.chi_square, "freedom": transfer.freedom,
             },
@@ -222,49 +210,38 @@ class Characterisation:
         """Tables, and the plots that stand with them: the figures of EMVA 1288, and the camera that was found."""
         rows = [
             (
-                row.name, row.symbol, row.unit, f"{row.set:.5g}",
-                "" if row.expected is None else f"{row.expected:.5g}",
-                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
-                f"{row.deviations:.1f}",
+                row.name,
+                row.symbol,
+                row.unit,
+                _text(row.set),
+                _text(row.expected),
+                *_digits(row),
+                _text(row.deviations, ".1f"),
             )
             for row in self.rows
-        ]  # fmt: skip
-        beside = "camera" if self.real else "set"
-        head = ("figure", "symbol", "unit", beside, "expected", "found", "std. error", "off by")
-        notes = []
-        if any(row.expected is not None for row in self.rows):
-            figure = "the camera has" if self.real else "the one set"
-            notes.append(f"expected: where the procedure finds another figure than {figure}, at these steps and frames")
-        fields = [
-            (
-                row.name, row.unit, *(() if self.real else (f"{row.set:.5g}" if row.set is not None else "",)),
-                *(round_to_error(number, row.standard_error) for number in (row.found, row.standard_error)),
-                *(() if self.real else ("" if row.deviations is None else f"{row.deviations:.1f}",)),
-            )
-            for row in self.fields
-        ]  # fmt: skip
-        of_fields = (
-            ("camera found", "unit", "found", "std. error")
-            if self.real
-            else ("camera found", "unit", "set", "found", "std. error", "off by")
-        )
+        ]
+        fields: list[tuple[str, ...]] = [
+            (row.name, row.unit, _text(row.set), *_digits(row), _text(row.deviations, ".1f")) for row in self.fields
+        ]
+        found = ("found", "std. error", "off by")
+        head = ("figure", "symbol", "unit", "camera" if self.real else "set", "expected", *found)
+        of_fields: tuple[str, ...] = ("camera found", "unit", "set", *found)
+        if self.real:  # nothing is set
+            of_fields, fields = ((*of_fields[:2], *of_fields[3:5]), [(*row[:2], *row[3:5]) for row in fields])
+        figure = "the camera has" if self.real else "the one set"
+        note = f"expected: where the procedure finds another figure than {figure}, at these steps and frames"
         return (
             Part(
                 "Figures of EMVA 1288",
                 "What the standard's procedure finds, with its standard error, and by how many of these it is off.",
-                head,
-                tuple(rows),
-                ("deviations.png", "photon_transfer.png", "linearity.png", "dark_current.png"),
-                tuple(notes),
+                head, tuple(rows), ("deviations.png", "photon_transfer.png", "linearity.png", "dark_current.png"),
+                (note,) if any(row.expected is not None for row in self.rows) else (),
             ),
             Part(
-                "The camera that explains the frames",
-                "The fields of camera.toml, which --camera takes.",
-                of_fields,
-                tuple(fields),
-                notes=tuple(self.found.notes),
+                "The camera that explains the frames", "The fields of camera.toml, which --camera takes.",
+                of_fields, tuple(fields), notes=tuple(self.found.notes),
             ),
-        )
+        )  # fmt: skip
 
     def lines(self) -> list[str]:
         """For people."""
@@ -276,17 +253,25 @@ class Characterisation:
         return [*lines, "", *text_table(camera.head, camera.rows), *camera.notes]
 
 
+def _digits(row: Row | FieldRow) -> tuple[str, str]:
+    """Return the number found and its standard error, to the digits that are known."""
+    return round_to_error(row.found, row.standard_error), round_to_error(row.standard_error, row.standard_error)
+
+
+def _text(value: float | None, digits: str = ".5g") -> str:
+    return "" if value is None else f"{value:{digits}}"
+
+
 def _set(frames: Frames, name: str) -> float:
     """What the camera's file sets of a figure ``name``; squares of those that are found as variances."""
     sensor, time = frames.sensor, float(frames.exposure_s[frames.dark])
     kind, _, part = name.partition("_")
     if kind in ("dsnu", "prnu"):
-        row, column, pixel = frames.parts(frames.dark)
+        parts = frames.parts(frames.dark)
         if kind == "prnu":
-            lit = frames.parts(frames.bright)
             alive = float(frames.electrons[frames.bright]) * (1 - sensor.dead_pixels)
-            row, column, pixel = ((on - off) / alive**2 for on, off in zip(lit, (row, column, pixel), strict=True))
-        return {"total": row + column + pixel, "row": row, "column": column, "pixel": pixel}[part]
+            parts = (frames.parts(frames.bright) - parts) / alive**2
+        return float(dict(zip(emva.SPLIT, (parts.sum(), *parts), strict=True))[part])
     dark = mean_dark_current(sensor)
     return {
         "system_gain": sensor.gain_dn_per_e,
@@ -304,7 +289,7 @@ def _set(frames: Frames, name: str) -> float:
     }[name]
 
 
-def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -> Row:
+def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
     """A figure as it is shown.
 
     Parameters
@@ -317,26 +302,29 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
         the figure.
     sessions
         (count,) the same of drawn sessions, which tell its error.
+    bend
+        standard error of the linearity that is expected.
     """
     sensor = frames.sensor
-    value, spread, centre = float(found), float(sessions.std()), float(sessions.mean())
+    value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
     given = _set(frames, name)
     # What the linear method makes of a camera that is not linear, and of rows that share noise, is not what is set.
     method = name in _BY_METHOD or bool(sensor.linearity)
     method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
-    bias = 0.0 if method or not spread or sensor.bits is None else (centre - given) / spread
+    bias = 0.0 if method or sensor.bits is None else (centre - given) / spread
     method |= abs(bias) > _BIASED
     if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + emva.QUANTISATION < emva.LEAST_DARK:
         bias = 0.0  # it is found as the standard's limit, as it should be
+    spread = math.hypot(spread, bend if name.startswith("linearity") else 0.0)
     if name == "saturation_capacity":
         spread = math.hypot(spread, frames.step / math.sqrt(12))
     against = centre if method else given
-    off = (value - against) / spread if spread else 0.0 if value == against else math.inf
+    off = (value - against) / spread
     symbol, unit = UNITS[name]
     scale = 100.0 if unit == "%" else 1.0
     if name.startswith(_SQUARES):
         root = math.sqrt(max(against, 0.0))
-        spread = spread / (2 * max(root, math.sqrt(spread))) if spread else 0.0
+        spread = spread / (2 * max(root, math.sqrt(spread)))
         given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
     expected = scale * centre if method else None
     return Row(name, symbol, unit, scale * given, expected, scale * value, scale * spread, off, bias)
@@ -345,20 +333,17 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray) -
 def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, ...]:
     """The fields of a camera that was ``found``, beside those of the ``model`` that took frames; None: not known."""
     rows = []
-    for name, unit in FIELDS.items():
-        value, error = getattr(found.sensor, name), found.errors.get(name, 0.0)
-        if value is None or not math.isfinite(value):
-            continue
-        given = None if model is None else _set_field(model, name)
-        off = None if given is None or not error else (value - given) / error
-        rows.append(FieldRow(name, unit, given, value, error, off))
-    bends = zip(found.sensor.linearity, ("bend", "bend_2"), strict=False)
-    for power, (value, name) in enumerate(bends):
-        given = None if model is None else ([*model.linearity, 0.0, 0.0][power])
-        error = found.transfer.error(name)
-        rows.append(
-            FieldRow(f"linearity.{power}", "1", given, value, error, None if given is None else (value - given) / error)
-        )
+    bends = {
+        f"linearity.{power}": (value, ("bend", "bend_2")[power]) for power, value in enumerate(found.sensor.linearity)
+    }
+    for name, unit in {**FIELDS, **dict.fromkeys(bends, "1")}.items():
+        value, error = getattr(found.sensor, name, None), found.errors.get(name, 0.0)
+        if name in bends:
+            value, error = bends[name][0], found.transfer.error(bends[name][1])
+        if value is not None and math.isfinite(value):
+            given = None if model is None else _set_field(model, name)
+            off = None if given is None or not error else (value - given) / error
+            rows.append(FieldRow(name, unit, given, value, error, off))
     return tuple(rows)
 
 
@@ -379,5 +364,6 @@ def _set_field(model: SensorModel, name: str) -> float | None:
         **dict(zip((f"dsnu_{part}_e" for part in emva.SPLIT[1:]), (row, column, pixel), strict=True)),
         **dict(zip((f"prnu_{part}" for part in emva.SPLIT[1:]), (of_row, of_column, of_pixel), strict=True)),
         **({} if model.binning > 1 else defects),
+        **{f"linearity.{power}": value for power, value in enumerate([*model.linearity, 0.0, 0.0])},
     }
     return known.get(name)

@@ -1,5 +1,7 @@
 """Estimators of EMVA 1288 on frames whose statistics are known without them."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -118,3 +120,20 @@ def test_linearity_is_the_least_and_the_largest_relative_deviation() -> None:
     off = signal[used] / (line[0] + line[1] * photons[used]) - 1
     assert found["linearity_min"] == pytest.approx(off.min(), rel=1e-6)
     assert found["linearity_max"] == pytest.approx(off.max(), rel=1e-6)
+
+
+def test_missing_codes_make_a_pattern_of_known_amplitude() -> None:
+    """floor(1.5 n) leaves two of three codes, of amplitude |1 + w| / 2 = 1/2; bit 2 at 0 one of 1 / (4 sin(pi/8)).
+
+    (Planted: the power of the pattern in place of its amplitude.)
+    """
+    noisy = [np.rint(np.random.default_rng(k).normal(1000, 12, (64, 64))) for k in range(2)]
+    assert alike(noisy, 4095).comb[0] < 6 / 64
+    for read, amplitude, period in (
+        (lambda frame: np.floor(1.5 * frame), 0.5, 3.0),
+        (lambda frame: frame - 4 * ((frame // 4) % 2), 1 / (4 * math.sin(math.pi / 8)), 8.0),
+    ):
+        found = alike([read(frame) for frame in noisy], 4095).comb
+        assert found[0] == pytest.approx(amplitude, abs=3 / 64) and found[1] == pytest.approx(period, rel=0.01)
+    assert alike(noisy).comb == (0.0, 1.0)  # real numbers have no codes
+    assert len({*alike(noisy, 4095).digests}) == 2 and alike([np.ones((16, 16))] * 2).digests == (b"", b"")

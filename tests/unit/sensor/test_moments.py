@@ -12,6 +12,7 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
 from mitsim.sensor.chain import poisson_quantile
+from mitsim.sensor.photon_transfer import average_moments
 from mitsim.sensor.specimen import specimen
 from tests.invented import sensor
 
@@ -179,3 +180,17 @@ def test_the_shipped_camera_s_noise_is_linear_from_the_dark_to_a_percent_below_i
     model = load_sensor(shipped_path("calibration", "imx249.toml"))
     first, last = moments._linear(model)
     assert first == 0 and 0.95 < last / model.superpixel_full_well_e < 1
+
+
+def test_rounding_shows_offsets_by_its_slope() -> None:
+    """Of noise s [DN] at a code's middle, the slope of mean readings is 1 - 2 exp(-2 pi^2 s^2) + 2 exp(-8 pi^2 s^2).
+
+    (Planted: all nodes with the same weight.)
+    """
+    model = sensor(bits=8, gain_dn_per_e=0.02, read_noise_e=12.0, black_level_dn=5.0, full_well_e=11_000.0)
+    wave = [math.exp(-2 * (math.pi * k * 0.24) ** 2) for k in (1, 2)]
+    mean, _, between = average_moments(np.zeros(1), 0.0, model, 1e-3)
+    assert mean[0] == pytest.approx(5, abs=1e-6)
+    assert math.sqrt(between[0]) == pytest.approx(1e-3 * (1 - 2 * wave[0] + 2 * wave[1]), rel=2e-3)
+    _, _, between = average_moments(np.array([1e4]), 0.0, model, 0.05)
+    assert math.sqrt(between[0]) == pytest.approx(0.05, rel=1e-2)  # noise of light dithers

@@ -85,7 +85,7 @@ def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> 
 
 COARSE: dict[str, tuple[dict[str, object], str]] = {
     "8 bits, a fifth of dark readings 0": (
-        {"bits": 8, "read_noise_e": 25.0, "gain_dn_per_e": 0.0235, "black_level_dn": 1.0}, "dark readings are 0 DN"
+        {"bits": 8, "read_noise_e": 25.0, "gain_dn_per_e": 0.0235, "black_level_dn": 1.0}, "raise black_level_dn"
     ),
     "10 bits, no black level": (
         {"bits": 10, "read_noise_e": 10.0, "gain_dn_per_e": 0.1, "black_level_dn": 0.0}, "raise black_level_dn"
