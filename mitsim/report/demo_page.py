@@ -288,7 +288,7 @@ class Trust:
     chi_square
         misfit a datum; None where there are no more data than unknowns.
     cause
-        likely cause of a flagged misfit; empty where the frames fit.
+        finding that flags the misfit; empty where the frames fit.
     """
 
     uncertainty: FloatArray

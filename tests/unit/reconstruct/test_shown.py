@@ -51,11 +51,11 @@ def test_misfit_is_shown_and_its_cause_where_flagged() -> None:
     """(Planted: the cause left out.)"""
     fits = reconstruct(bench().run("dots:4", picture(), 0), bench().calibrated(0))
     moved = reconstruct(bench(0.3).run("dots:4", picture(), 0), bench().calibrated(0))
-    for image, cause, digits in ((fits, "", ".3f"), (moved, "; likely cause: depth, light that lands beside", ".3g")):
+    for image, cause, digits in ((fits, "", ".3f"), (moved, "; light that the calibrated camera does not see", ".3g")):
         (line,) = (line for line in shown(image)[2] if line.startswith("misfit: "))
         assert image.misfit is not None
         assert line.startswith(f"misfit: chi-square {image.misfit.chi_square:{digits}} a datum, ")
-        assert (cause in line) and ("cause" in line) == bool(cause)
+        assert cause in line and ("calibrated camera" in line) == bool(cause)
 
 
 def test_what_is_not_known_is_not_shown() -> None:
