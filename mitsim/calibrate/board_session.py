@@ -48,7 +48,7 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms, stripe_misfits
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
-from mitsim.reconstruct.session_side import odd_responses, too_many
+from mitsim.reconstruct.session_check import odd_responses, too_many
 
 _IN_RAYS = 0.5
 """Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to

@@ -46,8 +46,7 @@ from mitsim.optics.terms import Lacking, lacking
 from mitsim.reconstruct.colour import behind
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
-from mitsim.reconstruct.session_side import frame_words
+from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session, frame_words
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""
