@@ -421,7 +421,9 @@ def _tilted(session: Session) -> Callable[[float, Half], Any]:
     return lambda time, half: 0.2 * time * plane
 
 
-def _lamp(drift: float = 0.0, flicker: float = 0.0, step: float = 0.0, ambient: float = 0.0) -> Callable[[Session], None]:
+def _lamp(
+    drift: float = 0.0, flicker: float = 0.0, step: float = 0.0, ambient: float = 0.0
+) -> Callable[[Session], None]:
     def plant(session: Session) -> None:
         count = len(session.order)
         time = np.linspace(0, 1, count)

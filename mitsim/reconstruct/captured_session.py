@@ -523,8 +523,8 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 def _sums(
     readings: _Readings, count: int, job: Job, uniform: FloatArray | None = None
 ) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Return sums over all responses, and the noise variance of each; ``uniform`` (rows, columns) is the uniform response,
-    None: the mean of both sides' first one."""
+    """Return sums over all responses, and the noise variance of each; ``uniform`` (rows, columns) is the uniform
+    response, None: the mean of both sides' first one."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first

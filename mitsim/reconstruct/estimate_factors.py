@@ -35,8 +35,8 @@ LARGEST_ERROR = 0.1
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
 _BLOCKS = 96
-"""Blocks a side, at most, whose mean light is kept of every pair: 29 KiB a pair at 512 pixels, where a block is 6 pixels
-wide, as a feature of the anchor camera's mask is."""
+"""Blocks a side, at most, whose mean light is kept of every pair: 29 KiB a pair at 512 pixels, where a block is as wide
+as a feature of the anchor camera's mask."""
 _NEGATIVE = 0.1
 """Sum over the sum of absolute values below which a uniform response counts as negative: noise alone makes 0.01."""
 _TURNS, _TURNED = 30, 1e-13

@@ -66,6 +66,8 @@ class MovingShadow:
     shares
         (N,) part s of its vector by which each pattern disagrees: 0 if it is right, 2 if its sign is wrong, 1 if it has
         nothing in common with the predicted vector.
+    sure
+        (N,) the same in standard errors of it.
     lines
         (n,) squared deviation of each column from what the others predict, in units of the mean square of columns.
     """
@@ -98,7 +100,10 @@ class MovingShadow:
         self.deviations = deviations / self._unit
         tiny = np.finfo(np.float64).tiny
         self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
-        self.shares = np.real(spectra.conj() * left).sum(axis=0) / np.maximum((squares * own).sum(axis=0), tiny)
+        sizes = np.maximum((squares * own).sum(axis=0), tiny)
+        self.shares = np.real(spectra.conj() * left).sum(axis=0) / sizes
+        # The deviation at each frequency is complex: half of its noise is along the pattern's own spectrum.
+        self.sure = self.shares * np.sqrt(2 * sizes * len(own) / self._unit)
         # Squared deviations that turning a pattern's sign removes from all patterns.
         self.by_turning = 4 * (np.real(spectra.conj() * left) - squares * own).sum(axis=0) / self._unit
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-3)

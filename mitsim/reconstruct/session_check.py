@@ -10,10 +10,10 @@ Therefore the sum S_k of each pair is fitted over all pixels and in time::
 
 with S the usual sum, U the response to uniform light, R_k that to pattern k, and B shapes found in the residual. c is
 the lamp's power, d the unequal power of both halves, l the lag, q the bend of the response to light, s the camera's
-motion in pixels, and a the ambient light. The change of ambient light within a pair is measured in the response, across
-the common vector. Only three acts change the factors: the sign of a response is turned, one frame of a pair replaces
-both, and responses are divided by the lamp's power. Each is accepted if the moving shadow, estimated afterwards, agrees.
-Every other fault is refused or counts in the stated error.
+motion in pixels, and a the ambient light. The change of ambient light within a pair is measured in the response,
+across the common vector. Only three acts change the factors: the sign of a response is turned, one frame of a pair
+replaces both, and responses are divided by the lamp's power. Each is accepted if the moving shadow, estimated
+afterwards, agrees. Every other fault is refused or counts in the stated error.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
+_LIKELY = 2.0
+"""The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
@@ -58,7 +60,7 @@ _NEAR = 5
 """Pairs next in time that give the sum which a wrong pair should have had."""
 _SHAPES = 2
 """Shapes that are looked for in the residual of the sums: a cloud, hot columns; a band's sine and cosine."""
-_ENOUGH = 16, 64
+_ENOUGH = 16, 40
 """Patterns, and sensor rows, from which the moving shadow predicts patterns."""
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
@@ -68,6 +70,10 @@ _NOISY = 4.0
 _WRONG, _UNLIKE = 40.0, 0.1
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
+_FOREIGN = 0.05, 15.0
+"""Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good sessions have
+0.44 at 6 of the latter, and 0.03 at 9; swapped patterns have about 1 at 17 and more, a pattern that is rolled by a line
+0.08 at 22."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
@@ -121,24 +127,58 @@ def frame_words(half: Half) -> str:
 def _shrunk(
     values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the variance
-    that they share, 0 where it cannot be told from 0.
+    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
+    variance that they share, 0 where it cannot be told from 0.
 
-    The variance of the true values is that of all ``good`` ones beyond the noise; where it cannot be told from 0, no
-    value is changed. A value that is sure by itself is kept.
+    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
+    no value is changed. A value that is sure by itself is kept.
     """
-    beyond = np.square(values) - variances
+    beyond, pooled, tiny = np.square(values) - variances, 0.0, np.finfo(np.float64).tiny
     middle = max(float(np.median((beyond / variances)[good])), 0.0)
     usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
-    pooled = 0.0
     for _ in range(4):
         weights = np.where(usual, 1 / np.square(variances + pooled), 0.0)
-        total = max(float(weights.sum()), np.finfo(np.float64).tiny)
+        total = max(float(weights.sum()), tiny)
         pooled = max(float(np.dot(weights, beyond)) / total, 0.0)
-    sure = pooled > _SURE * np.sqrt(2 * np.dot(np.square(weights), np.square(variances))) / total
+    deviation = float(np.sqrt(2 * np.dot(np.square(weights), np.square(variances)))) / total
+    pooled, sure = pooled * (pooled > _LIKELY * deviation), pooled > _SURE * deviation
     prior = np.maximum(pooled if sure else 0.0, np.where(beyond > _SURE**2 * variances, beyond, 0.0))
-    weight = prior / np.maximum(prior + variances, np.finfo(np.float64).tiny)
+    weight = prior / np.maximum(prior + variances, tiny)
     return weight * values, np.where(prior > 0, weight * variances, pooled), pooled if sure else 0.0
+
+
+def _pooled_mean(values: FloatArray, variances: FloatArray) -> float:
+    """Return the mean of all pairs' ``values``, 0 where it cannot be told from 0."""
+    usable = variances > 0
+    middle = float(np.median(values[usable]))
+    usable &= np.abs(values - middle) <= _DEVIATIONS * max(robust_scatter(values[usable], middle), 1e-300)
+    weights = 1 / variances[usable]
+    mean = float(np.average(values[usable], weights=weights))
+    scatter = float(np.average(np.square(values[usable] - mean), weights=weights))
+    return mean if abs(mean) > _SURE * np.sqrt(scatter / usable.sum()) else 0.0
+
+
+def _least_squares(shapes: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (0 for a
+    shape that is zero), and the residual."""
+    sizes = np.sqrt(np.square(shapes).sum(axis=1))
+    scale = np.where(sizes > 0, sizes, np.inf)
+    shapes = shapes / scale[:, None]
+    inverse = np.linalg.pinv(shapes @ shapes.T, rcond=1e-9, hermitian=True)
+    found = inverse @ (shapes @ values)
+    return found / scale, np.diag(inverse) / scale**2, values - found @ shapes
+
+
+def _shared_shape(rest: FloatArray) -> FloatArray | None:
+    """Return a shape that the residuals ``rest`` (2 N, P) of many pairs share; None if there is none."""
+    values, vectors = np.linalg.eigh(rest @ rest.T)
+    noise = float(np.median(np.square(rest).mean(axis=1)))
+    edge = noise * (np.sqrt(rest.shape[1]) + np.sqrt(len(rest))) ** 2
+    for value, vector in zip(values[:-4:-1], vectors.T[:-4:-1], strict=True):
+        # The inverse is the number of pairs that have the shape.
+        if value > 1.3 * edge and np.sum(vector**4) * 2 * MOST_FAULTS * len(rest) < 1:
+            return np.asarray(vector @ rest / np.sqrt(value))
+    return None
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -248,17 +288,19 @@ class Lamp:
 
     def warnings(self) -> Iterator[str]:
         """Yield a sentence on drift and on flicker, where there is any."""
-        done = f"frames are divided by its power, and {self.remaining:.1e} is left" if self.corrected else "not corrected"
-        if self.drift:
-            yield (
-                f"lamp: its power drifts by {self.drift:+.1%} over the session, a factor error of "
-                f"{self.drift_cost:.1e} if nothing is done; {done}: let it warm up"
-            )
-        if self.flicker:
-            yield (
-                f"lamp: its power flickers by {self.flicker:.2%} from frame to frame, a factor error of "
-                f"{self.flicker_cost:.1e} if nothing is done; {done}: use a steadier one, or expose for whole periods"
-            )
+        drift, flicker = (
+            f"drifts by {self.drift:+.1%} over the session",
+            f"flickers by {self.flicker:.2%} between frames",
+        )
+        for size, words, cost, remedy in (
+            (self.drift, drift, self.drift_cost, "let it warm up"),
+            (self.flicker, flicker, self.flicker_cost, "use a steadier one, or expose for whole periods"),
+        ):
+            if size:
+                yield (
+                    f"lamp: its power {words}, a factor error of {cost:.1e} if nothing is done; frames are divided by "
+                    f"its power, and {self.remaining:.1e} is left: {remedy}"
+                )
 
 
 @dataclass
@@ -348,15 +390,16 @@ class _Side:
     def __init__(self, sums: StripeSums, other: StripeSums, axis: int) -> None:
         self.sums, self.uniform, self.axis = sums, other.common, axis
         self.side: Side = SIDES[axis]
-        self.vectors = sums.vectors.copy()
+        self.vectors, self.misfits = sums.vectors.copy(), sums.misfits
         self.extras: dict[str, float] = {}
         self.uncounted: set[int] = set()
-        self.pairs = PairLight.together(sums.pairs) if sums.pairs else None
-        self.misfits = sums.misfits.copy()
-        if self.pairs is not None and not sums.centre:  # ambient light that changes within pairs is no noise
-            self.misfits -= ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
+        self.square = float(np.dot(sums.common, sums.common))
+        if sums.pairs:
+            self.pairs = PairLight.together(sums.pairs)
+            if not sums.centre:  # ambient light that changes within pairs is no noise
+                self.misfits = sums.misfits - ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
-        self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
+        self.noise = self.variance * len(self.vectors) / self.square
 
     @property
     def size(self) -> float:
@@ -377,194 +420,168 @@ class _Check:
     """A session while it is checked. Pairs of both sides are numbered one after the other."""
 
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
-        self.signs, self.taken, self.count = signs, taken, signs.shape[1]
+        self.sums, self.signs, self.taken, self.count = sums, signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
-        self.paired = all(own.pairs is not None for own in self.sides)
+        self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
         self.faults: list[SessionFault] = []
         self.doubts: dict[str, str] = {}
         self.lamp, self.ambient_moved = Lamp(), 0.0
-        places = {half: place / max(len(taken.order) - 1, 1) for place, half in enumerate(taken.order)}
-        self.times = np.array([
-            np.mean([places[half] for half in self._halves(own, index) if half in places])
-            for own in self.sides
-            for index in range(self.count)
-        ])  # fmt: skip
         self.enough = self.count >= _ENOUGH[0] and min(len(own.vectors) for own in self.sides) >= _ENOUGH[1]
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
         return [(own.side, index, sign) for sign in ((1, -1) if self.paired else (1,))]
 
-    def _refuse(self, wrong: Sequence[tuple[_Side, int]], reason: str, remedy: str = "take them again") -> NoReturn:
-        """Raise MitsimError that names the frames of patterns."""
-        names = [self.taken.name(half) for own, index in wrong for half in self._halves(own, index)]
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; {remedy}")
-
     def _of(self, own: _Side, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return those of the ``values`` (2 N, ...) that belong to a side."""
         return values[own.axis * self.count : (own.axis + 1) * self.count]
 
+    def _noise(self) -> float:
+        return float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
+
+    def _refuse(self, wrong: Sequence[tuple[_Side, int]], reason: str) -> NoReturn:
+        """Raise MitsimError that names the frames of ``wrong`` patterns."""
+        names = [self.taken.name(half) for own, index in wrong for half in self._halves(own, index)]
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
+
     def result(self, uniform_given: bool) -> CheckedSession:
-        sums, contaminated = (self.sides[0].sums, self.sides[1].sums), None
+        uniform = None
         if self.paired:
-            bad = self._check_sums()
+            bad = self._fit_sums()
             if self.taken.saturated and too_many(int(bad.sum()), self.count):
-                return CheckedSession(sums)
+                return CheckedSession(self.sums)
             wrong = [(own, int(index)) for own in self.sides for index in np.flatnonzero(self._of(own, bad))]
             if too_many(len(wrong), self.count):
                 raise MitsimError(
                     f"all frames: the two frames of {len(wrong)} of {2 * self.count} patterns do not add up to what "
                     "others do; check the frames' order and what was shown, and take the session again"
                 )
-            uniforms = [own for own, index in wrong if index == 0]
+            uniforms = [(own, 0) for own, index in wrong if index == 0]
             if len(uniforms) == 2:
-                self._refuse([(own, 0) for own in uniforms], "the uniform frames of both sides do not add up")
+                self._refuse(uniforms, "the uniform frames of both sides do not add up to what others do")
             if uniforms and not uniform_given:
-                names = [self.taken.name(half) for half in self._halves(uniforms[0], 0)]
-                doubt = f"frames: {' and '.join(names)}: the uniform frames of one side are wrong"
-                return CheckedSession(sums, doubts=[doubt], uniform=self._uniform(1 - uniforms[0].axis))
+                names = " and ".join(self.taken.name(half) for half in self._halves(*uniforms[0]))
+                doubt = f"frames: {names}: the uniform frames of one side are wrong; take them again"
+                return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform(1 - uniforms[0][0].axis))
             self._correct()
-            contaminated = None if uniform_given or not self._is_contaminated() else self._uniform()
+            powers = self.values[[0, self.count], 1]
+            # Ambient light or power that differ in the uniform frames are in the vectors that all responses share.
+            if not uniform_given and (
+                abs(powers[0] - powers[1]) > _SLIGHT or self.ambient_moved > (_MATTERS * self._noise()) ** 2
+            ):
+                uniform = self._uniform()
             for own, index in wrong:
-                self._use_one_frame(own, index, bad)
+                self._use_one_frame(own, index)
         elif self.taken.wrong:
-            wrong_ones = {(self.sides[SIDES.index(side)], index) for side, index, _ in self.taken.wrong}
-            self._refuse(sorted(wrong_ones, key=lambda one: (one[0].axis, one[1])), next(iter(self.taken.wrong.values())))
+            known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
+            self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
         for own in self.sides:
             self._check_shadow(own)
-            self._count_rounding(own)
-            self._count_dark_rows(own)
-        return self._judge(contaminated)
+            self._count_rounding_and_dark_rows(own)
+        return self._judge(uniform)
 
     # ---- sums of pairs -----------------------------------------------------------------------------------------------
 
-    def _check_sums(self) -> npt.NDArray[np.bool_]:
+    def _fit_sums(self) -> npt.NDArray[np.bool_]:
         """Fit the sums of all pairs; return (2 N,) whether pairs do not fit."""
-        a, v = (own.uniform for own in self.sides)
-        self.centre = self.sides[0].sums.centre
-        blocks = np.concatenate([own.pairs.blocks for own in self.sides if own.pairs]).astype(np.float64)
+        places = {half: place for place, half in enumerate(self.taken.order)}
+        halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
+        self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
+        sums = np.concatenate([own.pairs.blocks for own in self.sides]).astype(np.float64)
         if self.centre:
-            rows, columns = blocks.mean(axis=2, keepdims=True), blocks.mean(axis=1, keepdims=True)
-            blocks += blocks.mean(axis=(1, 2), keepdims=True) - rows - columns
-        self.shape, sums = blocks.shape[1:], blocks.reshape(len(blocks), -1)
-        self.along = block_means(a, 0), block_means(v, 0)
-        moved = [block_means(np.gradient(each), 0) for each in (a, v)]
-        y, x = (np.linspace(-1, 1, length) for length in self.shape)
-        common = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
+            sums -= sums.mean(axis=2, keepdims=True)
+            sums -= sums.mean(axis=1, keepdims=True)
+        self.shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
+        self.along = [block_means(own.uniform, 0) for own in self.sides]
+        moved = [block_means(np.gradient(own.uniform), 0) for own in self.sides]
+        fixed = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
         if not self.centre:
-            common += [np.ones(self.shape), np.outer(y, np.ones(len(x))), np.outer(np.ones(len(y)), x)]
+            one, place = (
+                [make(length) for length in self.shape] for make in (np.ones, lambda k: np.linspace(-1, 1, k))
+            )
+            fixed += [np.outer(*one), np.outer(place[0], one[1]), np.outer(one[0], place[1])]
         shown = [block_means(own.sums.vectors, 0) for own in self.sides]
-        squares = sum(
-            np.outer(*(np.square(each).mean(axis=1) if number == own.axis else np.square(self.along[number])
-                       for number, each in enumerate((shown[0], shown[1]))))
-            for own in self.sides
-        ) / 2  # fmt: skip
-
-        def response(axis: int, index: int) -> FloatArray:
-            own = shown[axis][:, index]
-            return np.outer(own, self.along[1]) if axis == 0 else np.outer(self.along[0], own)
-
-        before = dict(zip(self.taken.order[1:], self.taken.order, strict=False))
-        usual, self.good = np.median(sums, axis=0), np.ones(len(sums), bool)
-        self.lag = self.bend = 0.0
-        shapes: list[FloatArray] = []
+        responses = np.concatenate([
+            np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
+        ]).reshape(len(sums), -1)  # fmt: skip
+        first = np.arange(2) * self.count
+        bent = np.square(responses)
+        bent -= np.delete(bent, first, axis=0).mean(axis=0)
+        lagged, self.own_before = np.zeros_like(sums), np.zeros(len(sums))
+        numbers = {half: number for number, each in enumerate(halves) for half in each}
+        for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
+            if numbers[last] == numbers[half]:
+                self.own_before[numbers[half]] += last[2] / 2
+            else:
+                lagged[numbers[half]] += last[2] / 2 * responses[numbers[last]]
+        responses[first] = bent[first] = 0.0  # the uniform pattern has one lit frame
+        usual, self.lag, self.bend = np.median(sums, axis=0), 0.0, 0.0
+        shapes = [each.ravel() for each in fixed]
         for turn in range(2 + _SHAPES):
+            pooled = usual + self.lag * lagged + self.bend * bent if self.lag or self.bend else usual[None]
             found = [
-                self._fit(own, index, sums[own.axis * self.count + index] - usual, response, before, common + shapes, squares, not turn)
-                for own in self.sides for index in range(self.count)
-            ]  # fmt: skip
-            rest = np.stack([each[2] for each in found])
-            self.values, variances = (np.stack([each[part] for each in found]) for part in (0, 1))
+                _least_squares(np.stack([response, *shapes, *([lagged[k], bent[k]] if not turn else [])]), one)
+                for k, (response, one) in enumerate(zip(responses, sums - pooled, strict=True))
+            ]
+            self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
             if not turn:
                 usual = usual + np.median(rest, axis=0)
-                self.lag, self.bend = (self._pooled(self.values[:, -part], variances[:, -part]) for part in (2, 1))
-            else:
-                shape = self._shape_in(rest) if len(shapes) < _SHAPES else None
-                if shape is None:
-                    break
+                self.lag, self.bend = (_pooled_mean(self.values[:, part], variances[:, part]) for part in (-2, -1))
+            elif len(shapes) < len(fixed) + _SHAPES and (shape := _shared_shape(rest)) is not None:
                 shapes.append(shape)
+            else:
+                break
         squared = np.square(rest).mean(axis=1)
         area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-14 * float(np.square(usual).mean()))
-        self.variances = variances * noise
+        self.variances, spent = variances * noise, variances.shape[1]
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        shape_part = self.values[:, 1 + len(common) :] @ np.array([each.ravel() for each in shapes]).reshape(len(shapes), -1) if shapes else 0.0
+        other = (
+            rest + self.values[:, 1 + len(fixed) :] @ np.array(shapes[len(fixed) :])
+            if len(shapes) > len(fixed)
+            else rest
+        )
         excess, alone = [], []
         for own in self.sides:
-            common_vector = self.along[1 - own.axis]
-            square = float(np.dot(common_vector, common_vector))
-
-            def energy(values: FloatArray, own: _Side = own, along: FloatArray = common_vector, square: float = square) -> FloatArray:
-                frames = values.reshape(-1, *self.shape)
-                projected = (frames @ along if own.axis == 0 else along @ frames) / square
-                projected = projected - projected.mean(axis=1, keepdims=True) if self.centre else projected
-                return np.asarray(np.square(projected).sum(axis=1) * len(own.vectors) / self.shape[own.axis])
-
-            expected = noise / square * len(own.vectors) * (1 - len(found[0][0]) / self.shape[own.axis])
-            excess.append(energy(self._of(own, rest + shape_part)) - expected)
-            alone.append(energy(self._of(own, rest)) / max(expected, 1e-300))
+            expected = noise / self._along_square(own) * len(own.vectors) * (1 - spent / self.shape[own.axis])
+            deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
+            beyond = self._energy_along(own, other) - expected
+            excess.append(beyond * (beyond.sum() > _LIKELY * deviation))
+            alone.append(self._energy_along(own, rest) / max(expected, 1e-300))
         self.excess = np.concatenate(excess)
-        bad = np.zeros(len(squared), bool)
+        known = {numbers[half] for half in self.taken.wrong}
+        # Where one frame of a pair is black, power cannot be divided out.
+        bad = np.isin(np.arange(len(sums)), sorted(known)) | (np.abs(self.values[:, 0]) > _ALONE)
         for measure in (squared / noise, np.concatenate(alone)):
             middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > np.maximum(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
-        known = {(side, index) for side, index, _ in self.taken.wrong}
-        bad |= [(own.side, index) in known for own in self.sides for index in range(self.count)]
+            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
         self.good = ~bad
-        return np.asarray(bad)
+        return bad
 
-    def _fit(self, own, index, sums, response, before, common, squares, pool):
-        """Fit the deviation of one pair's sum; return the coefficients of R_k, the ``common`` shapes and, to ``pool``
-        them, R_(k-1) and R_k^2, which are known otherwise; their variances for noise of variance 1, and the residual."""
-        first = response(own.axis, index) if index else np.zeros(self.shape)
-        lagged = np.zeros(self.shape)
-        for half in self._halves(own, index):
-            if (last := before.get(half)) and last[:2] != half[:2]:
-                lagged = lagged + last[2] / 2 * response(SIDES.index(last[0]), last[1])
-        bent = np.square(first) - squares if index else first
-        parts = [first, *common, *([lagged, bent] if pool else [])]
-        shapes = np.stack([part.ravel() for part in parts])
-        sizes = np.sqrt(np.square(shapes).sum(axis=1))
-        shapes /= np.where(sizes > 0, sizes, 1.0)[:, None]
-        inverse = np.linalg.pinv(shapes @ shapes.T, rcond=1e-9, hermitian=True)
-        if not pool and (self.lag or self.bend):
-            sums = sums - (self.lag * lagged + self.bend * bent).ravel()
-        values = inverse @ (shapes @ sums)
-        scale = np.where(sizes > 0, sizes, np.inf)
-        return values / scale, np.diag(inverse) / scale**2, sums - values @ shapes
+    def _along_square(self, own: _Side) -> float:
+        return max(float(np.square(self.along[1 - own.axis]).sum()), 1e-300)
 
-    def _shape_in(self, rest: FloatArray) -> FloatArray | None:
-        """Return a shape that the residuals ``rest`` of many pairs share; None if there is none."""
-        values, vectors = np.linalg.eigh(rest @ rest.T)
-        noise = float(np.median(np.square(rest).mean(axis=1)))
-        edge = noise * (np.sqrt(rest.shape[1]) + np.sqrt(len(rest))) ** 2
-        for place in (-1, -2, -3):
-            part = np.square(vectors[:, place])
-            if values[place] > 1.3 * edge and 1 / np.square(part).sum() > 2 * MOST_FAULTS * len(rest):
-                return np.asarray((vectors[:, place] @ rest).reshape(self.shape))
-        return None
-
-    # ---- the uniform response ----------------------------------------------------------------------------------------
-
-    def _is_contaminated(self) -> bool:
-        """Return True if ambient light or power differ in the uniform frames so much that all vectors suffer."""
-        powers = [self.values[own.axis * self.count, 1] for own in self.sides]
-        return bool(abs(powers[0] - powers[1]) > _SLIGHT or self.ambient_moved > (_MATTERS * self._noise()) ** 2)
+    def _energy_along(self, own: _Side, rest: FloatArray) -> FloatArray:
+        """Return (N,) squared length of the vectors that the residuals ``rest`` of a side have along the common one."""
+        frames, common = self._of(own, rest).reshape(-1, *self.shape), self.along[1 - own.axis]
+        vectors = (frames @ common if own.axis == 0 else common @ frames) / self._along_square(own)
+        if self.centre:
+            vectors = vectors - vectors.mean(axis=1, keepdims=True)
+        return np.asarray(np.square(vectors).sum(axis=1) * len(own.vectors) / self.shape[own.axis])
 
     def _uniform(self, alone: int | None = None) -> FloatArray:
         """Return the uniform response whose vectors are those that the other patterns share, and whose size is that of
         the uniform frames of both sides, or of one ``alone``."""
-        found = []
-        for own in self.sides:
-            assert own.pairs is not None
-            used = self._of(own, self.good)
-            found.append(own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum())
-        right, left = found
+        right, left = (
+            own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum()
+            for own, used in ((own, self._of(own, self.good)) for own in self.sides)
+        )
         sizes = []
         for own, vector, common in zip(self.sides, (left, right), (right, left), strict=True):
             # D_0 = g vector common^T and ambient light, projected on the common vector of the sums.
             parts = np.column_stack([vector, np.vander(np.linspace(-1, 1, len(vector)), 2)])
-            share = float(np.dot(common, own.sums.common) / np.dot(own.sums.common, own.sums.common))
+            share = float(np.dot(common, own.sums.common)) / own.square
             sizes.append(abs(float(np.linalg.lstsq(parts, own.sums.vectors[:, 0], rcond=None)[0][0])) / share)
         return np.outer(left, right) * (np.mean(sizes) if alone is None else sizes[alone])
 
@@ -572,197 +589,144 @@ class _Check:
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        good = self.good
+        ends = np.split(np.argsort(self.times), [max(4, len(self.times) // 16), -max(4, len(self.times) // 16)])[::2]
+        moved = 0.0
         for own in self.sides:
-            own.add("sums", float(self._of(own, self.excess)[self._of(own, good)].sum()))
+            good = self._of(own, self.good)
+            own.add("sums", float(self._of(own, self.excess)[good].sum()))
             if not self.centre:
                 self._subtract_ambient(own)
-        self._count_lag_and_bend(self.lag, 2 * self.bend)
-        self._count_motion(self.values[:, 2:4], self.variances[:, 2:4])
+            # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
+            own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
+            cube = 2 * self.bend * float(np.sum(own.sums.common**3)) / own.square
+            own.add("bend", cube**2 * float(np.square(own.uniform[:, None] * own.vectors).sum()))
+            place, noise = self.values[:, 2 + own.axis], self._of(own, self.variances[:, 2 + own.axis])
+            steep = np.square(np.gradient(own.vectors, axis=0)).sum(axis=0)
+            away = [np.square(self._of(own, place) - np.median(place[end])) - noise for end in ends]
+            own.add("motion", max(float((each * steep)[good].sum()) for each in away))
+            moved = max(moved, abs(float(np.median(place[ends[1]]) - np.median(place[ends[0]]))))
+        self.doubts |= {
+            "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
+            "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
+            "motion": f"camera or mask move by {moved:.2g} pixels; fasten them",
+            "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
+        }
         if not self.taken.unsteady:
-            self._divide(self.lag)
-
-    def _pooled(self, values: FloatArray, variances: FloatArray) -> float:
-        """Return the mean of all pairs' ``values``, 0 where it cannot be told from 0."""
-        usable = variances > 0
-        if usable.sum() < 2:
-            return 0.0
-        middle = float(np.median(values[usable]))
-        usable &= np.abs(values - middle) <= _DEVIATIONS * max(robust_scatter(values[usable], middle), 1e-300)
-        weights = 1 / variances[usable]
-        mean = float(np.dot(weights, values[usable]) / weights.sum())
-        scatter = float(np.dot(weights, np.square(values[usable] - mean)) / weights.sum())
-        return mean if abs(mean) > _SURE * np.sqrt(scatter / usable.sum()) else 0.0
+            self._divide()
 
     def _subtract_ambient(self, own: _Side) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        assert own.pairs is not None
-        common, found = own.sums.common, own.pairs.ambient
-        across, along, inverse = ambient_shapes(common, len(own.vectors))
-        parts = np.array([1.0, 0.0]) @ self._shares(common), np.array([0.0, 1.0]) @ self._shares(common)
-        effects = np.stack([np.full(len(along), parts[0]), along * parts[0], np.full(len(along), parts[1])])
-        scales = np.array([inverse[0, 0] / len(along), inverse_slope(across, along), inverse[1, 1] / len(along)])
-        moved = 0.0
-        for part in range(3):
-            noise = np.full(self.count, own.variance * scales[part])
-            kept, left, _ = _shrunk(found[:, part], noise, self._of(own, self.good))
-            own.vectors -= np.outer(effects[part], kept)
-            own.add("ambient", float(left.sum() * np.square(effects[part]).sum()))
-            moved += float(np.square(kept).sum() * np.square(effects[part]).sum())
-        self.ambient_moved += moved / own.size
+        common, length = own.sums.common, len(own.vectors)
+        across, along, inverse = ambient_shapes(common, length)
+        shares = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))]) @ common / own.square
+        effects = np.full(length, shares[0]), along * shares[0], np.full(length, shares[1])
+        scales = inverse[0, 0] / length, inverse_slope(across, along), inverse[1, 1] / length
+        for found, effect, scale in zip(own.pairs.ambient.T, effects, scales, strict=True):
+            kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), self._of(own, self.good))
+            own.vectors -= np.outer(effect, kept)
+            own.add("ambient", float(left.sum() * np.square(effect).sum()))
+            self.ambient_moved += float(np.square(kept).sum() * np.square(effect).sum()) / own.size
 
-    @staticmethod
-    def _shares(common: FloatArray) -> FloatArray:
-        """Return what the shapes 1 and x add to a vector that is projected on the ``common`` one."""
-        shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))])
-        return np.asarray(shapes @ common / np.dot(common, common))
+    def _divide(self) -> None:
+        """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
 
-    def _count_lag_and_bend(self, lag: float, bend: float) -> None:
-        for own in self.sides:
-            # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
-            own.add("lag", lag**2 * (0.75**2 + 0.5**2) * own.size)
-            common = own.sums.common
-            cube = float(np.sum(common**3) / np.dot(common, common))
-            own.add("bend", (bend * cube) ** 2 * float(np.square(own.uniform[:, None] * own.vectors).sum()))
-        self.doubts["lag"] = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
-        self.doubts["bend"] = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
-
-    def _count_motion(self, values: FloatArray, variances: FloatArray) -> None:
-        first = np.argsort(self.times)[: max(4, len(values) // 16)]
-        last = np.argsort(self.times)[-max(4, len(values) // 16) :]
-        moved = 0.0
-        for own in self.sides:
-            steep = np.square(np.gradient(own.vectors, axis=0)).sum(axis=0)
-            here, good = self._of(own, values[:, own.axis]), self._of(own, self.good)
-            noise = self._of(own, variances[:, own.axis])
-            energies = []
-            for ends in (first, last):
-                start = float(np.median(values[ends, own.axis]))
-                energies.append(float(((np.square(here - start) - noise) * steep)[good].sum()))
-            own.add("motion", max(energies))
-            moved = max(moved, float(np.ptp(here[good])) if good.any() else 0.0)
-        self.doubts["motion"] = f"camera or mask move by {moved:.2g} pixels; fasten them"
-
-    def _divide(self, lag: float) -> None:
-        """Divide vectors by the lamp's power in each frame, which Y+ has 1 + d / c of, and Y- 1 - d / c."""
-        good, unequal, power = self.good, self.values[:, 0].copy(), self.values[:, 1]
-        for own in self.sides:
-            for index in range(self.count):
-                before = dict(zip(self.taken.order[1:], self.taken.order, strict=False))
-                last = [before.get(half) for half in self._halves(own, index)]
-                own_part = sum(half[2] for half in last if half and half[:2] == (own.side, index))
-                unequal[own.axis * self.count + index] -= lag * own_part / 2
-        first = [own.axis * self.count for own in self.sides]
+        D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
+        """
+        power, ratio = self.values[:, 1], self.values[:, 0] - self.lag * self.own_before
+        first = np.arange(2) * self.count
         unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
-        alone = np.abs(unequal) > _ALONE
-        usable = good & ~alone
-        both = (1 + power * unit) / np.where(alone, 1.0, 1 - np.square(unequal))
-        variances = self.variances[:, 1] * unit**2
-        degree = min(3, max(len(np.unique(self.times)) // 4, 0))
-        kept = usable.copy()
+        usable = self.good
+        both = (1 + power * unit) / (1 - np.square(np.where(usable, ratio, 0.0)))
+        degree, kept = min(3, max(len(np.unique(self.times)) // 4, 0)), usable
         for _ in range(4):
             trend = np.polynomial.Polynomial.fit(self.times[kept], both[kept], degree)(self.times)
             away = np.abs(both - trend)
             kept = usable & (away <= _DEVIATIONS * max(robust_scatter(away[usable]), 1e-12))
         both, trend = both / float(np.mean(trend)), trend / float(np.mean(trend))
-        changes = float(np.var(trend[usable])) > _SURE**2 * float(np.median(variances)) * (degree + 1) / usable.sum()
-        trend = trend if changes else np.ones(len(both))
-        deviations, left, shaken = _shrunk(both - trend, variances, usable)
-        patterned = self.variances[:, 0] > 0  # the uniform pattern has one lit frame
-        unequal, left_unequal, uneven = _shrunk(unequal, np.where(patterned, self.variances[:, 0], 1.0), usable & patterned)
-        powers = np.where(usable, trend + deviations, trend)
-        unequal = np.where(usable, unequal, 0.0)
-        mean, flickers = float(np.sqrt(np.mean(powers[first]))), float(np.sqrt(shaken + uneven))
+        variances = self.variances[:, 1] * unit**2
+        drifts = np.var(trend) > _SURE**2 * np.median(variances) * (degree + 1) / usable.sum()
+        trend = trend if drifts else np.ones(len(both))
+        own_power, left, shaken = _shrunk(both - trend, variances, usable)
+        patterned = self.variances[:, 0] > 0
+        ratio, left_ratio, uneven = _shrunk(ratio, np.where(patterned, self.variances[:, 0], 1.0), usable & patterned)
+        own_power, ratio = np.where(usable, own_power, 0.0), np.where(usable & patterned, ratio, 0.0)
+        powers, flicker = trend + own_power, float(np.sqrt(shaken + uneven))
+        mean = float(np.sqrt(np.mean(powers[first])))
+        # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
+        bent = own_power[first] / trend[first]
+        bent = float(np.abs(bent).min()) if bent[0] * bent[1] > 0 else 0.0
         costs = np.zeros(2)
         for own in self.sides:
-            c, ratio = self._of(own, powers), self._of(own, unequal).copy()
-            ratio[0] = 0.0
-            size, whole = own.size, float(np.square(own.uniform).sum())
-            energies = np.square(own.vectors).sum(axis=0)
-            keep = self._of(own, usable)
-            costs += (
-                float(np.square(self._of(own, trend) - 1)[keep] @ energies[keep]) / size,
-                float((np.square(c - self._of(own, trend)) @ energies + np.square(ratio).sum() * whole) / size),
-            )
-            noise = own.noise * float((np.square(1 / np.where(keep, c, 1.0)) - 1)[keep].clip(0).sum())
-            own.vectors = (own.vectors - np.outer(own.uniform / mean**2, ratio * c)) / c * mean
-            own.add("lamp", noise + float(self._of(own, left)[keep] @ energies[keep] + self._of(own, left_unequal)[keep][1:].sum() * whole))
+            size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
+            c, d, slow, keep = (self._of(own, each) for each in (powers, powers * ratio, trend, usable))
+            costs += [np.square(slow - 1) @ energies / size, (np.square(c - slow) @ energies + d @ d * whole) / size]
+            own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
+            noise = own.noise * float((1 / np.square(c) - 1)[keep].clip(0).sum())
+            lost = self._of(own, left) * energies + self._of(own, left_ratio * patterned) * whole
+            # The factors are those of the mean power; a capture may have any that the session had.
+            range_ = float(np.abs(trend - 1).max()) / 2
+            own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
+            own.add("bend", (bent / 2) ** 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
             for index in np.flatnonzero(keep):
-                part = float(c[index] / self._of(own, trend)[index])
-                self._name_power(own, int(index), part, float(ratio[index]), max(_SLIGHT, _DEVIATIONS * flickers))
-        drift, flicker = np.sqrt(costs)
-        order = np.argsort(self.times)
-        change = float(trend[order[-1]] - trend[order[0]]) if changes else 0.0
-        if changes:  # the factors are those of the mean power; the capture may have any
-            for own in self.sides:
-                own.add("lamp", (float(np.abs(trend[usable] - 1).max()) / 2) ** 2 * own.size)
-        # Two uniform frames that both differ from the sums alike are no lamp: light and numbers are not in proportion.
-        own_parts = (powers / trend)[first] - 1
-        bent = float(np.abs(own_parts).min()) if own_parts[0] * own_parts[1] > 0 else 0.0
-        if bent > max(_SLIGHT / 2, 3 * flickers):
-            for own in self.sides:
-                own.add("bend", (bent / 2) ** 2 * own.size)
-        noise = self._noise()
+                part = (
+                    float(own_power[own.axis * self.count + index]) / float(slow[index]),
+                    float(ratio[own.axis * self.count + index]),
+                )
+                sign = 1 if part[0] * part[1] >= 0 else -1
+                beyond = part[0] + sign * part[1]
+                if abs(beyond) > max(_SLIGHT, _DEVIATIONS * flicker) and (
+                    index == 0 or abs(part[0] - sign * part[1]) < abs(beyond) / 4
+                ):
+                    detail, repair = f"it has {1 + beyond:.3g} of its light", "its response is divided by that"
+                    self.faults.append(SessionFault(own.side, int(index), sign, "power", detail, repair))
+        drift, flickers = (float(cost) if cost > _MATTERS * self._noise() else 0.0 for cost in np.sqrt(costs))
+        change = float(trend[np.argmax(self.times)] - trend[np.argmin(self.times)])
         remaining = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
-        self.lamp = Lamp(
-            change if drift > _MATTERS * noise else 0.0,
-            flickers if flicker > _MATTERS * noise else 0.0,
-            float(drift), float(flicker), remaining, bool(drift or flicker),
-        )  # fmt: skip
-
-    def _name_power(self, own: _Side, index: int, power: float, ratio: float, least: float) -> None:
-        """Report a frame whose own power differs from the lamp's by more than the ``least``."""
-        each = {1: power * (1 + ratio) - 1, -1: power * (1 - ratio) - 1}
-        sign = max(each, key=lambda one: abs(each[one]))
-        if abs(each[sign]) > least and (index == 0 or abs(each[-sign]) < abs(each[sign]) / 4):
-            detail = f"it has {1 + each[sign]:.3g} of its light"
-            self.faults.append(SessionFault(own.side, index, sign, "power", detail, "its response is divided by that"))
-
-    def _noise(self) -> float:
-        return float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
+        corrected = bool(drift or flickers)
+        self.lamp = Lamp(change * bool(drift), flicker * bool(flickers), drift, flickers, remaining, corrected)
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
-    def _use_one_frame(self, own: _Side, index: int, bad: npt.NDArray[np.bool_]) -> None:
+    def _use_one_frame(self, own: _Side, index: int) -> None:
         """Replace a response by twice one of its frames less the usual sum; refused unless the moving shadow agrees."""
-        assert own.pairs is not None
-        known = [sign for side, place, sign in self.taken.wrong if (side, place) == (own.side, index)]
+        known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = self.taken.wrong[own.side, index, known[0]] if known else "the two do not add up to what others do"
         own.uncounted.add(index)
         if index == 0:
             own.vectors[:, 0] = own.uniform
-            self.faults.append(SessionFault(own.side, 0, None, "replaced", reason, "those of the other side replace them"))
+            repair = "those of the other side replace them"
+            self.faults.append(SessionFault(own.side, 0, None, "replaced", reason, repair))
             return
-        times, right = self._of(own, self.times), ~self._of(own, bad)
-        near = np.flatnonzero(right)[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
-        usual = np.median(own.pairs.light[:, near], axis=1)
-        away = own.pairs.light[:, index] - usual
-        tried = {-sign: own.sums.vectors[:, index] + sign * away for sign in (1, -1) if -sign not in known or len(known) == 2}
-        scores = {}
-        for wrong, vector in ({} if len(known) == 2 or not self.enough else tried).items():
-            own.vectors[:, index] = vector
-            shadow = MovingShadow(own.vectors, self.signs)
-            scores[wrong] = float(shadow.deviations[index]), float(shadow.unlike[index])
-        fits = {wrong: score for wrong, score in scores.items() if score[0] <= _WRONG or score[1] <= _UNLIKE}
-        if not fits:
+        times = self._of(own, self.times)
+        right = np.flatnonzero(self._of(own, self.good))
+        near = right[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
+        away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
+        tried, scores = {}, dict[int, float]()
+        for wrong in known or (1, -1):
+            tried[wrong] = own.sums.vectors[:, index] - wrong * away
+            if self.enough and len(known) < 2:
+                own.vectors[:, index] = tried[wrong]
+                shadow = MovingShadow(own.vectors, self.signs)
+                if shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE:
+                    scores[wrong] = float(shadow.deviations[index])
+        if not scores:
             self._refuse([(own, index)], reason)
-        sign = min(fits, key=lambda wrong: scores[wrong][0])
+        sign = min(scores, key=lambda wrong: scores[wrong])
         own.vectors[:, index] = tried[sign]
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
         error = 1.5 * own.noise
-        if len(fits) > 1 and scores[sign][0] > scores[-sign][0] / 2:  # the shadow does not decide between the frames
+        if len(scores) > 1 and scores[sign] > scores[-sign] / 2:  # the shadow does not decide between the frames
             error += float(np.square(away).sum())
         own.add("replaced", error)
-        cost = float(np.sqrt(error / own.size))
-        repair = "the other frame of its pair replaces it"
+        repair, cost = "the other frame of its pair replaces it", float(np.sqrt(error / own.size))
         self.faults.append(SessionFault(own.side, index, sign, "replaced", reason, repair, cost=cost))
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns and lines that are foreign."""
-        sums, turned = own.sums, set[int]()
+        sums, turned, foreign = own.sums, set[int](), list[int]()
         odd = odd_responses(sums.misfits, sums.energies, len(own.vectors) * len(sums.common))
-        if foreign := [int(index) for index in odd if index not in own.uncounted]:
-            self._refuse([(own, index) for index in foreign], f"they show no {own.side} stripes")
+        if shapeless := [(own, int(index)) for index in odd if index not in own.uncounted]:
+            self._refuse(shapeless, f"they show no {own.side} stripes")
 
         def turn(indices: Sequence[int]) -> None:
             own.vectors[:, indices] *= -1
@@ -770,89 +734,92 @@ class _Check:
 
         if np.dot(own.vectors[:, 0], own.uniform) < 0:
             turn([0])
-        if self.enough:
-            foreign = []
-            for _ in range(int(MOST_FAULTS * self.count) + 3):
-                shadow = MovingShadow(own.vectors, self.signs, foreign)
-                far = np.where((shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE), shadow.deviations, 0.0)
-                gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
-                far[[0, *foreign]] = gains[foreign] = 0.0
-                best = int(np.argmax(gains))
-                if gains[0] > _WRONG and shadow.unlike[0] > _UNLIKE:
-                    turn(range(1, self.count))  # the sign of pattern 0 is known
-                elif best and gains[best] > max(_LEAST, _TURNED * far.max()):
-                    turn([best])
-                elif far.any():
-                    foreign.append(int(np.argmax(far)))
-                else:
-                    break
-            if foreign:
-                wrong = [(own, index) for index in sorted(foreign)]
-                self._refuse(wrong, f"not the {own.side} stripes that the others foretell")
-            if shadow.lines.max() > _LINE:
-                line = int(np.argmax(shadow.lines))
-                raise MitsimError(
-                    f"all frames: line {line} of the {own.side} stripes is not as bright as its neighbours foretell; check "
-                    "the uniform and dark frames and the projector, and take the session again"
-                )
-        elif turned and len(turned) < self.count:
+        for _ in range(int(MOST_FAULTS * self.count) + 3 if self.enough else 0):
+            shadow = MovingShadow(own.vectors, self.signs, foreign)
+            doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
+            doubtful |= (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
+            far = np.where(doubtful, shadow.deviations, 0.0)
+            gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
+            far[[0, *foreign]] = gains[foreign] = 0.0
+            best = int(np.argmax(gains))
+            if gains[0] > _WRONG and shadow.unlike[0] > _UNLIKE:
+                turn(range(1, self.count))  # the sign of pattern 0 is known
+            elif best and gains[best] > max(_LEAST, _TURNED * far.max()):
+                turn([best])
+            elif far.any():
+                foreign.append(int(np.argmax(far)))
+            else:
+                break
+        if foreign:
+            wrong = [(own, index) for index in sorted(foreign)]
+            self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
+        if not self.enough and 0 < len(turned) < self.count:
             self._refuse([(own, index) for index in turned], "they are in each other's place")
-        if len(turned) > max(2, MOST_FAULTS * self.count) and len(turned) < self.count:
-            raise MitsimError("all frames: the frames of many patterns are exchanged; check their order")
+        if max(2, MOST_FAULTS * self.count) < len(turned) < self.count:
+            raise MitsimError("all frames: the two frames of many patterns are exchanged; check their order")
         for index in sorted(turned):
             detail, repair = "in each other's place", "they count in their right order"
             self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
-        if not self.paired and self.enough:
+        if self.enough and shadow.lines.max() > _LINE:
+            raise MitsimError(
+                f"all frames: line {int(np.argmax(shadow.lines))} of the {own.side} stripes is not as bright as its "
+                "neighbours predict; check the projector, uniform and dark frames, and take the session again"
+            )
+        if self.enough and not self.paired:
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)[1:]
             own.add("power", float(np.square(shadow.powers()[1:]) @ shown))
             self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
-    def _count_rounding(self, own: _Side) -> None:
-        """Count the rounding of numbers that noise does not make random: its mean over noise of a standard deviation s,
-        in steps, is a sine of the light of the amplitude exp(-2 pi^2 s^2) / pi, alike in pixels of like light."""
+    def _count_rounding_and_dark_rows(self, own: _Side) -> None:
+        """Count the rounding of numbers that noise does not make random, and sensor rows without light.
+
+        The mean of rounding over noise of a standard deviation s, in steps, is a sine of the light of the amplitude
+        exp(-2 pi^2 s^2) / pi, alike in pixels of like light.
+        """
         if self.taken.step:
             noise = max(own.variance / 2 / self.taken.step**2 - 1 / 12, 0.0)
-            bias = 2 * (self.taken.step * np.exp(-2 * np.pi**2 * noise) / np.pi) ** 2 / 2
-            common = own.sums.common
-            alike = float(np.square(common.sum()) / np.square(np.dot(common, common)))
+            bias = (self.taken.step * np.exp(-2 * np.pi**2 * noise) / np.pi) ** 2
+            alike = float(np.square(own.sums.common.sum() / own.square))
             own.add("rounding", bias * alike * len(own.vectors) * self.count)
-        self.doubts["rounding"] = "steps between numbers are larger than the noise; use more bits or more gain"
-
-    def _count_dark_rows(self, own: _Side) -> None:
-        """Count sensor rows or columns without light between neighbours that have it."""
+            self.doubts["rounding"] = "steps between numbers are larger than the noise; use more bits or more gain"
         light = np.square(own.vectors).sum(axis=1)
         around = np.minimum(light[:-2], light[2:])
         dark = np.flatnonzero(light[1:-1] < _DARK * around)
-        own.add("dark", float(around[dark].sum()))
         if len(dark):
+            own.add("dark", float(around[dark].sum()))
             word = "row" if own.axis == 0 else "column"
             self.doubts["dark"] = f"sensor {word} {dark[0] + 1} shows no light; check the sensor"
 
     def _judge(self, uniform: FloatArray | None) -> CheckedSession:
         """Add up the errors; MitsimError where they are more than a tenth."""
         reasons = {reason for own in self.sides for reason in own.extras}
-        costs = {reason: float(np.sqrt(sum(own.extras.get(reason, 0.0) / own.size for own in self.sides))) for reason in reasons}
-        self.doubts["sums"] = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
-        worst = [reason for reason in sorted(costs, key=lambda one: -costs[one]) if reason in self.doubts]
-        total = float(np.sqrt(sum(cost**2 for cost in costs.values())))
+        squares = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
+        costs = {each: float(np.sqrt(square)) for each, square in squares.items()}
+        worst = sorted(self.doubts.keys() & reasons, key=lambda reason: -costs[reason])
+        total, noise = float(np.sqrt(sum(squares.values()))), self._noise()
         if total > LARGEST_ERROR:
+            reason = self.doubts[worst[0]] if worst else "power and ambient light change"
             raise MitsimError(
-                f"all frames: {self.doubts[worst[0]] if worst else 'power and ambient light change'}: an error of "
-                f"{total:.0%} is left in the factors, allowed are {LARGEST_ERROR:.0%}; take the session again"
+                f"all frames: {reason}: an error of {total:.0%} is left in the factors, allowed are "
+                f"{LARGEST_ERROR:.0%}; take the session again"
             )
-        doubts = []
-        if self.ambient_moved > (_MATTERS * self._noise()) ** 2:
+        doubts = [
+            f"session: {self.doubts[reason]}; the stated error includes {costs[reason]:.1e} for it"
+            for reason in worst
+            if costs[reason] > _MATTERS * noise
+        ]
+        if self.ambient_moved > (_MATTERS * noise) ** 2:
             doubts.append(
                 f"session: ambient light changes between the two frames of pairs, a factor error of "
                 f"{np.sqrt(self.ambient_moved):.1e} if nothing is done; it is subtracted: darken the room"
             )
-        doubts += [
-            f"session: {self.doubts[reason]}; the stated error includes {costs[reason]:.1e} for it"
-            for reason in worst
-            if costs[reason] > _MATTERS * self._noise()
-        ]
-        sums = self.sides[0].result(), self.sides[1].result()
-        left_out = len(self.sides[0].uncounted), len(self.sides[1].uncounted)
-        extra = sum(self.sides[0].extras.values()), sum(self.sides[1].extras.values())
-        order = sorted(self.faults, key=lambda fault: (SIDES.index(fault.side), fault.index))
-        return CheckedSession(sums, order, self.lamp, doubts, left_out, extra, uniform)
+        first, second = self.sides
+        return CheckedSession(
+            (first.result(), second.result()),
+            sorted(self.faults, key=lambda fault: (SIDES.index(fault.side), fault.index)),
+            self.lamp,
+            doubts,
+            (len(first.uncounted), len(second.uncounted)),
+            (sum(first.extras.values()), sum(second.extras.values())),
+            uniform,
+        )
