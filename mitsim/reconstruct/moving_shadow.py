@@ -36,6 +36,13 @@ as well, without it 2 of 600 planted exchanges were missed."""
 _FARTHEST = 0.6
 """Part of the sensor that the shadow moves by at most, from the first scene line to the last: more leaves little that
 both show."""
+_ENOUGH = 16, 40
+"""Patterns, and sensor rows, from which their shadows are compared."""
+_PREDICTED = 0.3
+"""Squared deviation of the median pattern, as a part of its own square, up to which patterns are predicted: 1e-3 in
+most sessions of 32 patterns and more, 0.5 of 16 patterns whose shadow moves by two pixels a line."""
+_KNOWN = 0.1
+"""Part of a column beyond the modes from which the others predict it: at the ends of few lines it is less."""
 _ROUNDING = 1e-12
 """Squared deviation, as a part of the vectors' mean square, that vectors without noise have."""
 
@@ -68,8 +75,11 @@ class MovingShadow:
         nothing in common with the predicted vector.
     sure
         (N,) the same in standard errors of it.
+    predicts
+        whether most patterns are predicted: not by few lines whose shadows have little in common.
     lines
-        (n,) squared deviation of each column from what the others predict, in units of the mean square of columns.
+        (n,) squared deviation of each column from what the others predict, in units of the mean square of columns: 1
+        for a column that is missing, 0 where the others predict nothing.
     """
 
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Sequence[int] = ()) -> None:
@@ -100,14 +110,19 @@ class MovingShadow:
         self.deviations = deviations / self._unit
         tiny = np.finfo(np.float64).tiny
         self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
+        self.predicts = (
+            len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and float(np.median(self.unlike)) < _PREDICTED
+        )
         sizes = np.maximum((squares * own).sum(axis=0), tiny)
         self.shares = np.real(spectra.conj() * left).sum(axis=0) / sizes
         # The deviation at each frequency is complex: half of its noise is along the pattern's own spectrum.
         self.sure = self.shares * np.sqrt(2 * sizes * len(own) / self._unit)
         # Squared deviations that turning a pattern's sign removes from all patterns.
         self.by_turning = 4 * (np.real(spectra.conj() * left) - squares * own).sum(axis=0) / self._unit
-        kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-3)
-        self.lines = np.square(np.abs(rest / kept)).sum(axis=0) / max(float(np.square(np.abs(columns)).sum() / n), tiny)
+        kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
+        seen = (kept * (np.square(np.abs(columns)).sum(axis=1) / n)[:, None]).sum(axis=0)
+        known = kept.mean(axis=0) > _KNOWN
+        self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, tiny), 0.0)
         self._spectra, self._left, self._own = spectra, left, own
 
     def powers(self) -> FloatArray:

@@ -60,8 +60,6 @@ _NEAR = 5
 """Pairs next in time that give the sum which a wrong pair should have had."""
 _SHAPES = 2
 """Shapes that are looked for in the residual of the sums: a cloud, hot columns; a band's sine and cosine."""
-_ENOUGH = 16, 40
-"""Patterns, and sensor rows, from which the moving shadow predicts patterns."""
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
@@ -426,7 +424,6 @@ class _Check:
         self.faults: list[SessionFault] = []
         self.doubts: dict[str, str] = {}
         self.lamp, self.ambient_moved = Lamp(), 0.0
-        self.enough = self.count >= _ENOUGH[0] and min(len(own.vectors) for own in self.sides) >= _ENOUGH[1]
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
         return [(own.side, index, sign) for sign in ((1, -1) if self.paired else (1,))]
@@ -464,10 +461,11 @@ class _Check:
                 doubt = f"frames: {names}: the uniform frames of one side are wrong; take them again"
                 return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform(1 - uniforms[0][0].axis))
             self._correct()
-            powers = self.values[[0, self.count], 1]
+            powers, deviations = self.values[[0, self.count], 1], np.sqrt(self.variances[[0, self.count], 1])
             # Ambient light or power that differ in the uniform frames are in the vectors that all responses share.
             if not uniform_given and (
-                abs(powers[0] - powers[1]) > _SLIGHT or self.ambient_moved > (_MATTERS * self._noise()) ** 2
+                abs(powers[0] - powers[1]) > max(_SLIGHT, _DEVIATIONS * deviations.max())
+                or self.ambient_moved > (_MATTERS * self._noise()) ** 2
             ):
                 uniform = self._uniform()
             for own, index in wrong:
@@ -545,9 +543,10 @@ class _Check:
         excess, alone = [], []
         for own in self.sides:
             expected = noise / self._along_square(own) * len(own.vectors) * (1 - spent / self.shape[own.axis])
+            expected *= 1 + np.pi / 2 / len(sums)  # the usual sum is a median
             deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
             beyond = self._energy_along(own, other) - expected
-            excess.append(beyond * (beyond.sum() > _LIKELY * deviation))
+            excess.append(beyond * (beyond.sum() > _SURE * deviation))
             alone.append(self._energy_along(own, rest) / max(expected, 1e-300))
         self.excess = np.concatenate(excess)
         known = {numbers[half] for half in self.taken.wrong}
@@ -625,7 +624,8 @@ class _Check:
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), self._of(own, self.good))
             own.vectors -= np.outer(effect, kept)
             own.add("ambient", float(left.sum() * np.square(effect).sum()))
-            self.ambient_moved += float(np.square(kept).sum() * np.square(effect).sum()) / own.size
+            moved = np.square(kept)[self._of(own, self.good)].sum()
+            self.ambient_moved += float(moved * np.square(effect).sum()) / own.size
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -690,7 +690,8 @@ class _Check:
     def _use_one_frame(self, own: _Side, index: int) -> None:
         """Replace a response by twice one of its frames less the usual sum; refused unless the moving shadow agrees."""
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
-        reason = self.taken.wrong[own.side, index, known[0]] if known else "the two do not add up to what others do"
+        reason = "the two do not add up to what others do"
+        reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
         own.uncounted.add(index)
         if index == 0:
             own.vectors[:, 0] = own.uniform
@@ -703,12 +704,11 @@ class _Check:
         away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
         tried, scores = {}, dict[int, float]()
         for wrong in known or (1, -1):
-            tried[wrong] = own.sums.vectors[:, index] - wrong * away
-            if self.enough and len(known) < 2:
-                own.vectors[:, index] = tried[wrong]
-                shadow = MovingShadow(own.vectors, self.signs)
-                if shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE:
-                    scores[wrong] = float(shadow.deviations[index])
+            own.vectors[:, index] = tried[wrong] = own.sums.vectors[:, index] - wrong * away
+            shadow = MovingShadow(own.vectors, self.signs)
+            fits = shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE
+            if len(known) < 2 and fits and (known or shadow.predicts):
+                scores[wrong] = float(shadow.deviations[index])
         if not scores:
             self._refuse([(own, index)], reason)
         sign = min(scores, key=lambda wrong: scores[wrong])
@@ -734,8 +734,10 @@ class _Check:
 
         if np.dot(own.vectors[:, 0], own.uniform) < 0:
             turn([0])
-        for _ in range(int(MOST_FAULTS * self.count) + 3 if self.enough else 0):
+        for _ in range(int(MOST_FAULTS * self.count) + 3):
             shadow = MovingShadow(own.vectors, self.signs, foreign)
+            if not shadow.predicts:
+                break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
             doubtful |= (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
             far = np.where(doubtful, shadow.deviations, 0.0)
@@ -753,19 +755,19 @@ class _Check:
         if foreign:
             wrong = [(own, index) for index in sorted(foreign)]
             self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
-        if not self.enough and 0 < len(turned) < self.count:
+        if not shadow.predicts and 0 < len(turned) < self.count:
             self._refuse([(own, index) for index in turned], "they are in each other's place")
         if max(2, MOST_FAULTS * self.count) < len(turned) < self.count:
             raise MitsimError("all frames: the two frames of many patterns are exchanged; check their order")
         for index in sorted(turned):
             detail, repair = "in each other's place", "they count in their right order"
             self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
-        if self.enough and shadow.lines.max() > _LINE:
+        if shadow.predicts and shadow.lines.max() > _LINE:
             raise MitsimError(
                 f"all frames: line {int(np.argmax(shadow.lines))} of the {own.side} stripes is not as bright as its "
                 "neighbours predict; check the projector, uniform and dark frames, and take the session again"
             )
-        if self.enough and not self.paired:
+        if shadow.predicts and not self.paired:
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)[1:]
             own.add("power", float(np.square(shadow.powers()[1:]) @ shown))
             self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
