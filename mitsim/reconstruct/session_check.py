@@ -123,13 +123,13 @@ def frame_words(half: Half) -> str:
 
 
 def _shrunk(
-    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_]
+    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
     variance that they share, 0 where it cannot be told from 0.
 
     The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
-    no value is changed. A value that is sure by itself is kept.
+    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
     """
     beyond, pooled, tiny = np.square(values) - variances, 0.0, np.finfo(np.float64).tiny
     middle = max(float(np.median((beyond / variances)[good])), 0.0)
@@ -140,7 +140,7 @@ def _shrunk(
         pooled = max(float(np.dot(weights, beyond)) / total, 0.0)
     deviation = float(np.sqrt(2 * np.dot(np.square(weights), np.square(variances)))) / total
     pooled, sure = pooled * (pooled > _LIKELY * deviation), pooled > _SURE * deviation
-    prior = np.maximum(pooled if sure else 0.0, np.where(beyond > _SURE**2 * variances, beyond, 0.0))
+    prior = np.maximum(np.maximum(least, pooled if sure else 0.0), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / np.maximum(prior + variances, tiny)
     return weight * values, np.where(prior > 0, weight * variances, pooled), pooled if sure else 0.0
 
@@ -648,7 +648,9 @@ class _Check:
         trend = trend if drifts else np.ones(len(both))
         own_power, left, shaken = _shrunk(both - trend, variances, usable)
         patterned = self.variances[:, 0] > 0
-        ratio, left_ratio, uneven = _shrunk(ratio, np.where(patterned, self.variances[:, 0], 1.0), usable & patterned)
+        # A single frame of other power changes both alike.
+        ratio_variances, alike = np.where(patterned, self.variances[:, 0], 1.0), np.square(own_power)
+        ratio, left_ratio, uneven = _shrunk(ratio, ratio_variances, usable & patterned, alike)
         own_power, ratio = np.where(usable, own_power, 0.0), np.where(usable & patterned, ratio, 0.0)
         powers, flicker = trend + own_power, float(np.sqrt(shaken + uneven))
         mean = float(np.sqrt(np.mean(powers[first])))
