@@ -318,13 +318,12 @@ def estimates(
         as for :func:`session_sums`.
     """
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
-    sensor, drift = session.bench.sensor, session.recipe.drift
+    drift = session.recipe.drift
     taken = SessionConditions(
         session.order,
         saturated=bool(found.saturated),
         # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
         unsteady=bool(drift.session_ramp or drift.session_flicker),
-        step=0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s,
     )
     with job.clock.stage("estimate"):
         judged = [

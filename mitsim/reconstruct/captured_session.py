@@ -503,12 +503,10 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    digital = session.listed.digital
     taken = SessionConditions(
         session.order,
         session.frame_name,
         bool(readings.saturated),
-        step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
         wrong=readings.wrong(),
     )
     found = check_session(sums, signs, taken)

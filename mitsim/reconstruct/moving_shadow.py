@@ -125,12 +125,12 @@ class MovingShadow:
         self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, tiny), 0.0)
         self._spectra, self._left, self._own = spectra, left, own
 
-    def powers(self) -> FloatArray:
-        """Return (N,) 1 - 1 / p, p being the power of each frame that is shown against the uniform one: its vector is
-        p (u_i + u_0) - u_0."""
+    def powers(self) -> tuple[FloatArray, FloatArray]:
+        """Return (N,) 1 - 1 / p and its variance, p being the power of each frame that is shown against the uniform
+        one: its vector is p (u_i + u_0) - u_0."""
         shown = self._spectra + self._spectra[:, :1]
         size = np.maximum((np.square(np.abs(shown)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
-        return np.asarray(np.real(shown.conj() * self._left).sum(axis=0) / size)
+        return np.real(shown.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
 
 
 def shadow_step(factor: FloatArray) -> float:

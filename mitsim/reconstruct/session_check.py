@@ -65,7 +65,7 @@ _UNEXPLAINED = 0.05
 of its amplitude."""
 _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
-_WRONG, _UNLIKE = 40.0, 0.1
+_WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
 _FOREIGN = 0.05, 15.0
@@ -197,8 +197,6 @@ class SessionConditions:
         and not refused.
     unsteady
         whether it is stated that the lamp is, so that its power is neither divided out nor reported.
-    step
-        between two numbers of a frame, as the responses have it; 0: none.
     wrong
         frames that are known to be wrong, and why.
     """
@@ -207,7 +205,6 @@ class SessionConditions:
     name: Callable[[Half], str] = frame_words
     saturated: bool = False
     unsteady: bool = False
-    step: float = 0.0
     wrong: Mapping[Half, str] = field(default_factory=dict)
 
 
@@ -398,10 +395,19 @@ class _Side:
                 self.misfits = sums.misfits - ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
+        light = np.square(self.vectors).sum(axis=1)
+        around = np.minimum(light[:-2], light[2:])
+        self.dead = 1 + np.flatnonzero(light[1:-1] < _DARK * around)
+        self.lost = float(around[self.dead - 1].sum())
 
     @property
     def size(self) -> float:
         return max(float(np.square(self.vectors).sum()), 1e-300)
+
+    def shadow(self, signs: FloatArray, unknown: Sequence[int] = ()) -> MovingShadow:
+        vectors = self.vectors.copy()
+        vectors[self.dead] = (vectors[self.dead - 1] + vectors[self.dead + 1]) / 2
+        return MovingShadow(vectors, signs, unknown)
 
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
@@ -449,9 +455,10 @@ class _Check:
                 return CheckedSession(self.sums)
             wrong = [(own, int(index)) for own in self.sides for index in np.flatnonzero(self._of(own, bad))]
             if too_many(len(wrong), self.count):
+                remedy = "check the frames' order, what was shown, and that numbers are in proportion to light"
                 raise MitsimError(
                     f"all frames: the two frames of {len(wrong)} of {2 * self.count} patterns do not add up to what "
-                    "others do; check the frames' order and what was shown, and take the session again"
+                    f"others do; {remedy}; take the session again"
                 )
             uniforms = [(own, 0) for own, index in wrong if index == 0]
             if len(uniforms) == 2:
@@ -468,14 +475,18 @@ class _Check:
                 or self.ambient_moved > (_MATTERS * self._noise()) ** 2
             ):
                 uniform = self._uniform()
+            self._costs()
             for own, index in wrong:
                 self._use_one_frame(own, index)
         elif self.taken.wrong:
             known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
             self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
         for own in self.sides:
+            if len(own.dead):
+                own.add("dead", own.lost)
+                word = "row" if own.axis == 0 else "column"
+                self.doubts["dead"] = f"sensor {word} {own.dead[0]} shows no light; check the sensor"
             self._check_shadow(own)
-            self._count_rounding_and_dark_rows(own)
         return self._judge(uniform)
 
     # ---- sums of pairs -----------------------------------------------------------------------------------------------
@@ -600,7 +611,8 @@ class _Check:
             cube = 2 * self.bend * float(np.sum(own.sums.common**3)) / own.square
             own.add("bend", cube**2 * float(np.square(own.uniform[:, None] * own.vectors).sum()))
             place, noise = self.values[:, 2 + own.axis], self._of(own, self.variances[:, 2 + own.axis])
-            steep = np.square(np.gradient(own.vectors, axis=0)).sum(axis=0)
+            # Differences of neighbours: those of every second pixel do not see the finest detail.
+            steep = np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
             away = [np.square(self._of(own, place) - np.median(place[end])) - noise for end in ends]
             own.add("motion", max(float((each * steep)[good].sum()) for each in away))
             moved = max(moved, abs(float(np.median(place[ends[1]]) - np.median(place[ends[0]]))))
@@ -669,18 +681,13 @@ class _Check:
             range_ = float(np.abs(trend - 1).max()) / 2
             own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
             own.add("bend", (bent / 2) ** 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
-            for index in np.flatnonzero(keep):
-                part = (
-                    float(own_power[own.axis * self.count + index]) / float(slow[index]),
-                    float(ratio[own.axis * self.count + index]),
-                )
-                sign = 1 if part[0] * part[1] >= 0 else -1
-                beyond = part[0] + sign * part[1]
-                if abs(beyond) > max(_SLIGHT, _DEVIATIONS * flicker) and (
-                    index == 0 or abs(part[0] - sign * part[1]) < abs(beyond) / 4
-                ):
-                    detail, repair = f"it has {1 + beyond:.3g} of its light", "its response is divided by that"
-                    self.faults.append(SessionFault(own.side, int(index), sign, "power", detail, repair))
+            parts = np.stack([(1 + sign * self._of(own, ratio)) * c / slow - 1 for sign in (1, -1)])
+            parts[1, 0] = 0.0  # the uniform pattern has one lit frame
+            wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
+            for half, index in zip(*np.nonzero(wrong & keep), strict=True):
+                detail = f"it has {1 + parts[half, index]:.3g} of its light"
+                repair = "its response is divided by that"
+                self.faults.append(SessionFault(own.side, int(index), 1 - 2 * int(half), "power", detail, repair))
         drift, flickers = (float(cost) if cost > _MATTERS * self._noise() else 0.0 for cost in np.sqrt(costs))
         change = float(trend[np.argmax(self.times)] - trend[np.argmin(self.times)])
         remaining = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
@@ -707,7 +714,7 @@ class _Check:
         tried, scores = {}, dict[int, float]()
         for wrong in known or (1, -1):
             own.vectors[:, index] = tried[wrong] = own.sums.vectors[:, index] - wrong * away
-            shadow = MovingShadow(own.vectors, self.signs)
+            shadow = own.shadow(self.signs)
             fits = shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE
             if len(known) < 2 and fits and (known or shadow.predicts):
                 scores[wrong] = float(shadow.deviations[index])
@@ -726,7 +733,7 @@ class _Check:
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns and lines that are foreign."""
         sums, turned, foreign = own.sums, set[int](), list[int]()
-        odd = odd_responses(sums.misfits, sums.energies, len(own.vectors) * len(sums.common))
+        odd = odd_responses(own.misfits, sums.energies, len(own.vectors) * len(sums.common))
         if shapeless := [(own, int(index)) for index in odd if index not in own.uncounted]:
             self._refuse(shapeless, f"they show no {own.side} stripes")
 
@@ -737,7 +744,7 @@ class _Check:
         if np.dot(own.vectors[:, 0], own.uniform) < 0:
             turn([0])
         for _ in range(int(MOST_FAULTS * self.count) + 3):
-            shadow = MovingShadow(own.vectors, self.signs, foreign)
+            shadow = own.shadow(self.signs, foreign)
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
@@ -770,47 +777,32 @@ class _Check:
                 "neighbours predict; check the projector, uniform and dark frames, and take the session again"
             )
         if shadow.predicts and not self.paired:
-            shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)[1:]
-            own.add("power", float(np.square(shadow.powers()[1:]) @ shown))
+            shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
+            powers, variances = shadow.powers()
+            own.add("power", float((np.square(powers) - variances)[1:] @ shown[1:]))
             self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
-    def _count_rounding_and_dark_rows(self, own: _Side) -> None:
-        """Count the rounding of numbers that noise does not make random, and sensor rows without light.
-
-        The mean of rounding over noise of a standard deviation s, in steps, is a sine of the light of the amplitude
-        exp(-2 pi^2 s^2) / pi, alike in pixels of like light.
-        """
-        if self.taken.step:
-            noise = max(own.variance / 2 / self.taken.step**2 - 1 / 12, 0.0)
-            bias = (self.taken.step * np.exp(-2 * np.pi**2 * noise) / np.pi) ** 2
-            alike = float(np.square(own.sums.common.sum() / own.square))
-            own.add("rounding", bias * alike * len(own.vectors) * self.count)
-            self.doubts["rounding"] = "steps between numbers are larger than the noise; use more bits or more gain"
-        light = np.square(own.vectors).sum(axis=1)
-        around = np.minimum(light[:-2], light[2:])
-        dark = np.flatnonzero(light[1:-1] < _DARK * around)
-        if len(dark):
-            own.add("dark", float(around[dark].sum()))
-            word = "row" if own.axis == 0 else "column"
-            self.doubts["dark"] = f"sensor {word} {dark[0] + 1} shows no light; check the sensor"
-
-    def _judge(self, uniform: FloatArray | None) -> CheckedSession:
-        """Add up the errors; MitsimError where they are more than a tenth."""
+    def _costs(self) -> dict[str, float]:
+        """Return the relative error of both factors by its reason, the largest first; MitsimError where all are more
+        than a tenth."""
         reasons = {reason for own in self.sides for reason in own.extras}
         squares = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
-        costs = {each: float(np.sqrt(square)) for each, square in squares.items()}
-        worst = sorted(self.doubts.keys() & reasons, key=lambda reason: -costs[reason])
-        total, noise = float(np.sqrt(sum(squares.values()))), self._noise()
-        if total > LARGEST_ERROR:
-            reason = self.doubts[worst[0]] if worst else "power and ambient light change"
+        costs = {each: float(np.sqrt(squares[each])) for each in sorted(reasons, key=lambda each: -squares[each])}
+        if (total := float(np.sqrt(sum(squares.values())))) > LARGEST_ERROR:
+            reason = next((self.doubts[each] for each in costs if each in self.doubts), "power or ambient light change")
             raise MitsimError(
                 f"all frames: {reason}: an error of {total:.0%} is left in the factors, allowed are "
                 f"{LARGEST_ERROR:.0%}; take the session again"
             )
+        return costs
+
+    def _judge(self, uniform: FloatArray | None) -> CheckedSession:
+        """Report the errors that matter."""
+        costs, noise = self._costs(), self._noise()
         doubts = [
-            f"session: {self.doubts[reason]}; the stated error includes {costs[reason]:.1e} for it"
-            for reason in worst
-            if costs[reason] > _MATTERS * noise
+            f"session: {self.doubts[reason]}; the stated error includes {cost:.1e} for it"
+            for reason, cost in costs.items()
+            if reason in self.doubts and cost > _MATTERS * noise
         ]
         if self.ambient_moved > (_MATTERS * noise) ** 2:
             doubts.append(

@@ -59,15 +59,15 @@ def frames(
     }
 
 
-def checked(shown: Frames, pairs: bool = True, step: float = 0.0, **wrong: Half) -> CheckedSession:
-    """Check frames whose numbers are a ``step`` apart, of which some are known to be ``wrong``, why: which; not
+def checked(shown: Frames, pairs: bool = True, **wrong: Half) -> CheckedSession:
+    """Check frames of which some are known to be ``wrong``, why: which; not
     ``pairs``: each response is of its +1 frame and that of all light. Reads them again where the check asks for it."""
 
     def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         one, other = shown[side, index, 1], shown[side, index, -1]
         return (one - other, one + other) if pairs else (2 * one - shown.get((side, 0, 0), shown[side, 0, 1]), None)
 
-    taken = SessionConditions(ORDER, step=step, wrong={half: why for why, half in wrong.items()})
+    taken = SessionConditions(ORDER, wrong={half: why for why, half in wrong.items()})
     uniform = None
     for turn in range(2):
         first = [pair(side, 0) for side in SIDES]
@@ -119,15 +119,6 @@ def test_a_good_session_is_left_as_it_is_to_the_bit(pairs: bool) -> None:
     assert all(np.array_equal(own.vectors, found.sums[axis].vectors) for axis, own in enumerate(found.sums))
     actual, stated = error(found)
     assert 0.7 * stated < actual < 1.2 * stated
-
-
-def test_rounding_of_a_session_with_little_noise_counts() -> None:
-    """Noise of 0.1 steps does not make rounding random. (Planted: steps in place of their squares.)"""
-    rounded = {half: 0.03 * np.rint(frame / 0.03) for half, frame in frames(noise=3e-3).items()}
-    found = checked(rounded, step=0.03)
-    assert holds(found) and error(found)[1] > 2 * error(checked(rounded))[1]
-    fine = {half: 1e-3 * np.rint(frame / 1e-3) for half, frame in frames(noise=3e-3).items()}
-    assert error(checked(fine, step=1e-3)) == error(checked(fine))
 
 
 # ---- Single frames and patterns --------------------------------------------------------------------------------------
@@ -321,13 +312,13 @@ def test_motion_midway_is_measured_and_counts(pixels: float) -> None:
     """(Planted: the motion along the columns is taken for that along the rows.)"""
     moved = [shadow(PIXELS[0], pixels), EXACT[1]]
     found = checked(frames(lambda frame, time, half: light(half, moved) if time > 0.25 else frame))
-    (words,) = found.doubts
-    assert f"camera or mask move by {pixels:g} pixels" in words and holds(found)
+    (words,) = (words for words in found.doubts if "camera or mask" in words)
+    assert float(words.split(" pixels")[0].split()[-1]) == pytest.approx(pixels, rel=0.2) and holds(found)
 
 
 def test_motion_by_half_a_pixel_is_refused() -> None:
     moved = [shadow(length, 0.5) for length in PIXELS]
-    with pytest.raises(MitsimError, match="^all frames: camera or mask move by 0.5 pixels; fasten them: an error of"):
+    with pytest.raises(MitsimError, match="^all frames: camera or mask move by 0.[456] pixels; fasten them: an error of"):
         checked(frames(lambda frame, time, half: light(half, moved) if time > 0.5 else frame))
 
 
@@ -342,9 +333,9 @@ def test_lag_is_measured_and_counts() -> None:
     assert holds(found) and any("each frame holds 2.0% of the one before" in words for words in found.doubts)
 
 
-@pytest.mark.parametrize("power", [0.95, 1.1])
+@pytest.mark.parametrize("power", [0.98, 1.02])
 def test_numbers_that_are_not_in_proportion_to_light_count(power: float) -> None:
-    found = checked(frames(lambda frame, time, half: np.power(frame, power)))
+    found = checked(frames(lambda frame, time, half: np.power(frame, power), noise=5e-3))
     assert holds(found) and any("not in proportion to light" in words for words in found.doubts)
 
 
