@@ -65,7 +65,7 @@ _UNEXPLAINED = 0.05
 of its amplitude."""
 _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
-_WRONG, _UNLIKE = 40.0, 0.03
+_WRONG, _UNLIKE = 25.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
 _FOREIGN = 0.05, 15.0
@@ -778,8 +778,9 @@ class _Check:
             )
         if shadow.predicts and not self.paired:
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
-            powers, variances = shadow.powers()
-            own.add("power", float((np.square(powers) - variances)[1:] @ shown[1:]))
+            squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
+            counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
+            own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
             self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
     def _costs(self) -> dict[str, float]:
