@@ -347,7 +347,6 @@ def factors_of_sums(
     right: StripeSums,
     signs: FloatArray,
     stated_noise: float | None = None,
-    left_out: tuple[int, int] = (0, 0),
     extra: tuple[float, float] = (0.0, 0.0),
 ) -> Estimate:
     """Factors from finished sums.
@@ -360,8 +359,6 @@ def factors_of_sums(
         H (n, N), as :func:`estimate_factors` takes it.
     stated_noise
         root mean square sensor noise of a response [frame unit]; None: unknown.
-    left_out
-        responses of each side whose misfit and energy are not in the sums.
     extra
         squared error of each side's vectors, all in all, that is not the noise of their responses.
     """
@@ -371,8 +368,7 @@ def factors_of_sums(
     energy = left.energy + right.energy
     residual = float(np.sqrt((left.misfit + right.misfit) / energy))
     # Each response of m m' numbers spends one fitted number a sensor row (or column).
-    counted = count - left_out[0], count - left_out[1]
-    spare = counted[0] * len(a) * (len(v) - 1) + counted[1] * len(v) * (len(a) - 1)
+    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))

@@ -38,9 +38,9 @@ _FARTHEST = 0.6
 both show."""
 _ENOUGH = 16, 40
 """Patterns, and sensor rows, from which their shadows are compared."""
-_PREDICTED = 0.3
-"""Squared deviation of the median pattern, as a part of its own square, up to which patterns are predicted: 1e-3 in
-most sessions of 32 patterns and more, 0.5 of 16 patterns whose shadow moves by two pixels a line."""
+_PREDICTED = 0.15
+"""Squared deviation of a pattern, as a part of its own square, that a tenth of the patterns must not exceed: it is 0.03
+with three exchanged pairs of 32, and 0.3 where a shadow of 16 lines moves by two pixels a line and predicts nothing."""
 _KNOWN = 0.1
 """Part of a column beyond the modes from which the others predict it: at the ends of few lines it is less."""
 _ROUNDING = 1e-12
@@ -76,7 +76,7 @@ class MovingShadow:
     sure
         (N,) the same in standard errors of it.
     predicts
-        whether most patterns are predicted: not by few lines whose shadows have little in common.
+        whether patterns are predicted: few lines, whose shadows have little in common, predict nothing.
     lines
         (n,) squared deviation of each column from what the others predict, in units of the mean square of columns: 1
         for a column that is missing, 0 where the others predict nothing.
@@ -111,7 +111,7 @@ class MovingShadow:
         tiny = np.finfo(np.float64).tiny
         self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
         self.predicts = (
-            len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and float(np.median(self.unlike)) < _PREDICTED
+            len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
         )
         sizes = np.maximum((squares * own).sum(axis=0), tiny)
         self.shares = np.real(spectra.conj() * left).sum(axis=0) / sizes

@@ -72,14 +72,16 @@ _FOREIGN = 0.05, 15.0
 """Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good sessions have
 0.44 at 6 of the latter, and 0.03 at 9; swapped patterns have about 1 at 17 and more, a pattern that is rolled by a line
 0.08 at 22."""
+_KNOWN = 5.0
+"""The same of a pattern that the others determine: 4 if its sign is wrong, and thousands if they do not."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
 """The same in deviations of the median pattern."""
 _LINE = 0.15
 """Squared deviation of a column from what the others predict, over the mean square, from which a line is wrong."""
-_DARK = 0.1
-"""Light of a sensor row over that of its neighbours below which it is dead."""
+_DARK, _LIT = 0.02, 0.1
+"""Light of a dead sensor row over that of its neighbours at most, and theirs over the median row's at least."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
 
@@ -312,8 +314,6 @@ class CheckedSession:
         how steady it is.
     doubts
         sentences on errors that are not mended and count in the stated error.
-    left_out
-        responses of each side whose misfit is not counted.
     extra
         squared error of each side's vectors beyond their noise.
     uniform
@@ -325,7 +325,6 @@ class CheckedSession:
     faults: list[SessionFault] = field(default_factory=list)
     lamp: Lamp = field(default_factory=Lamp)
     doubts: list[str] = field(default_factory=list)
-    left_out: tuple[int, int] = (0, 0)
     extra: tuple[float, float] = (0.0, 0.0)
     uniform: FloatArray | None = None
 
@@ -339,7 +338,7 @@ class CheckedSession:
         noise
             as ``stated_noise`` of :func:`mitsim.reconstruct.estimate_factors.factors_of_sums`.
         """
-        return factors_of_sums(*self.sums, signs, noise, self.left_out, self.extra)
+        return factors_of_sums(*self.sums, signs, noise, self.extra)
 
     def warnings(self, name: Callable[[Half], str]) -> tuple[str, ...]:
         """Return a sentence for each fault and doubt; ``name`` gives the name of a frame."""
@@ -380,24 +379,23 @@ def check_session(
 
 class _Side:
     """One side of a session while it is checked: ``vectors`` (m, N) as they are mended so far, ``extras`` squared
-    errors by their reason, ``uncounted`` responses whose misfit does not count, ``axis`` 0 for horizontal stripes."""
+    errors by their reason, ``axis`` 0 for horizontal stripes."""
 
     def __init__(self, sums: StripeSums, other: StripeSums, axis: int) -> None:
         self.sums, self.uniform, self.axis = sums, other.common, axis
         self.side: Side = SIDES[axis]
-        self.vectors, self.misfits = sums.vectors.copy(), sums.misfits
+        self.vectors, self.misfits = sums.vectors.copy(), sums.misfits.copy()
         self.extras: dict[str, float] = {}
-        self.uncounted: set[int] = set()
         self.square = float(np.dot(sums.common, sums.common))
         if sums.pairs:
             self.pairs = PairLight.together(sums.pairs)
             if not sums.centre:  # ambient light that changes within pairs is no noise
-                self.misfits = sums.misfits - ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
+                self.misfits -= ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
         light = np.square(self.vectors).sum(axis=1)
         around = np.minimum(light[:-2], light[2:])
-        self.dead = 1 + np.flatnonzero(light[1:-1] < _DARK * around)
+        self.dead = 1 + np.flatnonzero((light[1:-1] < _DARK * around) & (around > _LIT * np.median(light)))
         self.lost = float(around[self.dead - 1].sum())
 
     @property
@@ -413,11 +411,9 @@ class _Side:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
     def result(self) -> StripeSums:
-        if not self.uncounted and np.array_equal(self.vectors, self.sums.vectors):
+        if np.array_equal(self.vectors, self.sums.vectors):
             return self.sums
-        kept = np.setdiff1d(np.arange(self.sums.done), sorted(self.uncounted))
-        misfit, energy = float(self.misfits[kept].sum()), float(self.sums.energies[kept].sum())
-        return replace(self.sums, vectors=self.vectors, misfit=misfit, energy=energy)
+        return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))
 
 
 class _Check:
@@ -466,7 +462,7 @@ class _Check:
             if uniforms and not uniform_given:
                 names = " and ".join(self.taken.name(half) for half in self._halves(*uniforms[0]))
                 doubt = f"frames: {names}: the uniform frames of one side are wrong; take them again"
-                return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform(1 - uniforms[0][0].axis))
+                return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform())
             self._correct()
             powers, deviations = self.values[[0, self.count], 1], np.sqrt(self.variances[[0, self.count], 1])
             # Ambient light or power that differ in the uniform frames are in the vectors that all responses share.
@@ -497,18 +493,19 @@ class _Check:
         halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
         self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
         sums = np.concatenate([own.pairs.blocks for own in self.sides]).astype(np.float64)
+        lit = sums.mean(axis=0)  # noise of light is larger where there is more
+        bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
         if self.centre:
             sums -= sums.mean(axis=2, keepdims=True)
             sums -= sums.mean(axis=1, keepdims=True)
         self.shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
         self.along = [block_means(own.uniform, 0) for own in self.sides]
+        self.squares = [max(float(np.square(each).sum()), 1e-300) for each in self.along[::-1]]
         moved = [block_means(np.gradient(own.uniform), 0) for own in self.sides]
         fixed = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
         if not self.centre:
-            one, place = (
-                [make(length) for length in self.shape] for make in (np.ones, lambda k: np.linspace(-1, 1, k))
-            )
-            fixed += [np.outer(*one), np.outer(place[0], one[1]), np.outer(one[0], place[1])]
+            (y, x), (one, same) = ([make(k) for k in self.shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
+            fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
         shown = [block_means(own.sums.vectors, 0) for own in self.sides]
         responses = np.concatenate([
             np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
@@ -544,45 +541,37 @@ class _Check:
         area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-14 * float(np.square(usual).mean()))
-        self.variances, spent = variances * noise, variances.shape[1]
+        self.variances, spent = variances * noise * bright, variances.shape[1]
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        other = (
-            rest + self.values[:, 1 + len(fixed) :] @ np.array(shapes[len(fixed) :])
-            if len(shapes) > len(fixed)
-            else rest
-        )
+        other = rest + self.values[:, 1 + len(fixed) :] @ np.reshape(shapes[len(fixed) :], (-1, rest.shape[1]))
         excess, alone = [], []
         for own in self.sides:
-            expected = noise / self._along_square(own) * len(own.vectors) * (1 - spent / self.shape[own.axis])
+            expected = noise / self.squares[own.axis] * len(own.vectors) * (1 - spent / self.shape[own.axis])
             expected *= 1 + np.pi / 2 / len(sums)  # the usual sum is a median
             deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
             beyond = self._energy_along(own, other) - expected
             excess.append(beyond * (beyond.sum() > _SURE * deviation))
             alone.append(self._energy_along(own, rest) / max(expected, 1e-300))
         self.excess = np.concatenate(excess)
-        known = {numbers[half] for half in self.taken.wrong}
-        # Where one frame of a pair is black, power cannot be divided out.
-        bad = np.isin(np.arange(len(sums)), sorted(known)) | (np.abs(self.values[:, 0]) > _ALONE)
+        bad = np.abs(self.values[:, 0]) > _ALONE  # one frame is black, so that power cannot be divided out
+        bad[[numbers[half] for half in self.taken.wrong]] = True
         for measure in (squared / noise, np.concatenate(alone)):
             middle = max(float(np.median(measure)), 1.0)
             bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
         self.good = ~bad
         return bad
 
-    def _along_square(self, own: _Side) -> float:
-        return max(float(np.square(self.along[1 - own.axis]).sum()), 1e-300)
-
     def _energy_along(self, own: _Side, rest: FloatArray) -> FloatArray:
         """Return (N,) squared length of the vectors that the residuals ``rest`` of a side have along the common one."""
         frames, common = self._of(own, rest).reshape(-1, *self.shape), self.along[1 - own.axis]
-        vectors = (frames @ common if own.axis == 0 else common @ frames) / self._along_square(own)
+        vectors = (frames @ common if own.axis == 0 else common @ frames) / self.squares[own.axis]
         if self.centre:
             vectors = vectors - vectors.mean(axis=1, keepdims=True)
         return np.asarray(np.square(vectors).sum(axis=1) * len(own.vectors) / self.shape[own.axis])
 
-    def _uniform(self, alone: int | None = None) -> FloatArray:
+    def _uniform(self) -> FloatArray:
         """Return the uniform response whose vectors are those that the other patterns share, and whose size is that of
-        the uniform frames of both sides, or of one ``alone``."""
+        the uniform frames that fit."""
         right, left = (
             own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum()
             for own, used in ((own, self._of(own, self.good)) for own in self.sides)
@@ -593,29 +582,30 @@ class _Check:
             parts = np.column_stack([vector, np.vander(np.linspace(-1, 1, len(vector)), 2)])
             share = float(np.dot(common, own.sums.common)) / own.square
             sizes.append(abs(float(np.linalg.lstsq(parts, own.sums.vectors[:, 0], rcond=None)[0][0])) / share)
-        return np.outer(left, right) * (np.mean(sizes) if alone is None else sizes[alone])
+        return np.asarray(np.outer(left, right) * np.mean(np.array(sizes)[self.good[:: self.count]]))
 
     # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        ends = np.split(np.argsort(self.times), [max(4, len(self.times) // 16), -max(4, len(self.times) // 16)])[::2]
-        moved = 0.0
+        order, ends, moved = np.argsort(self.times), max(4, len(self.times) // 16), 0.0
         for own in self.sides:
-            good = self._of(own, self.good)
-            own.add("sums", float(self._of(own, self.excess)[good].sum()))
+            own.add("sums", float(self._of(own, self.excess * self.good).sum()))
             if not self.centre:
                 self._subtract_ambient(own)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
             cube = 2 * self.bend * float(np.sum(own.sums.common**3)) / own.square
             own.add("bend", cube**2 * float(np.square(own.uniform[:, None] * own.vectors).sum()))
-            place, noise = self.values[:, 2 + own.axis], self._of(own, self.variances[:, 2 + own.axis])
             # Differences of neighbours: those of every second pixel do not see the finest detail.
-            steep = np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
-            away = [np.square(self._of(own, place) - np.median(place[end])) - noise for end in ends]
-            own.add("motion", max(float((each * steep)[good].sum()) for each in away))
-            moved = max(moved, abs(float(np.median(place[ends[1]]) - np.median(place[ends[0]]))))
+            steep = self._of(own, self.good) * np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
+            moves = self.values[:, 2 + own.axis]
+            first, last = (float(np.median(part)) for part in (moves[order[:ends]], moves[order[-ends:]]))
+            away = np.square(moves - np.median(moves[self.good])) / self.variances[:, 2 + own.axis]
+            if np.mean(away[self.good]) > 1 + _SURE * np.sqrt(2 / self.good.sum()):
+                energies = [float(np.square(self._of(own, moves) - end) @ steep) for end in (first, last)]
+                own.add("motion", max(energies))
+                moved = max(moved, abs(last - first))
         self.doubts |= {
             "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
             "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
@@ -648,7 +638,7 @@ class _Check:
         first = np.arange(2) * self.count
         unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
         usable = self.good
-        both = (1 + power * unit) / (1 - np.square(np.where(usable, ratio, 0.0)))
+        both = (1 + power * unit) / (1 - np.where(usable, np.square(ratio) - self.variances[:, 0], 0.0).clip(0))
         degree, kept = min(3, max(len(np.unique(self.times)) // 4, 0)), usable
         for _ in range(4):
             trend = np.polynomial.Polynomial.fit(self.times[kept], both[kept], degree)(self.times)
@@ -701,7 +691,7 @@ class _Check:
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = "the two do not add up to what others do"
         reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
-        own.uncounted.add(index)
+        own.misfits[index] = np.median(own.misfits)
         if index == 0:
             own.vectors[:, 0] = own.uniform
             repair = "those of the other side replace them"
@@ -734,8 +724,8 @@ class _Check:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns and lines that are foreign."""
         sums, turned, foreign = own.sums, set[int](), list[int]()
         odd = odd_responses(own.misfits, sums.energies, len(own.vectors) * len(sums.common))
-        if shapeless := [(own, int(index)) for index in odd if index not in own.uncounted]:
-            self._refuse(shapeless, f"they show no {own.side} stripes")
+        if len(odd):
+            self._refuse([(own, int(index)) for index in odd], f"they show no {own.side} stripes")
 
         def turn(indices: Sequence[int]) -> None:
             own.vectors[:, indices] *= -1
@@ -748,7 +738,8 @@ class _Check:
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
-            doubtful |= (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
+            known = (shadow.deviations > _WRONG) | (shadow.unlike < _KNOWN)
+            doubtful |= known & (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
             far = np.where(doubtful, shadow.deviations, 0.0)
             gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
             far[[0, *foreign]] = gains[foreign] = 0.0
@@ -761,13 +752,13 @@ class _Check:
                 foreign.append(int(np.argmax(far)))
             else:
                 break
+        else:
+            raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
         if foreign:
             wrong = [(own, index) for index in sorted(foreign)]
             self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
         if not shadow.predicts and 0 < len(turned) < self.count:
             self._refuse([(own, index) for index in turned], "they are in each other's place")
-        if max(2, MOST_FAULTS * self.count) < len(turned) < self.count:
-            raise MitsimError("all frames: the two frames of many patterns are exchanged; check their order")
         for index in sorted(turned):
             detail, repair = "in each other's place", "they count in their right order"
             self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
@@ -816,7 +807,6 @@ class _Check:
             sorted(self.faults, key=lambda fault: (SIDES.index(fault.side), fault.index)),
             self.lamp,
             doubts,
-            (len(first.uncounted), len(second.uncounted)),
             (sum(first.extras.values()), sum(second.extras.values())),
             uniform,
         )
