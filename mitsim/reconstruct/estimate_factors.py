@@ -217,11 +217,7 @@ class StripeSums:
         projected = without_plane(own) @ response
         if self.centre:  # both factors' means are zero, so that light of no mask is not in their vectors
             return PairLight(vector - vector.mean(), blocks, np.zeros(3), projected - projected.mean())
-        across, along, inverse = ambient_shapes(self.common, len(vector))
-        seen = response @ across
-        even, tilted = inverse @ seen.mean(axis=0)
-        slope = float(along @ seen[:, 0]) * inverse_slope(across, along)
-        return PairLight(vector, blocks, np.array([even, slope, tilted]), projected)
+        return PairLight(vector, blocks, AmbientLight(self.common, len(vector)).measure(response), projected)
 
     def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
@@ -431,32 +427,50 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 # ---- Light that is no mask's, and means over blocks of pixels ----
 
 
-def ambient_shapes(common: FloatArray, length: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what measures even and tilted light across a ``common`` vector v (k,): (k, 2) the shapes 1 and x less
-    their parts along v, (length,) places -1 to 1 along the response's vector, and the inverse of the shapes' products.
+class AmbientLight:
+    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
+
+    Parameters
+    ----------
+    common
+        (k,) v.
+    length
+        m, of the responses' vectors u.
+
+    Attributes
+    ----------
+    effects
+        (3, m) vectors that light of size 1 adds to u: even, tilted along u, tilted along v, by places -1 to 1.
+    variances
+        (3,) of the measured sizes for noise of variance 1.
     """
-    shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
-    across = shapes - np.outer(common, common @ shapes) / np.dot(common, common)
-    return across, np.linspace(-1, 1, length), np.linalg.pinv(across.T @ across)
+
+    def __init__(self, common: FloatArray, length: int) -> None:
+        self._places, even = np.linspace(-1, 1, length), np.ones(length)
+        shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
+        shares = common @ shapes / np.dot(common, common)
+        self.effects = np.stack([shares[0] * even, shares[0] * self._places, shares[1] * even])
+        self._across = shapes - np.outer(common, shares)
+        self._products = np.zeros((3, 3))
+        self._products[::2, ::2] = length * self._across.T @ self._across
+        self._products[1, 1] = np.dot(self._places, self._places) * np.square(self._across[:, 0]).sum()
+        self._inverse = np.linalg.pinv(self._products)
+        self.variances = np.diag(self._inverse)
+
+    def measure(self, response: FloatArray) -> FloatArray:
+        """Return (3,) the sizes of the light in a ``response`` (m, k)."""
+        seen = response @ self._across
+        return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
+
+    def energies(self, sizes: FloatArray) -> FloatArray:
+        """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
+        return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
 
 
 def without_plane(vectors: FloatArray) -> FloatArray:
     """Return ``vectors`` (m,) or (m, N) less their parts along even and linearly tilted light."""
     plane = np.linalg.qr(np.vander(np.linspace(-1, 1, len(vectors)), 2))[0]
     return np.asarray(vectors - plane @ (plane.T @ vectors))
-
-
-def ambient_energy(common: FloatArray, length: int, ambient: FloatArray) -> FloatArray:
-    """Return (N,) squares that ``ambient`` light (N, 3) adds to the misfits of responses of ``length`` rows."""
-    across, along, _ = ambient_shapes(common, length)
-    even = np.einsum("ki,ij,kj->k", ambient[:, ::2], across.T @ across, ambient[:, ::2]) * length
-    return np.asarray(even + np.square(ambient[:, 1]) * np.square(across[:, 0]).sum() * np.square(along).sum())
-
-
-def inverse_slope(across: FloatArray, along: FloatArray) -> float:
-    """Return the inverse of the squared length of even light across the common vector that is tilted ``along``."""
-    square = float(np.square(across[:, 0]).sum() * np.square(along).sum())
-    return 1 / square if square else 0.0
 
 
 def block_means(values: FloatArray, axis: int) -> FloatArray:

@@ -6,14 +6,13 @@ the lamp and the time.
 
 Therefore the sum S_k of each pair is fitted over all pixels and in time::
 
-    S_k = S + c_k U + d_k R_k + l_k R_(k-1) + q_k R_k^2 + s_k . grad U + a_k . (1, y, x) + b_k . B
+    S_k = S + c_k U + d_k R_k + l R_(k-1) + s_k . grad U + a_k . (1, y, x)
 
-with S the usual sum, U the response to uniform light, R_k that to pattern k, and B shapes found in the residual. c is
-the lamp's power, d the unequal power of both halves, l the lag, q the bend of the response to light, s the camera's
-motion in pixels, and a the ambient light. The change of ambient light within a pair is measured in the response,
-across the common vector. Only three acts change the factors: the sign of a response is turned, one frame of a pair
-replaces both, and responses are divided by the lamp's power. Each is accepted if the moving shadow, estimated
-afterwards, agrees. Every other fault is refused or counts in the stated error.
+with S the usual sum, U the response to uniform light, and R_k that to pattern k. c is the lamp's power, d the unequal
+power of both halves, l the lag, s the camera's motion in pixels, and a the ambient light. The change of ambient light
+within a pair is measured in the response, across the common vector. Only three acts change the factors: the sign of a
+response is turned, one frame of a pair replaces both, and responses are divided by the lamp's power. Each is accepted
+if the moving shadow, estimated afterwards, agrees. Every other fault is refused or counts in the stated error.
 """
 
 from __future__ import annotations
@@ -30,14 +29,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, UNIFORM, Half, Side
 from mitsim.reconstruct.estimate_factors import (
     LARGEST_ERROR,
+    AmbientLight,
     Estimate,
     PairLight,
     StripeSums,
-    ambient_energy,
-    ambient_shapes,
     block_means,
     factors_of_sums,
-    inverse_slope,
     without_plane,
 )
 from mitsim.reconstruct.moving_shadow import MovingShadow
@@ -58,8 +55,6 @@ _SLIGHT = 0.02
 """Change of a single frame's power that is not reported by itself: a lamp's flicker makes as much."""
 _NEAR = 5
 """Pairs next in time that give the sum which a wrong pair should have had."""
-_SHAPES = 2
-"""Shapes that are looked for in the residual of the sums: a cloud, hot columns; a band's sine and cosine."""
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
@@ -80,8 +75,9 @@ _LEAST = 3.0
 """The same in deviations of the median pattern."""
 _LINE = 0.15
 """Squared deviation of a column from what the others predict, over the mean square, from which a line is wrong."""
-_DARK, _LIT = 0.02, 0.1
-"""Light of a dead sensor row over that of its neighbours at most, and theirs over the median row's at least."""
+_DARK, _LIT = (0.02, 0.3), 0.1
+"""Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
+the sign turned; and theirs over the median row's at least."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
 
@@ -167,18 +163,6 @@ def _least_squares(shapes: FloatArray, values: FloatArray) -> tuple[FloatArray, 
     inverse = np.linalg.pinv(shapes @ shapes.T, rcond=1e-9, hermitian=True)
     found = inverse @ (shapes @ values)
     return found / scale, np.diag(inverse) / scale**2, values - found @ shapes
-
-
-def _shared_shape(rest: FloatArray) -> FloatArray | None:
-    """Return a shape that the residuals ``rest`` (2 N, P) of many pairs share; None if there is none."""
-    values, vectors = np.linalg.eigh(rest @ rest.T)
-    noise = float(np.median(np.square(rest).mean(axis=1)))
-    edge = noise * (np.sqrt(rest.shape[1]) + np.sqrt(len(rest))) ** 2
-    for value, vector in zip(values[:-4:-1], vectors.T[:-4:-1], strict=True):
-        # The inverse is the number of pairs that have the shape.
-        if value > 1.3 * edge and np.sum(vector**4) * 2 * MOST_FAULTS * len(rest) < 1:
-            return np.asarray(vector @ rest / np.sqrt(value))
-    return None
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -390,13 +374,15 @@ class _Side:
         if sums.pairs:
             self.pairs = PairLight.together(sums.pairs)
             if not sums.centre:  # ambient light that changes within pairs is no noise
-                self.misfits -= ambient_energy(sums.common, len(self.vectors), self.pairs.ambient)
+                self.ambient = AmbientLight(sums.common, len(self.vectors))
+                self.misfits -= self.ambient.energies(self.pairs.ambient)
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
         light = np.square(self.vectors).sum(axis=1)
-        around = np.minimum(light[:-2], light[2:])
-        self.dead = 1 + np.flatnonzero((light[1:-1] < _DARK * around) & (around > _LIT * np.median(light)))
-        self.lost = float(around[self.dead - 1].sum())
+        around = np.pad(light, 1, constant_values=np.inf)
+        around = np.minimum(around[:-2], around[2:])
+        self.dead = np.flatnonzero((light < _DARK[sums.centre] * around) & (around > _LIT * np.median(light)))
+        self.lost = float(around[self.dead].sum())
 
     @property
     def size(self) -> float:
@@ -404,7 +390,8 @@ class _Side:
 
     def shadow(self, signs: FloatArray, unknown: Sequence[int] = ()) -> MovingShadow:
         vectors = self.vectors.copy()
-        vectors[self.dead] = (vectors[self.dead - 1] + vectors[self.dead + 1]) / 2
+        last = len(vectors) - 1
+        vectors[self.dead] = (vectors[(self.dead - 1).clip(0)] + vectors[(self.dead + 1).clip(max=last)]) / 2
         return MovingShadow(vectors, signs, unknown)
 
     def add(self, reason: str, energy: float) -> None:
@@ -451,17 +438,16 @@ class _Check:
                 return CheckedSession(self.sums)
             wrong = [(own, int(index)) for own in self.sides for index in np.flatnonzero(self._of(own, bad))]
             if too_many(len(wrong), self.count):
-                remedy = "check the frames' order, what was shown, and that numbers are in proportion to light"
                 raise MitsimError(
                     f"all frames: the two frames of {len(wrong)} of {2 * self.count} patterns do not add up to what "
-                    f"others do; {remedy}; take the session again"
+                    f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
+                    "that numbers are in proportion to light"
                 )
             uniforms = [(own, 0) for own, index in wrong if index == 0]
             if len(uniforms) == 2:
                 self._refuse(uniforms, "the uniform frames of both sides do not add up to what others do")
             if uniforms and not uniform_given:
-                names = " and ".join(self.taken.name(half) for half in self._halves(*uniforms[0]))
-                doubt = f"frames: {names}: the uniform frames of one side are wrong; take them again"
+                doubt = f"frames: the uniform frames of {uniforms[0][0].side} stripes are wrong; take them again"
                 return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform())
             self._correct()
             powers, deviations = self.values[[0, self.count], 1], np.sqrt(self.variances[[0, self.count], 1])
@@ -471,7 +457,7 @@ class _Check:
                 or self.ambient_moved > (_MATTERS * self._noise()) ** 2
             ):
                 uniform = self._uniform()
-            self._costs()
+            self._report()
             for own, index in wrong:
                 self._use_one_frame(own, index)
         elif self.taken.wrong:
@@ -511,8 +497,6 @@ class _Check:
             np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
         ]).reshape(len(sums), -1)  # fmt: skip
         first = np.arange(2) * self.count
-        bent = np.square(responses)
-        bent -= np.delete(bent, first, axis=0).mean(axis=0)
         lagged, self.own_before = np.zeros_like(sums), np.zeros(len(sums))
         numbers = {half: number for number, each in enumerate(halves) for half in each}
         for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
@@ -520,38 +504,33 @@ class _Check:
                 self.own_before[numbers[half]] += last[2] / 2
             else:
                 lagged[numbers[half]] += last[2] / 2 * responses[numbers[last]]
-        responses[first] = bent[first] = 0.0  # the uniform pattern has one lit frame
-        usual, self.lag, self.bend = np.median(sums, axis=0), 0.0, 0.0
-        shapes = [each.ravel() for each in fixed]
-        for turn in range(2 + _SHAPES):
-            pooled = usual + self.lag * lagged + self.bend * bent if self.lag or self.bend else usual[None]
-            found = [
-                _least_squares(np.stack([response, *shapes, *([lagged[k], bent[k]] if not turn else [])]), one)
-                for k, (response, one) in enumerate(zip(responses, sums - pooled, strict=True))
-            ]
-            self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
-            if not turn:
-                usual = usual + np.median(rest, axis=0)
-                self.lag, self.bend = (_pooled_mean(self.values[:, part], variances[:, part]) for part in (-2, -1))
-            elif len(shapes) < len(fixed) + _SHAPES and (shape := _shared_shape(rest)) is not None:
-                shapes.append(shape)
-            else:
-                break
+        responses[first] = 0.0  # the uniform pattern has one lit frame
+        usual, shapes = np.median(sums, axis=0), np.stack(fixed).reshape(len(fixed), -1)
+        found = [
+            _least_squares(np.vstack([responses[k], shapes, lagged[k]]), one - usual) for k, one in enumerate(sums)
+        ]
+        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
+        self.lag = _pooled_mean(self.values[:, -1], variances[:, -1])
+        sums -= usual + np.median(rest, axis=0) + self.lag * lagged
+        found = [_least_squares(np.vstack([responses[k], shapes]), one) for k, one in enumerate(sums)]
+        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
+        order, few = np.argsort(self.times), max(4, len(sums) // 16)
+        self.ends = np.stack([np.median(self.values[part, 2:4], axis=0) for part in (order[:few], order[-few:])])
+        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
         squared = np.square(rest).mean(axis=1)
         area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-14 * float(np.square(usual).mean()))
         self.variances, spent = variances * noise * bright, variances.shape[1]
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        other = rest + self.values[:, 1 + len(fixed) :] @ np.reshape(shapes[len(fixed) :], (-1, rest.shape[1]))
         excess, alone = [], []
         for own in self.sides:
             expected = noise / self.squares[own.axis] * len(own.vectors) * (1 - spent / self.shape[own.axis])
             expected *= 1 + np.pi / 2 / len(sums)  # the usual sum is a median
             deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
-            beyond = self._energy_along(own, other) - expected
-            excess.append(beyond * (beyond.sum() > _SURE * deviation))
-            alone.append(self._energy_along(own, rest) / max(expected, 1e-300))
+            energy = self._energy_along(own, rest)
+            excess.append((energy - expected) * ((energy - expected).sum() > _SURE * deviation))
+            alone.append(energy / max(expected, 1e-300))
         self.excess = np.concatenate(excess)
         bad = np.abs(self.values[:, 0]) > _ALONE  # one frame is black, so that power cannot be divided out
         bad[[numbers[half] for half in self.taken.wrong]] = True
@@ -559,7 +538,7 @@ class _Check:
             middle = max(float(np.median(measure)), 1.0)
             bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
         self.good = ~bad
-        return bad
+        return np.asarray(bad)
 
     def _energy_along(self, own: _Side, rest: FloatArray) -> FloatArray:
         """Return (N,) squared length of the vectors that the residuals ``rest`` of a side have along the common one."""
@@ -588,28 +567,23 @@ class _Check:
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        order, ends, moved = np.argsort(self.times), max(4, len(self.times) // 16), 0.0
         for own in self.sides:
             own.add("sums", float(self._of(own, self.excess * self.good).sum()))
             if not self.centre:
                 self._subtract_ambient(own)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            cube = 2 * self.bend * float(np.sum(own.sums.common**3)) / own.square
-            own.add("bend", cube**2 * float(np.square(own.uniform[:, None] * own.vectors).sum()))
             # Differences of neighbours: those of every second pixel do not see the finest detail.
             steep = self._of(own, self.good) * np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
             moves = self.values[:, 2 + own.axis]
-            first, last = (float(np.median(part)) for part in (moves[order[:ends]], moves[order[-ends:]]))
             away = np.square(moves - np.median(moves[self.good])) / self.variances[:, 2 + own.axis]
             if np.mean(away[self.good]) > 1 + _SURE * np.sqrt(2 / self.good.sum()):
-                energies = [float(np.square(self._of(own, moves) - end) @ steep) for end in (first, last)]
-                own.add("motion", max(energies))
-                moved = max(moved, abs(last - first))
+                ends = self.ends[:, own.axis]
+                own.add("motion", max(float(np.square(self._of(own, moves) - end) @ steep) for end in ends))
         self.doubts |= {
             "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
             "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
-            "motion": f"camera or mask move by {moved:.2g} pixels; fasten them",
+            "motion": f"camera or mask move by {self.moved:.2g} pixels; fasten them",
             "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
         }
         if not self.taken.unsteady:
@@ -617,17 +591,13 @@ class _Check:
 
     def _subtract_ambient(self, own: _Side) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        common, length = own.sums.common, len(own.vectors)
-        across, along, inverse = ambient_shapes(common, length)
-        shares = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))]) @ common / own.square
-        effects = np.full(length, shares[0]), along * shares[0], np.full(length, shares[1])
-        scales = inverse[0, 0] / length, inverse_slope(across, along), inverse[1, 1] / length
-        for found, effect, scale in zip(own.pairs.ambient.T, effects, scales, strict=True):
-            kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), self._of(own, self.good))
+        good, light = self._of(own, self.good), own.ambient
+        for found, effect, scale in zip(own.pairs.ambient.T, light.effects, light.variances, strict=True):
+            kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
-            own.add("ambient", float(left.sum() * np.square(effect).sum()))
-            moved = np.square(kept)[self._of(own, self.good)].sum()
-            self.ambient_moved += float(moved * np.square(effect).sum()) / own.size
+            size = float(np.square(effect).sum())
+            own.add("ambient", float(left.sum()) * size)
+            self.ambient_moved += float(np.square(kept)[good].sum()) * size / own.size
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -754,6 +724,8 @@ class _Check:
                 break
         else:
             raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
+        if foreign and (doubts := self._report()):
+            raise MitsimError(f"all frames: {doubts[0]}, and most patterns disagree; take the session again")
         if foreign:
             wrong = [(own, index) for index in sorted(foreign)]
             self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
@@ -774,28 +746,27 @@ class _Check:
             own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
             self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
-    def _costs(self) -> dict[str, float]:
-        """Return the relative error of both factors by its reason, the largest first; MitsimError where all are more
-        than a tenth."""
+    def _report(self) -> list[str]:
+        """Return sentences on the errors that matter, the largest first; MitsimError for more than a tenth."""
         reasons = {reason for own in self.sides for reason in own.extras}
-        squares = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
-        costs = {each: float(np.sqrt(squares[each])) for each in sorted(reasons, key=lambda each: -squares[each])}
-        if (total := float(np.sqrt(sum(squares.values())))) > LARGEST_ERROR:
-            reason = next((self.doubts[each] for each in costs if each in self.doubts), "power or ambient light change")
+        energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
+        order, total = sorted(reasons, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
+        if total > LARGEST_ERROR:
+            reason = self.doubts.get(order[0], "power or ambient light change too much")
             raise MitsimError(
                 f"all frames: {reason}: an error of {total:.0%} is left in the factors, allowed are "
                 f"{LARGEST_ERROR:.0%}; take the session again"
             )
-        return costs
+        most = (_MATTERS * self._noise()) ** 2
+        return [
+            f"{self.doubts[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
+            for each in order
+            if each in self.doubts and energies[each] > most
+        ]
 
     def _judge(self, uniform: FloatArray | None) -> CheckedSession:
         """Report the errors that matter."""
-        costs, noise = self._costs(), self._noise()
-        doubts = [
-            f"session: {self.doubts[reason]}; the stated error includes {cost:.1e} for it"
-            for reason, cost in costs.items()
-            if reason in self.doubts and cost > _MATTERS * noise
-        ]
+        doubts, noise = [f"session: {words}" for words in self._report()], self._noise()
         if self.ambient_moved > (_MATTERS * noise) ** 2:
             doubts.append(
                 f"session: ambient light changes between the two frames of pairs, a factor error of "
