@@ -1,6 +1,6 @@
 """Outcome of calibration sessions with planted faults: right, refused or wrong.
 
-    python benchmarks/session_faults.py RESULT.json [--sessions 9] [--clean 200] [--kinds ...] [--seed 0] [--n 32 64 128]
+    python benchmarks/session_faults.py RESULT.json [--sessions 9] [--clean 200] [--kinds ...] [--seed 0] [--n 32 64]
 
 Simulates sessions in numpy (geometric shadow of a mask, falloff, keystone, rotation, blur as by diffraction, Poisson
 and read noise, rounding), writes them as files, and calibrates with
@@ -595,7 +595,9 @@ PAIRED = ("all pairs of a side exchanged", "all pairs exchanged", "pattern 0 exc
 def error(camera: Camera, factors: Factors) -> float:
     """Relative error of both factors, in quadrature; the sign that both share is free."""
     each, scale = [], np.sqrt(camera.peak)
-    signs = [np.sign(np.vdot(found, exact)) for found, exact in zip((factors.left, factors.right), camera.exact)]
+    signs = [
+        np.sign(np.vdot(found, exact)) for found, exact in zip((factors.left, factors.right), camera.exact, strict=True)
+    ]
     sign = signs[0] if signs[0] == signs[1] else 1.0
     for found, exact in zip((factors.left, factors.right), camera.exact, strict=True):
         each.append(float(np.linalg.norm(sign * found - exact * scale) / np.linalg.norm(exact * scale)))
@@ -616,7 +618,7 @@ def outcome(seed: int, n: int, kind: str | None, uniform: bool) -> dict[str, Any
         except MitsimError as refusal:
             row["message"] = str(refusal)
             named = set(re.findall(r"f_\d+\.npy", row["message"]))
-            true = session.wrong is None or bool(named) and named <= session.names()
+            true = session.wrong is None or (bool(named) and named <= session.names())
             return {**row, "outcome": "refused" if "all frames" in row["message"] or true else "misnamed"}
     stated = float(np.hypot(*factors.estimate.predicted_error)) if factors.estimate else 0.0
     found = {"warnings": list(factors.warnings), "stated": stated, "error": error(camera, factors)}

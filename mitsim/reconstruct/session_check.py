@@ -640,7 +640,7 @@ class _Check:
             # The factors are those of the mean power; a capture may have any that the session had.
             range_ = float(np.abs(trend - 1).max()) / 2
             own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
-            own.add("bend", (bent / 2) ** 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
+            own.add("bend", bent**2 / 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
             parts = np.stack([(1 + sign * self._of(own, ratio)) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
@@ -731,8 +731,14 @@ class _Check:
             self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
         if not shadow.predicts and 0 < len(turned) < self.count:
             self._refuse([(own, index) for index in turned], "they are in each other's place")
-        for index in sorted(turned):
-            detail, repair = "in each other's place", "they count in their right order"
+        all_pairs = len(turned) == self.count
+        for index in [0] if all_pairs else sorted(turned):
+            detail = (
+                f"in each other's place, as in all pairs of {own.side} stripes"
+                if all_pairs
+                else "in each other's place"
+            )
+            repair = "they count in their right order"
             self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
         if shadow.predicts and shadow.lines.max() > _LINE:
             raise MitsimError(
