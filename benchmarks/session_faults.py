@@ -594,14 +594,10 @@ PAIRED = ("all pairs of a side exchanged", "all pairs exchanged", "pattern 0 exc
 
 def error(camera: Camera, factors: Factors) -> float:
     """Relative error of both factors, in quadrature; the sign that both share is free."""
-    each, scale = [], np.sqrt(camera.peak)
-    signs = [
-        np.sign(np.vdot(found, exact)) for found, exact in zip((factors.left, factors.right), camera.exact, strict=True)
-    ]
-    sign = signs[0] if signs[0] == signs[1] else 1.0
-    for found, exact in zip((factors.left, factors.right), camera.exact, strict=True):
-        each.append(float(np.linalg.norm(sign * found - exact * scale) / np.linalg.norm(exact * scale)))
-    return float(np.hypot(*each))
+    scale, pairs = np.sqrt(camera.peak), list(zip((factors.left, factors.right), camera.exact, strict=True))
+    sign = -1.0 if all(np.vdot(found, exact) < 0 for found, exact in pairs) else 1.0
+    each = [np.linalg.norm(sign * found - exact * scale) / np.linalg.norm(exact * scale) for found, exact in pairs]
+    return float(np.hypot(each[0], each[1]))
 
 
 @single_threaded_blas()
