@@ -306,6 +306,11 @@ def _sides_exchanged(session: Session, *sides: str) -> None:
     session.wrong = None
 
 
+def _uniforms_exchanged(session: Session) -> None:
+    for side in SIDES:
+        session.exchange(side, 0)
+
+
 def _swapped(next_one: bool) -> Callable[[Session], None]:
     def plant(session: Session) -> None:
         side, (one, other) = SIDES[int(session.rng.integers(2))], session.pick(2)
@@ -324,7 +329,7 @@ def _lines(change: Callable[[Session, np.ndarray], np.ndarray]) -> Callable[[Ses
         line = change(session, session.signs[:, index].astype(float))
         for half in session.halves(side, index):
             session.lines[half] = (1 + half[2] * line) / 2
-            session.wrong |= {half}
+            session.show({half: half})
 
     return plant
 
@@ -366,7 +371,7 @@ def _frames(
 def _half_lost(session: Session, light: np.ndarray) -> np.ndarray:
     axis, cut = int(session.rng.integers(2)), session.rng.uniform(0.3, 0.7)
     keep = np.arange(light.shape[axis]) < cut * light.shape[axis]
-    return light * (keep[:, None] if axis == 0 else keep)
+    return np.asarray(light * (keep[:, None] if axis == 0 else keep))
 
 
 def _rolled(session: Session, light: np.ndarray) -> np.ndarray:
@@ -535,7 +540,7 @@ KINDS: dict[str, Callable[[Session], None]] = {
     "all pairs of a side exchanged": lambda session: _sides_exchanged(session, SIDES[int(session.rng.integers(2))]),
     "all pairs exchanged": lambda session: _sides_exchanged(session, *SIDES),
     "pattern 0 exchanged": lambda session: session.exchange(SIDES[int(session.rng.integers(2))], 0),
-    "both patterns 0 exchanged": lambda session: [session.exchange(side, 0) for side in SIDES] and None,
+    "both patterns 0 exchanged": _uniforms_exchanged,
     "patterns swapped": _swapped(False),
     "neighbours swapped": _swapped(True),
     "pattern rolled": _lines(lambda session, line: np.roll(line, int(session.rng.integers(2, len(line) - 1)))),
@@ -617,8 +622,9 @@ def outcome(seed: int, n: int, kind: str | None, uniform: bool) -> dict[str, Any
             true = session.wrong is None or (bool(named) and named <= session.names())
             return {**row, "outcome": "refused" if "all frames" in row["message"] or true else "misnamed"}
     stated = float(np.hypot(*factors.estimate.predicted_error)) if factors.estimate else 0.0
-    found = {"warnings": list(factors.warnings), "stated": stated, "error": error(camera, factors)}
-    return {**row, **found, "outcome": "right" if found["error"] <= LIMIT * stated else "wrong"}
+    actual = error(camera, factors)
+    row |= {"warnings": list(factors.warnings), "stated": stated, "error": actual}
+    return {**row, "outcome": "right" if actual <= LIMIT * stated else "wrong"}
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
