@@ -608,7 +608,8 @@ class _Check:
         first = np.arange(2) * self.count
         unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
         usable = self.good
-        both = (1 + power * unit) / (1 - np.where(usable, np.square(ratio) - self.variances[:, 0], 0.0).clip(0))
+        sure = usable & (np.square(ratio) > _SURE**2 * self.variances[:, 0])
+        both = (1 + power * unit) / (1 - np.where(sure, np.square(ratio), 0.0))
         degree, kept = min(3, max(len(np.unique(self.times)) // 4, 0)), usable
         for _ in range(4):
             trend = np.polynomial.Polynomial.fit(self.times[kept], both[kept], degree)(self.times)
