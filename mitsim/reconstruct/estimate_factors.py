@@ -210,7 +210,7 @@ class StripeSums:
 
     def _pair_light(self, response: FloatArray, light: FloatArray, own: FloatArray) -> PairLight:
         """Return the light of a pair with this ``response``, whose vector is its ``own``."""
-        blocks = block_means(block_means(light, 0), 1).astype(np.float32)
+        blocks = block_means(block_means(light).T).T.astype(np.float32)
         if self.side != "horizontal":
             response, light = response.T, light.T
         vector = light @ (self.common / np.dot(self.common, self.common))
@@ -473,16 +473,12 @@ def without_plane(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors - plane @ (plane.T @ vectors))
 
 
-def block_means(values: FloatArray, axis: int) -> FloatArray:
-    """Return means of ``values`` over groups of neighbours along an ``axis``, at most ``_BLOCKS`` groups."""
-    length = values.shape[axis]
-    size = -(-length // _BLOCKS)
-    if size == 1:
-        return values
-    starts = np.arange(0, length, size)
-    counts = np.diff(np.append(starts, length))
-    sums = np.add.reduceat(values, starts, axis=axis)
-    return np.asarray(sums / (counts if axis == values.ndim - 1 else counts[:, None]))
+def block_means(values: FloatArray) -> FloatArray:
+    """Return means of ``values`` over blocks of neighbours along their first axis, at most ``_BLOCKS`` blocks."""
+    size = -(-len(values) // _BLOCKS)
+    whole = len(values) // size * size
+    means = values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if size > 1 else values[:whole]
+    return means if whole == len(values) else np.concatenate([means, values[whole:].mean(axis=0, keepdims=True)])
 
 
 # ---- Whether the factors can be used ----

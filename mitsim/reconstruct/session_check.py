@@ -39,6 +39,7 @@ from mitsim.reconstruct.estimate_factors import (
 )
 from mitsim.reconstruct.moving_shadow import MovingShadow
 
+Single = npt.NDArray[np.float32]
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, the usual sum is in doubt."""
 _MATTERS = 0.5
@@ -60,15 +61,16 @@ _UNEXPLAINED = 0.05
 of its amplitude."""
 _NOISY = 4.0
 """Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
-_WRONG, _UNLIKE = 25.0, 0.03
+_WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.05, 15.0
-"""Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good sessions have
-0.44 at 6 of the latter, and 0.03 at 9; swapped patterns have about 1 at 17 and more, a pattern that is rolled by a line
-0.08 at 22."""
-_KNOWN = 5.0
-"""The same of a pattern that the others determine: 4 if its sign is wrong, and thousands if they do not."""
+_FOREIGN = 0.05, 15.0, 15.0
+"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too: good
+sessions have 0.93 at 30 and a deviation of 10 (128 patterns), 0.03 at 9 (32 patterns); swapped patterns have about 1 at
+17 and more and a deviation of 20, a pattern that is rolled by a line 0.08 at 22 and 133."""
+_KNOWN = 5.0, 25.0
+"""Squared deviation, as a part of its own square, of a pattern that the others determine: 4 if its sign is wrong, and
+thousands if they do not; and the deviation from which that does not matter."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
@@ -154,15 +156,15 @@ def _pooled_mean(values: FloatArray, variances: FloatArray) -> float:
     return mean if abs(mean) > _SURE * np.sqrt(scatter / usable.sum()) else 0.0
 
 
-def _least_squares(shapes: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _least_squares(shapes: Single, values: Single) -> tuple[FloatArray, FloatArray, Single]:
     """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (0 for a
     shape that is zero), and the residual."""
-    sizes = np.sqrt(np.square(shapes).sum(axis=1))
+    products = (shapes @ shapes.T).astype(np.float64)
+    sizes = np.sqrt(np.diag(products))
     scale = np.where(sizes > 0, sizes, np.inf)
-    shapes = shapes / scale[:, None]
-    inverse = np.linalg.pinv(shapes @ shapes.T, rcond=1e-9, hermitian=True)
+    inverse = np.linalg.pinv(products / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
     found = inverse @ (shapes @ values)
-    return found / scale, np.diag(inverse) / scale**2, values - found @ shapes
+    return found, np.diag(inverse), values - found.astype(np.float32) @ shapes
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -478,40 +480,39 @@ class _Check:
         places = {half: place for place, half in enumerate(self.taken.order)}
         halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
         self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
-        sums = np.concatenate([own.pairs.blocks for own in self.sides]).astype(np.float64)
+        sums = np.concatenate([own.pairs.blocks for own in self.sides])
         lit = sums.mean(axis=0)  # noise of light is larger where there is more
         bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
         if self.centre:
             sums -= sums.mean(axis=2, keepdims=True)
             sums -= sums.mean(axis=1, keepdims=True)
         self.shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
-        self.along = [block_means(own.uniform, 0) for own in self.sides]
+        self.along = [block_means(own.uniform) for own in self.sides]
         self.squares = [max(float(np.square(each).sum()), 1e-300) for each in self.along[::-1]]
-        moved = [block_means(np.gradient(own.uniform), 0) for own in self.sides]
+        moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
         fixed = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
         if not self.centre:
             (y, x), (one, same) = ([make(k) for k in self.shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
-        shown = [block_means(own.sums.vectors, 0) for own in self.sides]
-        responses = np.concatenate([
-            np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
-        ]).reshape(len(sums), -1)  # fmt: skip
+        shown = [block_means(own.sums.vectors) for own in self.sides]
+        left, right = np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
+        responses = np.concatenate([left, right]).reshape(len(sums), -1).astype(np.float32)
         first = np.arange(2) * self.count
         lagged, self.own_before = np.zeros_like(sums), np.zeros(len(sums))
         numbers = {half: number for number, each in enumerate(halves) for half in each}
         for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
             if numbers[last] == numbers[half]:
                 self.own_before[numbers[half]] += last[2] / 2
-            else:
-                lagged[numbers[half]] += last[2] / 2 * responses[numbers[last]]
+            elif last[1]:  # the uniform pattern's light looks like the lamp's power
+                lagged[numbers[half]] += np.float32(last[2] / 2) * responses[numbers[last]]
         responses[first] = 0.0  # the uniform pattern has one lit frame
-        usual, shapes = np.median(sums, axis=0), np.stack(fixed).reshape(len(fixed), -1)
+        usual, shapes = np.median(sums, axis=0), np.stack(fixed).reshape(len(fixed), -1).astype(np.float32)
         found = [
             _least_squares(np.vstack([responses[k], shapes, lagged[k]]), one - usual) for k, one in enumerate(sums)
         ]
         self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
         self.lag = _pooled_mean(self.values[:, -1], variances[:, -1])
-        sums -= usual + np.median(rest, axis=0) + self.lag * lagged
+        sums -= usual + np.median(rest, axis=0) + np.float32(self.lag) * lagged
         found = [_least_squares(np.vstack([responses[k], shapes]), one) for k, one in enumerate(sums)]
         self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
         order, few = np.argsort(self.times), max(4, len(sums) // 16)
@@ -520,7 +521,7 @@ class _Check:
         squared = np.square(rest).mean(axis=1)
         area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
-        noise = max(noise, 1e-14 * float(np.square(usual).mean()))
+        noise = max(noise, 1e-13 * float(np.square(usual).mean()))
         self.variances, spent = variances * noise * bright, variances.shape[1]
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
         excess, alone = [], []
@@ -709,7 +710,8 @@ class _Check:
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
-            known = (shadow.deviations > _WRONG) | (shadow.unlike < _KNOWN)
+            known = (shadow.unlike < _KNOWN[0]) | (shadow.deviations > _KNOWN[1])
+            known &= shadow.deviations > _FOREIGN[2]
             doubtful |= known & (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
             far = np.where(doubtful, shadow.deviations, 0.0)
             gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
