@@ -46,8 +46,7 @@ from mitsim.optics.terms import Lacking, lacking
 from mitsim.reconstruct.colour import behind
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
-from mitsim.reconstruct.session_side import frame_words
+from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session, frame_words
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""
@@ -319,13 +318,12 @@ def estimates(
         as for :func:`session_sums`.
     """
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
-    sensor, drift = session.bench.sensor, session.recipe.drift
+    drift = session.recipe.drift
     taken = SessionConditions(
         session.order,
         saturated=bool(found.saturated),
         # Who states that the lamp drifts asks what that costs, which is gone once it is divided out.
         unsteady=bool(drift.session_ramp or drift.session_flicker),
-        step=0.0 if sensor.largest_dn is None else 1 / sensor.gain_dn_per_e / lit.exposure_s,
     )
     with job.clock.stage("estimate"):
         judged = [

@@ -224,9 +224,10 @@ def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
     own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
     single = float(own["misfit"]), float(own["energy"]), int(own["done"])
     sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
-    sums.misfits, sums.energies, sums.fluxes = own["misfits"], own["energies"], own["fluxes"]
+    sums.misfits, sums.energies = own["misfits"], own["energies"]
     if "light" in own:
-        sums.pairs = [PairLight(*parts) for parts in zip(own["light"].T, own["rows"], own["columns"], strict=True)]
+        parts = (own["light"].T, own["blocks"], own["ambient"], own["across"])
+        sums.pairs = [PairLight(*pair) for pair in zip(*parts, strict=True)]
     return sums
 
 

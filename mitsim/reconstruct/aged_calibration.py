@@ -33,7 +33,7 @@ from mitsim.reconstruct.estimate_factors import (
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.known_frames import KnownFrames
-from mitsim.reconstruct.session_side import shadow_step
+from mitsim.reconstruct.moving_shadow import shadow_step
 from mitsim.reconstruct.shifted_codes import (
     TURNS,
     Exposure,

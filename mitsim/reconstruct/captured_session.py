@@ -40,7 +40,7 @@ from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
 from mitsim.reconstruct.estimate_factors import Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.session_faults import CheckedSession, SessionConditions, check_session
+from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
 """Of a list's `digital`, what a camera's file states where the list does not."""
@@ -53,8 +53,6 @@ light, from which one is wrong: light that is twice the usual doubles the first,
 most sessions' noise."""
 _LIT = 0.01
 """Light of a dark frame beyond the others', as a part of the uniform frame's, from which it is wrong."""
-_CLIPPED, _FEW = 2e-3, 10
-"""Part of a frame's pixels, and how many, at its largest number that are no chance: of noisy ones a few are."""
 
 
 # ---- From the frames of a real session to factors ----
@@ -452,15 +450,6 @@ class _Readings:
             )
         return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
-    def is_clipped(self, half: Half) -> bool:
-        """Whether many pixels of a frame share its largest number."""
-        for exposure in range(len(self.session.listed.exposure_ladder)):
-            for frame in self.session.repeats_of(half, exposure):
-                values = self.session.read(frame.file)
-                if np.count_nonzero(values == values.max()) > max(_CLIPPED * values.size, _FEW):
-                    return True
-        return False
-
     def _merge(self, half: Half) -> _Reading:
         """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
@@ -514,18 +503,15 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    digital = session.listed.digital
     taken = SessionConditions(
         session.order,
         session.frame_name,
-        readings.is_clipped,
         bool(readings.saturated),
-        step=(digital.step_dn or 0.0) / digital.gain_dn_per_e / digital.exposure_s,
         wrong=readings.wrong(),
     )
     found = check_session(sums, signs, taken)
-    if right := found.right_uniform():
-        sums, variances = _sums(readings, signs.shape[1], job, right)
+    if found.uniform is not None:
+        sums, variances = _sums(readings, signs.shape[1], job, found.uniform)
         found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
@@ -533,17 +519,16 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 
 
 def _sums(
-    readings: _Readings, count: int, job: Job, uniform: Side | None = None
+    readings: _Readings, count: int, job: Job, uniform: FloatArray | None = None
 ) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Sums over all responses, and the noise variance of each; ``uniform`` is the side whose first response is the
-    uniform one, None: the mean of both."""
+    """Return sums over all responses, and the noise variance of each; ``uniform`` (rows, columns) is the uniform
+    response, None: the mean of both sides' first one."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
     _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
-    alone = None if uniform is None else (left, right)[SIDES.index(uniform)]
     lights = [light for *_, light in first]
-    sums = stripe_sums(left, right, count, readings.session.listed.centre, alone, lights)
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, uniform, lights)
     variances = [variance for _, variance, _ in first]
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):

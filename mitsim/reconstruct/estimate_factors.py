@@ -34,10 +34,11 @@ LARGEST_ERROR = 0.1
 """Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
-_BINS = 512
-"""Groups of rows, and of columns, whose light is kept of every frame: all of the anchor camera, 16 KiB a pair."""
-FLUX_NOISE = 1.5
-"""Standard deviation of a response's flux over that of its mean, by Hann windows: 3/8 over 1/2 squared."""
+_BLOCKS = 96
+"""Blocks a side, at most, whose mean light is kept of every pair: 29 KiB a pair at 512 pixels, where a block is as wide
+as a feature of the anchor camera's mask."""
+_NEGATIVE = 0.1
+"""Sum over the sum of absolute values below which a uniform response counts as negative: noise alone makes 0.01."""
 _TURNS, _TURNED = 30, 1e-13
 """Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
 each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
@@ -103,40 +104,46 @@ class ResponseFit:
         ||Y_i - u_i common^T||^2 and ||Y_i||^2.
     pair
         of its two frames, where their sum is known.
-    flux
-        its mean light, more of it towards the sensor's middle; 0 where that of its frames is known.
     """
 
     vector: FloatArray
     misfit: float
     energy: float
     pair: PairLight | None = None
-    flux: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class PairLight:
-    """What :mod:`mitsim.reconstruct.session_faults` needs of a pair's two frames.
+    """Light of the two frames of a pair, as :mod:`mitsim.reconstruct.session_check` needs it.
 
     Attributes
     ----------
     light
         (m,) their sum, projected as the response is.
-    rows, columns
-        (2, bins) mean light of groups of rows, and of columns, of the +1 and of the -1 frame.
+    blocks
+        (rows, columns) mean of their sum over blocks of pixels, single precision.
+    ambient
+        (3,) light of the response that the mask does not cast, measured across the common vector: even, and tilted
+        along the response's vector and along the common one, whose places are -1 to 1.
+    across
+        (k,) the response projected on its own vector less the parts that even and tilted light have in it: the common
+        vector times that one's squared length.
     """
 
     light: FloatArray
-    rows: FloatArray
-    columns: FloatArray
+    blocks: npt.NDArray[np.float32]
+    ambient: FloatArray
+    across: FloatArray
 
     @classmethod
     def together(cls, pairs: Sequence[PairLight]) -> PairLight:
-        """That of N ``pairs``: light (m, N), rows and columns (N, 2, bins)."""
+        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns), ambient (N, 3), across
+        (N, k)."""
         return cls(
             np.stack([pair.light for pair in pairs], axis=1),
-            np.stack([pair.rows for pair in pairs]),
-            np.stack([pair.columns for pair in pairs]),
+            np.stack([pair.blocks for pair in pairs]),
+            np.stack([pair.ambient for pair in pairs]),
+            np.stack([pair.across for pair in pairs]),
         )
 
 
@@ -158,7 +165,7 @@ class StripeSums:
         sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
     done
         responses that are in.
-    misfits, energies, fluxes
+    misfits, energies
         (N,) what each response added.
     pairs
         of the two frames of each; none where responses are not the differences of two, or their sums are not known.
@@ -173,11 +180,10 @@ class StripeSums:
     done: int = 0
     misfits: FloatArray = field(init=False)
     energies: FloatArray = field(init=False)
-    fluxes: FloatArray = field(init=False)
     pairs: list[PairLight] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.misfits, self.energies, self.fluxes = np.zeros((3, self.vectors.shape[1]))
+        self.misfits, self.energies = np.zeros((2, self.vectors.shape[1]))
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
@@ -202,16 +208,16 @@ class StripeSums:
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
         return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_light(self, response: FloatArray, light: FloatArray) -> PairLight:
-        across = self.side == "horizontal"
-        vector = (light if across else light.T) @ (self.common / np.dot(self.common, self.common))
-        # Both factors' means are zero where frames are centred; what centring takes off the other side, v does.
-        vector = vector - vector.mean() if self.centre else vector
-        sums = [_marginals(part) for part in (light, response)]
-        rows, columns = (
-            np.stack([both + difference, both - difference]) / 2 for both, difference in zip(*sums, strict=True)
-        )
-        return PairLight(vector, rows, columns)
+    def _pair_light(self, response: FloatArray, light: FloatArray, own: FloatArray) -> PairLight:
+        """Return the light of a pair with this ``response``, whose vector is its ``own``."""
+        blocks = block_means(block_means(light).T).T.astype(np.float32)
+        if self.side != "horizontal":
+            response, light = response.T, light.T
+        vector = light @ (self.common / np.dot(self.common, self.common))
+        projected = without_plane(own) @ response
+        if self.centre:  # both factors' means are zero, so that light of no mask is not in their vectors
+            return PairLight(vector - vector.mean(), blocks, np.zeros(3), projected - projected.mean())
+        return PairLight(vector, blocks, AmbientLight(self.common, len(vector)).measure(response), projected)
 
     def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
@@ -226,8 +232,8 @@ class StripeSums:
             misfit += sum_of_squares(np.subtract(block, explained, out=explained))
             energy += sum_of_squares(block)
         if light is None:
-            return ResponseFit(vector, misfit, energy, flux=_flux(given))
-        return ResponseFit(vector, misfit, energy, self._pair_light(given, light))
+            return ResponseFit(vector, misfit, energy)
+        return ResponseFit(vector, misfit, energy, self._pair_light(given, light, vector))
 
     def put(self, seen: ResponseFit) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -235,7 +241,6 @@ class StripeSums:
         self.misfit += seen.misfit
         self.energy += seen.energy
         self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
-        self.fluxes[self.done] = seen.flux
         if seen.pair is not None:
             self.pairs.append(seen.pair)
         self.done += 1
@@ -264,7 +269,7 @@ def stripe_sums(
     """
     first = _response(horizontal, "horizontal response 0", None, centre)
     second = _response(vertical, "vertical response 0", first.shape, centre)
-    mean = (first + second) / 2
+    mean = (upright(first, horizontal) + upright(second, vertical)) / 2
     if uniform is not None:
         mean = _response(uniform, "uniform response", first.shape, centre)
     a, v = _rank_one_split(mean)
@@ -275,6 +280,13 @@ def stripe_sums(
     ):
         sums.put(sums._fit_checked(checked, np.asarray(response), light))
     return left, right
+
+
+def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
+    """Return a uniform ``response``, its sign turned if its ``light`` (before centring) is negative because its two
+    frames are exchanged. Light that was centred before has no sign."""
+    negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
+    return -response if negative else response
 
 
 # ---- From responses, or their sums, to factors ----
@@ -331,7 +343,6 @@ def factors_of_sums(
     right: StripeSums,
     signs: FloatArray,
     stated_noise: float | None = None,
-    left_out: tuple[int, int] = (0, 0),
     extra: tuple[float, float] = (0.0, 0.0),
 ) -> Estimate:
     """Factors from finished sums.
@@ -344,8 +355,6 @@ def factors_of_sums(
         H (n, N), as :func:`estimate_factors` takes it.
     stated_noise
         root mean square sensor noise of a response [frame unit]; None: unknown.
-    left_out
-        responses of each side whose misfit and energy are not in the sums.
     extra
         squared error of each side's vectors, all in all, that is not the noise of their responses.
     """
@@ -355,8 +364,7 @@ def factors_of_sums(
     energy = left.energy + right.energy
     residual = float(np.sqrt((left.misfit + right.misfit) / energy))
     # Each response of m m' numbers spends one fitted number a sensor row (or column).
-    counted = count - left_out[0], count - left_out[1]
-    spare = counted[0] * len(a) * (len(v) - 1) + counted[1] * len(v) * (len(a) - 1)
+    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
     noise = float(np.sqrt((left.misfit + right.misfit) / spare))
     expected = spare * (stated_noise or 0.0) ** 2 / energy
     unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
@@ -416,27 +424,61 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
-# ---- Means of a frame over rows and columns ----
+# ---- Light that is no mask's, and means over blocks of pixels ----
 
 
-def _marginals(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of a ``frame`` (rows, columns) over groups of rows, and over groups of columns, ``_BINS`` at most."""
-    rows, columns = frame.shape
-    return _group_means(frame @ np.full(columns, 1 / columns)), _group_means(np.full(rows, 1 / rows) @ frame)
+class AmbientLight:
+    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
+
+    Parameters
+    ----------
+    common
+        (k,) v.
+    length
+        m, of the responses' vectors u.
+
+    Attributes
+    ----------
+    effects
+        (3, m) vectors that light of size 1 adds to u: even, tilted along u, tilted along v, by places -1 to 1.
+    variances
+        (3,) of the measured sizes for noise of variance 1.
+    """
+
+    def __init__(self, common: FloatArray, length: int) -> None:
+        self._places, even = np.linspace(-1, 1, length), np.ones(length)
+        shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
+        shares = common @ shapes / np.dot(common, common)
+        self.effects = np.stack([shares[0] * even, shares[0] * self._places, shares[1] * even])
+        self._across = shapes - np.outer(common, shares)
+        self._products = np.zeros((3, 3))
+        self._products[::2, ::2] = length * self._across.T @ self._across
+        self._products[1, 1] = np.dot(self._places, self._places) * np.square(self._across[:, 0]).sum()
+        self._inverse = np.linalg.pinv(self._products)
+        self.variances = np.diag(self._inverse)
+
+    def measure(self, response: FloatArray) -> FloatArray:
+        """Return (3,) the sizes of the light in a ``response`` (m, k)."""
+        seen = response @ self._across
+        return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
+
+    def energies(self, sizes: FloatArray) -> FloatArray:
+        """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
+        return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
 
 
-def _flux(frame: FloatArray) -> float:
-    """Mean light of a ``frame`` (rows, columns), by Hann windows: a mask's shadow that moves over the sensor leaves it,
-    and comes in, where they are dark."""
-    rows, columns = (np.hanning(length + 2)[1:-1] for length in frame.shape)
-    return float(rows @ frame @ columns / (rows.sum() * columns.sum()))
+def without_plane(vectors: FloatArray) -> FloatArray:
+    """Return ``vectors`` (m,) or (m, N) less their parts along even and linearly tilted light."""
+    plane = np.linalg.qr(np.vander(np.linspace(-1, 1, len(vectors)), 2))[0]
+    return np.asarray(vectors - plane @ (plane.T @ vectors))
 
 
-def _group_means(values: FloatArray) -> FloatArray:
-    if len(values) <= _BINS:
-        return values
-    starts = np.arange(_BINS) * len(values) // _BINS
-    return np.asarray(np.add.reduceat(values, starts) / np.diff(np.append(starts, len(values))))
+def block_means(values: FloatArray) -> FloatArray:
+    """Return means of ``values`` over blocks of neighbours along their first axis, at most ``_BLOCKS`` blocks."""
+    size = -(-len(values) // _BLOCKS)
+    whole = len(values) // size * size
+    means = values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if size > 1 else values[:whole]
+    return means if whole == len(values) else np.concatenate([means, values[whole:].mean(axis=0, keepdims=True)])
 
 
 # ---- Whether the factors can be used ----

@@ -1,7 +1,5 @@
 """Factors come back from striped light: exactly without noise, with the predicted error under noise."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from scipy.linalg import hadamard
@@ -11,6 +9,7 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.estimate_factors import (
+    AmbientLight,
     StripeSums,
     _rank_one_split,
     estimate_factors,
@@ -291,17 +290,36 @@ def test_responses_that_are_missing_are_counted() -> None:
             estimate_factors(*sides, H)
 
 
-def test_the_flux_of_an_even_response_is_its_light() -> None:
-    """Of a sensor that is not square. (Planted: the windows' sums divided by each other.)"""
-    sums, _ = stripe_sums(np.ones((M, M + 5)), np.ones((M, M + 5)), 2)
-    assert sums.fit_response(np.full((M, M + 5), 3.0), 1).flux == pytest.approx(3.0, rel=1e-12)
-
-
-def test_a_large_sensor_s_light_is_kept_by_groups_of_rows() -> None:
-    """1030 rows in 512 groups of two and three, of the +1 and of the -1 frame."""
+def test_a_large_sensor_s_light_is_kept_by_blocks() -> None:
+    """1030 rows in blocks of eleven, of the sum of both frames; the last block has seven."""
     rows, light = 1030, np.tile(np.arange(1030.0)[:, None], (1, 4))
     sums, _ = stripe_sums(np.ones((rows, 4)), np.ones((rows, 4)), 2)
     pair = sums.fit_response(light / 2, 1, light).pair
-    ends = np.arange(513) * rows // 512
-    means = np.array([np.arange(first, last).mean() for first, last in pairwise(ends)])
-    np.testing.assert_allclose(pair.rows, [0.75 * means, 0.25 * means], rtol=1e-12)
+    means = np.array([np.arange(first, min(first + 11, rows)).mean() for first in range(0, rows, 11)])
+    np.testing.assert_allclose(pair.blocks, np.tile(means[:, None], (1, 4)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_ambient_light_is_measured_across_the_common_vector(side: int) -> None:
+    """Even light and light tilted along either side, whatever the response is. (Planted: tilts exchanged.)"""
+    rng, (rows, columns) = np.random.default_rng(2), (30, 40)
+    left, right = rng.random(rows) + 1, rng.random(columns) + 1
+    y, x = np.linspace(-1, 1, rows), np.linspace(-1, 1, columns)
+    both = stripe_sums(np.outer(left, right), np.outer(left, right), 2)
+    shown = np.outer(rng.standard_normal(rows), right) if side == 0 else np.outer(left, rng.standard_normal(columns))
+    ambient = 0.3 + 0.2 * y[:, None] - 0.1 * x
+    pair = both[side].fit_response(shown + ambient, 1, shown).pair
+    np.testing.assert_allclose(pair.ambient, [0.3, *((0.2, -0.1) if side == 0 else (-0.1, 0.2))], rtol=1e-9)
+    own, light = both[side], AmbientLight(both[side].common, (rows, columns)[side])
+    taken = own.fit_response(shown + ambient, 1).vector - light.effects.T @ pair.ambient
+    np.testing.assert_allclose(taken, own.fit_response(shown, 1).vector, rtol=1e-9)
+    misfit = own.fit_response(shown + ambient, 1).misfit
+    np.testing.assert_allclose(light.energies(pair.ambient[None]), [misfit], rtol=1e-6)
+
+
+def test_a_uniform_response_whose_frames_are_exchanged_is_turned() -> None:
+    """(Planted: both are averaged as they are, so that nothing is left.)"""
+    horizontal, vertical = responses(*factors())
+    right, turned = (stripe_sums(sign * horizontal[0], vertical[0], N) for sign in (1, -1))
+    for own, other in zip(right, turned, strict=True):
+        np.testing.assert_allclose(own.common, other.common)

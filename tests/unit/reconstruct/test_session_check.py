@@ -1,0 +1,397 @@
+"""Sessions with planted faults are mended, and the stated error holds, or they are refused with the frames named.
+
+Errors are compared with exact factors of a geometric shadow.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.devices.camera import centred_edges
+from mitsim.devices.mask import mls_mask
+from mitsim.devices.patterns import stripe_signs
+from mitsim.devices.session import SIDES, Half, halves_in_order
+from mitsim.optics.shadow import scene_factor
+from mitsim.reconstruct.estimate_factors import stripe_sums
+from mitsim.reconstruct.moving_shadow import MovingShadow
+from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
+
+N, PIXELS = 32, (90, 100)
+SIGNS = stripe_signs(N).astype(float)
+ORDER = halves_in_order(N, True)
+Frames = dict[Half, np.ndarray]
+
+
+def shadow(pixels: int, moved: float = 0.0) -> np.ndarray:
+    """Factor of the anchor's mask before a sensor that has ``moved`` by pixels."""
+    edges = centred_edges(pixels, 5.0 / pixels) + moved * 5.0 / pixels
+    return scene_factor(mls_mask().terms[0][1], 0.06, edges, centred_edges(N, 120 / N), 2.0, 400.0)
+
+
+EXACT = [shadow(pixels) for pixels in PIXELS]
+WHOLE = [factor.sum(axis=1) for factor in EXACT]
+UNIT = 1 / np.outer(*WHOLE).max()
+"""Light of the uniform frame is 1 at its brightest pixel."""
+
+
+def light(half: Half, exact: list[np.ndarray] = EXACT, lit: np.ndarray | None = None) -> np.ndarray:
+    """Light of a frame by ``exact`` factors; ``lit`` lines in place of the pattern's."""
+    side, index, sign = half
+    lines = (1 + sign * SIGNS[:, index]) / 2 if lit is None else lit
+    whole = [factor.sum(axis=1) for factor in exact]
+    sides = (exact[0] @ lines, whole[1]) if side == SIDES[0] else (whole[0], exact[1] @ lines)
+    return UNIT * np.outer(*sides)
+
+
+def frames(
+    change: Callable[[np.ndarray, float, Half], np.ndarray] = lambda frame, time, half: frame, noise: float = 1e-3
+) -> Frames:
+    """All frames, each after a ``change`` by time (0 to 1) and half, with ``noise``."""
+    rng, last = np.random.default_rng(3), len(ORDER) - 1
+    return {
+        half: change(light(half), place / last, half) + noise * rng.standard_normal(PIXELS)
+        for place, half in enumerate(ORDER)
+    }
+
+
+def checked(shown: Frames, pairs: bool = True, **wrong: Half) -> CheckedSession:
+    """Check frames of which some are known to be ``wrong``, why: which; not
+    ``pairs``: each response is of its +1 frame and that of all light. Reads them again where the check asks for it."""
+
+    def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        one, other = shown[side, index, 1], shown[side, index, -1]
+        return (one - other, one + other) if pairs else (2 * one - shown.get((side, 0, 0), shown[side, 0, 1]), None)
+
+    taken = SessionConditions(ORDER, wrong={half: why for why, half in wrong.items()})
+    uniform = None
+    for turn in range(2):
+        first = [pair(side, 0) for side in SIDES]
+        sums = stripe_sums(first[0][0], first[1][0], N, uniform=uniform, lights=[both for _, both in first])
+        for own in sums:
+            for index in range(1, N):
+                response, both = pair(own.side, index)
+                own.put(own.fit_response(response, index, both))
+        found = check_session(sums, SIGNS, taken, uniform_given=bool(turn))
+        uniform = found.uniform
+        if uniform is None:
+            break
+    return found
+
+
+def error(found: CheckedSession) -> tuple[float, float]:
+    """Actual and stated relative error of both factors, in quadrature."""
+    estimate = found.estimate(SIGNS, None)
+    balance = np.sqrt(UNIT * np.linalg.norm(WHOLE[1]) / np.linalg.norm(WHOLE[0]))
+    exact = EXACT[0] * balance, EXACT[1] * UNIT / balance
+    actual = [
+        np.linalg.norm(one - other) / np.linalg.norm(other)
+        for one, other in zip((estimate.left, estimate.right), exact, strict=True)
+    ]
+    return float(np.hypot(*actual)), float(np.hypot(*estimate.predicted_error))
+
+
+def holds(found: CheckedSession, most: float = 0.1) -> bool:
+    """Return True if the error is stated within a factor of 1.5, and is below ``most``."""
+    actual, stated = error(found)
+    return actual < 1.5 * stated < 1.5 * most
+
+
+CLEAN = error(checked(frames()))[0]
+
+
+def shown_frames(text: str) -> set[tuple[str, int]]:
+    """Patterns that a message names."""
+    return {(side, int(index)) for side, index in re.findall(r"(horizontal|vertical) stripes (\d+)", text)}
+
+
+# ---- Good sessions ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+def test_a_good_session_is_left_as_it_is_to_the_bit(pairs: bool) -> None:
+    found = checked(frames(), pairs)
+    assert not found.warnings(str) and found.lamp.for_manifest() is None and found.uniform is None
+    assert all(np.array_equal(own.vectors, found.sums[axis].vectors) for axis, own in enumerate(found.sums))
+    actual, stated = error(found)
+    assert 0.7 * stated < actual < 1.2 * stated
+
+
+# ---- Single frames and patterns --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("half", [("horizontal", 5, 1), ("vertical", 20, -1)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda frame: 0 * frame,
+        lambda frame: np.where(np.arange(PIXELS[1]) < 50, frame, 0.0),
+        lambda frame: np.roll(frame, 3, 0),
+        lambda frame: np.minimum(frame, np.quantile(frame, 0.7)),
+    ],
+)
+def test_the_other_frame_of_its_pair_replaces_a_wrong_one(
+    change: Callable[[np.ndarray], np.ndarray], half: Half
+) -> None:
+    """(Planted: the other frame is left out; the sum's deviation is added with the wrong sign.)"""
+    found = checked({**frames(), half: change(light(half))})
+    (fault,) = found.faults
+    assert (fault.side, fault.index, fault.sign, fault.kind) == (*half, "replaced")
+    assert error(found)[0] < 1.2 * CLEAN and holds(found, 0.01)
+    (named,) = found.warnings(lambda half: f"f{half[2]:+d}.png")
+    assert named.startswith(f"frames: f{half[2]:+d}.png: the two do not add up")
+    assert found.faults_for_manifest(str)[0]["frames"] == [str(half)]
+
+
+@pytest.mark.parametrize("other", [("horizontal", 4, -1), ("horizontal", 5, -1), ("vertical", 0, 1)])
+def test_a_frame_that_repeats_another_is_replaced(other: Half) -> None:
+    found = checked({**(shown := frames()), ("horizontal", 5, 1): shown[other]})
+    assert [fault.index for fault in found.faults] == [5] and error(found)[0] < 1.2 * CLEAN and holds(found, 0.01)
+
+
+@pytest.mark.parametrize("part", [0.5, 0.9, 1.2])
+def test_a_response_is_divided_by_a_single_frames_power(part: float) -> None:
+    """(Planted: of half the power; of the other frame.)"""
+    half = ("vertical", 20, -1)
+    found = checked({**(shown := frames()), half: part * shown[half]})
+    (fault,) = found.faults
+    assert (*half, "power") == (fault.side, fault.index, fault.sign, fault.kind)
+    assert f"{part:g} of its light" in fault.detail
+    assert error(found)[0] < 1.2 * CLEAN and holds(found, 0.01)
+
+
+def test_frames_that_are_known_to_be_wrong_are_left_out_whatever_they_show() -> None:
+    """(Planted: only what does not add up.)"""
+    half: Half = ("horizontal", 5, 1)
+    (fault,) = (found := checked(frames(), unlike=half)).faults
+    assert (fault.side, fault.index, fault.sign, fault.detail) == (*half, "is wrong: unlike")
+    assert holds(found, 0.01)
+    with pytest.raises(MitsimError, match=r"^frames: horizontal stripes 5 of sign \+1, .* 5 of sign -1: is wrong: "):
+        checked(frames(), unlike=half, missing=("horizontal", 5, -1))
+    with pytest.raises(MitsimError, match=r"^frames: vertical stripes 20 of sign \+1: unlike; take them again"):
+        checked(frames(), pairs=False, unlike=("vertical", 20, 1))
+
+
+@pytest.mark.parametrize(
+    "change", [lambda frame: 0.7 * frame + 0.02, lambda frame: np.where(np.arange(PIXELS[1]) < 50, frame, 0.0)]
+)
+def test_a_wrong_uniform_frame_is_replaced_by_those_of_the_other_side(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """The session is read again. (Planted: the size of both uniform frames; their own vectors.)"""
+    found = checked({**(shown := frames()), ("vertical", 0, 1): change(shown["vertical", 0, 1])})
+    (fault,) = found.faults
+    assert (fault.side, fault.index) == ("vertical", 0) and error(found)[0] < 1.2 * CLEAN and holds(found, 0.02)
+
+
+@pytest.mark.parametrize("indices", [[0], [6], [1], [16], [3, 9, 30], range(N)])
+@pytest.mark.parametrize("side", SIDES)
+def test_the_signs_of_exchanged_pairs_are_turned(side: str, indices: list[int]) -> None:
+    """The light decides on pattern 0, the moving shadow on all others. (Planted: pattern 0 is turned by the shadow,
+    which cannot tell it from the turn of all others; 2 pi + k and 4 pi - k are left out, for the finest stripes.)"""
+    shown = frames()
+    turned = {(side, index, sign): shown[side, index, -sign] for index in indices for sign in (1, -1)}
+    found = checked({**shown, **turned})
+    assert [(fault.side, fault.index, fault.kind) for fault in found.faults] == [
+        (side, index, "exchanged") for index in (indices if len(indices) < N else [0])
+    ]
+    assert error(found)[0] == pytest.approx(CLEAN, rel=0.02)
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+@pytest.mark.parametrize(
+    ("index", "lines"),
+    [
+        (9, SIGNS[:, 25]),
+        (1, SIGNS[:, 2]),
+        (16, np.roll(SIGNS[:, 16], 1)),
+        (13, np.roll(SIGNS[:, 13], 5)),
+        (20, np.random.default_rng(1).choice([-1.0, 1.0], N)),
+    ],
+)
+def test_a_pattern_that_shows_other_stripes_is_refused_and_named(index: int, lines: np.ndarray, pairs: bool) -> None:
+    """(Planted: the worst pattern is not fitted before the others are judged, which names more than one.)"""
+    shown = frames()
+    for sign in (1, -1):
+        shown["horizontal", index, sign] += light(("horizontal", 0, 1), lit=sign * (lines - SIGNS[:, index]) / 2)
+    with pytest.raises(MitsimError, match="other horizontal stripes than the other patterns predict") as refusal:
+        checked(shown, pairs)
+    assert shown_frames(str(refusal.value)) - {("horizontal", 0)} == {("horizontal", index)}
+
+
+def test_swapped_patterns_and_stripes_of_the_other_side_are_refused_and_named() -> None:
+    shown = frames()
+    swapped = {("vertical", one, sign): shown["vertical", 30 - one, sign] for one in (9, 21) for sign in (1, -1)}
+    with pytest.raises(MitsimError) as refusal:
+        checked({**shown, **swapped})
+    assert shown_frames(str(refusal.value)) == {("vertical", 9), ("vertical", 21)}
+    with pytest.raises(MitsimError, match="they show no vertical stripes") as refusal:
+        checked({**shown, **{("vertical", 7, sign): shown["horizontal", 7, sign] for sign in (1, -1)}})
+    assert shown_frames(str(refusal.value)) == {("vertical", 7)}
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+def test_a_line_that_is_stuck_is_refused(pairs: bool) -> None:
+    """(Planted: the first line alone is looked at.)"""
+    stuck = np.arange(N) == 11
+
+    def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
+        lines = (1 + half[2] * SIGNS[:, half[1]]) / 2
+        return light(half, lit=np.where(stuck, 1.0, lines)) if half[0] == "horizontal" else frame
+
+    with pytest.raises(MitsimError, match=r"^all frames: "):
+        checked(frames(change), pairs)
+
+
+def test_a_dead_sensor_row_counts() -> None:
+    def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
+        return np.where(np.arange(PIXELS[0])[:, None] == 40, 0.3, frame)
+
+    found = checked(frames(change))
+    assert holds(found, 0.15) and any("sensor row 40 shows no light" in words for words in found.doubts)
+
+
+@pytest.mark.parametrize("start", [0, 2, 20, 40])
+def test_frames_that_are_one_step_out_of_order_are_refused(start: int) -> None:
+    shown, names = frames(), ORDER[start:]
+    late = {**shown, **{name: shown[ORDER[start + place - 1]] for place, name in enumerate(names)}}
+    with pytest.raises(MitsimError, match=r"^all frames: the two frames of .* patterns do not add up"):
+        checked(late)
+
+
+# ---- Faults of the whole session -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "ambient",
+    [
+        lambda time, y, x: 0.03 * time,
+        lambda time, y, x: 0.3 * time,
+        lambda time, y, x: 0.2 * time * (y + 0.5 * x),
+        lambda time, y, x: 0.3 * np.random.default_rng(int(1e6 * time)).random(),
+        lambda time, y, x: 0.2 * (time > 0.4),
+    ],
+)
+def test_ambient_light_is_told_from_the_lamp(ambient: Callable[..., np.ndarray]) -> None:
+    """Slow, fast, tilted, switched on. (Planted: the sums are projected on the uniform response alone; the change
+    within pairs is not subtracted; uniform frames with other ambient light in them are believed.)"""
+    y, x = np.meshgrid(*(np.linspace(0, 1, length) for length in PIXELS), indexing="ij")
+    found = checked(frames(lambda frame, time, half: frame + ambient(time, y, x)))
+    assert not found.faults and not found.lamp.drift and not found.lamp.flicker
+    assert error(found)[0] < 1.3 * CLEAN and holds(found, 0.01)
+
+
+@pytest.mark.parametrize("ambient", [0.0, 0.2])
+def test_a_drifting_lamp_is_divided_out(ambient: float) -> None:
+    """With and without ambient light that grows. (Planted: the trend's mean is not 1.)"""
+    found = checked(frames(lambda frame, time, half: (1 + 0.05 * (time - 0.5)) * frame + ambient * time))
+    assert not found.faults and found.lamp.drift == pytest.approx(0.05, rel=0.05) and not found.lamp.flicker
+    assert found.lamp.drift_cost == pytest.approx(0.05 / np.sqrt(12) * np.sqrt(2), rel=0.2), "of both sides"
+    assert error(found)[0] < 1.3 * CLEAN and holds(found, 0.05)
+    (words,) = found.lamp.warnings()
+    assert words.startswith("lamp: its power drifts by +5.0% over the session")
+
+
+@pytest.mark.parametrize("seed", [1, 12])
+def test_a_flickering_lamp_is_divided_out(seed: int) -> None:
+    """An error of 2 % becomes half a percent. (Planted: the unequal power of both frames is not divided out.)"""
+    power = dict(zip(ORDER, 1 + 0.005 * np.random.default_rng(seed).standard_normal(len(ORDER)), strict=True))
+    found = checked(frames(lambda frame, time, half: power[half] * frame))
+    assert not found.faults and not found.lamp.drift
+    assert found.lamp.flicker == pytest.approx(0.005, rel=0.25) and found.lamp.flicker_cost > 0.015
+    actual, stated = error(found)
+    assert 0.5 * stated < actual < 1.5 * stated < 0.015
+
+
+@pytest.mark.parametrize("pixels", [0.02, 0.03])
+def test_motion_midway_is_measured_and_counts(pixels: float) -> None:
+    """(Planted: the motion along the columns is taken for that along the rows.)"""
+    moved = [shadow(PIXELS[0], pixels), EXACT[1]]
+    found = checked(frames(lambda frame, time, half: light(half, moved) if time > 0.25 else frame, noise=5e-3))
+    (words,) = (words for words in found.doubts if "camera or mask" in words)
+    assert float(words.split(" pixels")[0].split()[-1]) == pytest.approx(pixels, rel=0.3) and holds(found)
+
+
+def test_motion_by_half_a_pixel_is_refused() -> None:
+    moved = [shadow(length, 0.5) for length in PIXELS]
+    with pytest.raises(MitsimError, match=r"^all frames: .* (nothing moves \(by|mask move by) 0.[456]"):
+        checked(frames(lambda frame, time, half: light(half, moved) if time > 0.5 else frame))
+
+
+def test_lag_is_measured_and_counts() -> None:
+    """(Planted: the frame before is taken for the one after.)"""
+    before = dict(zip(ORDER[1:], ORDER, strict=False))
+
+    def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
+        return 0.98 * frame + 0.02 * light(before[half]) if half in before else frame
+
+    found = checked(frames(change))
+    assert holds(found) and any("each frame holds 2.0% of the one before" in words for words in found.doubts)
+
+
+@pytest.mark.parametrize("power", [0.98, 1.02])
+def test_numbers_that_are_not_in_proportion_to_light_count(power: float) -> None:
+    found = checked(frames(lambda frame, time, half: np.power(frame, power), noise=5e-3))
+    assert holds(found) and any("not in proportion to light" in words for words in found.doubts)
+
+
+def test_bands_are_refused() -> None:
+    """(Planted: pairs are compared with the median pair alone, which has bands too.)"""
+    rng = np.random.default_rng(4)
+
+    def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
+        return frame * (1 + 0.01 * np.sin(np.arange(PIXELS[0]) / 4 + 6.3 * rng.random()))[:, None]
+
+    with pytest.raises(MitsimError, match=r"^all frames: "):
+        checked(frames(change))
+
+
+# ---- Without pairs ---------------------------------------------------------------------------------------------------
+
+
+def test_a_sign_is_turned_without_pairs() -> None:
+    half, clean = ("vertical", 20, 1), error(checked(frames(), pairs=False))[0]
+    found = checked({**frames(), half: light(("vertical", 20, -1))}, pairs=False)
+    assert [(fault.index, fault.kind) for fault in found.faults] == [(20, "exchanged")]
+    assert error(found)[0] == pytest.approx(clean, rel=0.1)
+
+
+@pytest.mark.parametrize("change", [lambda frame: 0 * frame, lambda frame: np.roll(frame, 3, 0)])
+def test_a_wrong_frame_without_pairs_is_refused_and_named(change: Callable[[np.ndarray], np.ndarray]) -> None:
+    half = ("horizontal", 20, 1)
+    with pytest.raises(MitsimError) as refusal:
+        checked({**frames(), half: change(light(half))}, pairs=False)
+    assert shown_frames(str(refusal.value)) == {half[:2]}
+
+
+@pytest.mark.parametrize("flicker", [0.002, 0.005])
+def test_unequal_power_without_pairs_counts(flicker: float) -> None:
+    """(Planted: the power's own noise alone.)"""
+    power = dict(zip(ORDER, 1 + flicker * np.random.default_rng(5).standard_normal(len(ORDER)), strict=True))
+    found = checked(frames(lambda frame, time, half: power[half] * frame), pairs=False)
+    assert holds(found) and any("frames are of different power" in words for words in found.doubts)
+
+
+def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
+    uniform = {("horizontal", 0, 0): 0.9 * frames()["horizontal", 0, 1]}
+    with pytest.raises(MitsimError, match=r"^all frames: "):
+        checked({**frames(), **uniform}, pairs=False)
+
+
+# ---- The moving shadow -----------------------------------------------------------------------------------------------
+
+
+def test_shares_are_the_part_of_a_pattern_that_disagrees() -> None:
+    """0 of good patterns, 2 of a turned sign, 1 of a vector that is gone; a missing column has all of its square."""
+    vectors = EXACT[0] @ SIGNS
+    assert np.abs(MovingShadow(vectors, SIGNS).shares[[0, 9, 16]]).max() < 0.1
+    for factor, share in ((-1.0, 2.0), (1e-6, -1e6)):
+        wrong = vectors.copy()
+        wrong[:, 9] *= factor
+        assert MovingShadow(wrong, SIGNS).shares[9] == pytest.approx(share, rel=0.1)
+    missing = EXACT[0] * (np.arange(N) != 11)
+    assert MovingShadow(missing @ SIGNS, SIGNS).lines[11] == pytest.approx(1.0, abs=0.3)
