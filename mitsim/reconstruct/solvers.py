@@ -427,7 +427,10 @@ class Tikhonov(Solver):
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised."""
         prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
-        return replace(prepared, stated=camera.stated_rank)
+        stated = camera.manifest.noise
+        left, right = (float(np.square(side).sum(axis=1).mean()) for side in patterns)
+        noise = (stated.left, stated.right) if stated else Prepared.noise
+        return replace(prepared, stated=camera.stated_rank, noise=noise, light=(left, right))
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
