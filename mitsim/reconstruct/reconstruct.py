@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
+    from mitsim.reconstruct.point_spread_fit import PointSpreadFit
+
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
@@ -81,7 +83,7 @@ class Reconstruction(Solution):
     condition: float | None
     rank_sides: tuple[int, int] | None
     condition_sides: tuple[float, float] | None
-    misfit: Misfit | None
+    misfit: Misfit | PointSpreadFit | None
     uncertainties: Uncertainty | None
     seconds: dict[str, float]
     inputs: dict[str, Any]
@@ -374,7 +376,8 @@ def reconstruct_request(
         data = accumulate(shots, factors, solver, **request.iterative)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
-        uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
+        shown = misfit.chi_square if misfit else 1.0
+        uncertainties = uncertainty(data, solution, shown) if solver.linear and not _by_pixel(depth) else None
     status = misfit.judge(solution.status) if misfit else solution.status
     image = solution.image
     if beside:

@@ -362,8 +362,8 @@ def test_the_steadiest_of_two_is_looked_for():
 
 @pytest.mark.parametrize("side", [0, 1])
 def test_the_least_lambda_is_the_noise_of_factors_over_the_image(side):
-    """400 drawn errors of one factor, and images of unit variance, under light of 2: the variance that they put into the
-    data of the other side's largest singular value, with a standard error of 3 %.
+    """400 drawn errors of one factor, and images of unit variance, under light of 2: the variance that they put into
+    the data of the other side's largest singular value, with a standard error of 3 %.
     (Planted: sensor pixels in place of scene pixels, the light's first power, the other side's noise.)"""
     rng, deviation = np.random.default_rng(4), 0.01
     factors = [rng.normal(size=(30, 12)), rng.normal(size=(40, 10))]
