@@ -216,7 +216,7 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> 
     inherits = image.status.verdict.good and not image.ok
     verdict = "Flagged" if inherits else image.status.verdict.value.capitalize()
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
-    trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit) if known)
+    trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit, image.fit) if known)
     lines = [
         f"{f'Flagged: {image.status.flags[0]}' if inherits else f'{image.status.sentence}.'}"
         if result.quality is None

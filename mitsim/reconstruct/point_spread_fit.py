@@ -52,9 +52,9 @@ _ALIKE = 0.9
 _BETTER, _EQUAL = 0.85, 0.98
 """Cost of the best turned copy over that of the given light, below which the copy is recommended, and below which the
 light is wrong even if noise explains the frames: right light has 0.995 and more."""
-_LEAST_GAIN, _RISE, _NOISY = 1.015, 0.06, 1.2
-"""Right light has more than the first times chi-square to the power of the second (1.13 and more at chi-squares of 1.3
-to 2). Below the last chi-square noise explains the frames, and they decide nothing."""
+_LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
+"""Right light has more than the first times chi-square to the power of the second (1.032 and more at a chi-square of
+1.65, 1.13 of 2). Below the last chi-square noise explains the frames, and they decide nothing."""
 _OFF, _OFF_MEAN = 1 / 12, 1 / 8
 """Distances from the middle of the picture, over its side, that are flagged: of the middle between the 5 % and 95 %
 quantiles of the light, and of its mean, which differs more among right ones (by 0.04 for a dozen lenses)."""

@@ -71,10 +71,12 @@ def solve_point_spread(
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
-    frames, kind = frames.astype(light.precision), "weight" if method == TV else "ridge"
-    prior = (
-        automatic_prior(light, frames, prior, kind) if lam == "auto" else replace(prior, **{kind: check_lambda(lam)})
-    )
+    frames = frames.astype(light.precision)
+    if lam == "auto":
+        prior = automatic_prior(light, frames, prior, "weight" if method == TV else "ridge")
+    else:
+        known = check_lambda(lam)
+        prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
     energy = float(np.vdot(frames, frames))
     found = minimise(light, frames, prior, iterations, tolerance)
     residual = light.image_of(found.image) - frames
@@ -168,17 +170,19 @@ def reconstruct_psf_request(
     with clock.stage("solve"):
         solution = solve_point_spread(camera, frames, request.name, request.lam, **request.iterative)
     with clock.stage("misfit"):
-        misfit = find_fit(camera, frames, seen.variance)
+        fit = find_fit(camera, frames, seen.variance)
+    status = fit.judge(solution.status)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
     if seen.saturated:
         flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")
     return Reconstruction(
-        **{**vars(solution), "status": replace(status := misfit.judge(solution.status), flags=(*status.flags, *flags))},
+        **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
         rank=None,
         condition=None,
         rank_sides=None,
         condition_sides=None,
-        misfit=misfit,
+        misfit=None,
+        fit=fit,
         uncertainties=None,
         seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
         inputs=psf_inputs(shots, light, reduce, request),

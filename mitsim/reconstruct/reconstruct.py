@@ -77,18 +77,21 @@ class Reconstruction(Solution):
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
     predicted
         seconds by stage and memory, before it was begun; None where nobody could tell.
+    fit
+        how well the frames fit a point spread function; None of an image by factors, whose ``misfit`` says so.
     """
 
     rank: int | None
     condition: float | None
     rank_sides: tuple[int, int] | None
     condition_sides: tuple[float, float] | None
-    misfit: Misfit | PointSpreadFit | None
+    misfit: Misfit | None
     uncertainties: Uncertainty | None
     seconds: dict[str, float]
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
     predicted: ImageCost | None = None
+    fit: PointSpreadFit | None = None
 
     @property
     def depths(self) -> DepthMap | None:
@@ -115,7 +118,7 @@ class Reconstruction(Solution):
     @property
     def trust(self) -> tuple[str, ...]:
         """A line on the misfit, and one on the uncertainty by source, where these are known."""
-        return tuple(str(known) for known in (self.misfit, self.uncertainties) if known)
+        return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -136,7 +139,7 @@ class Reconstruction(Solution):
             "focus_range_mm": self.focus.range_mm if self.focus else None,
             "focus_alternatives": [asdict(other) for other in self.focus.alternatives] if self.focus else None,
             "depths": self.depths.summary() if self.depths else None,
-            "misfit": self.misfit and self.misfit.summary(),
+            "misfit": known.summary() if (known := self.misfit or self.fit) else None,
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
             "warnings": () if self.ok else (str(self.status),),

@@ -210,7 +210,7 @@ def point_and_frame(noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_light_that_is_turned_or_of_another_camera_is_flagged(seed: int) -> None:
+def test_light_that_is_turned_or_random_is_flagged(seed: int) -> None:
     """Right light is not flagged at a noise of 0.5 and of 5 %. With 5 % frames may not decide how the light lies.
     (Planted: no total variation.)"""
     for noise in (0.005, 0.05):
@@ -219,7 +219,6 @@ def test_light_that_is_turned_or_of_another_camera_is_flagged(seed: int) -> None
             "turned by 180 degrees": light[::-1, ::-1],
             "mirrored upside down": light[::-1],
             "mirrored left to right": light[:, ::-1],
-            "another camera": point_and_frame(noise, seed + 20)[0],
             "random numbers": np.random.default_rng(seed).random(light.shape),
         }
         right = find_fit(ShiftedLight(light, (48, 56), precision=np.float32), frames.astype(np.float32), None)
@@ -230,7 +229,7 @@ def test_light_that_is_turned_or_of_another_camera_is_flagged(seed: int) -> None
                 found = find_fit(camera, frames.astype(np.float32), None)
                 assert found.fault[0].startswith("Misfit: ") and found.summary()["flagged"], name
                 assert found.unexplained > right.unexplained, name
-                assert name in ("another camera", "random numbers") or (found.gain is not None and found.gain < 1)
+                assert name == "random numbers" or (found.gain is not None and found.gain < 1)
 
 
 def test_displaced_light_is_flagged_and_light_without_a_side_is_not_compared() -> None:
