@@ -55,9 +55,9 @@ light is wrong even if noise explains the frames: right light has 0.995 and more
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
 """Right light has more than the first times chi-square to the power of the second (1.032 and more at a chi-square of
 1.65, 1.13 of 2). Below the last chi-square noise explains the frames, and they decide nothing."""
-_OFF, _OFF_MEAN = 1 / 12, 1 / 8
-"""Distances from the middle of the picture, over its side, that are flagged: of the middle between the 5 % and 95 %
-quantiles of the light, and of its mean, which differs more among right ones (by 0.04 for a dozen lenses)."""
+_OFF = 1 / 8
+"""Distance from the middle of the picture to the mean of the light, over its side, that is flagged: a dozen lenses are
+off by 0.04 (standard deviation)."""
 _GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 """Part of the frames, rms, and chi-square, above which a fit is flagged without any comparison."""
 
@@ -257,12 +257,10 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     others = {name: cost(copy, rough)[0] for name, copy in copies.items() if _likeness(small.psf, copy) < _ALIKE}
     reading = min(others, key=lambda name: others[name], default="")
     energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
-    off, displaced = [], False
-    for axis, size in enumerate(light.psf.shape):
-        profile, place = np.abs(light.psf).sum(axis=1 - axis), np.arange(size) - (size - 1) / 2
-        low, high = np.interp([0.05, 0.95], np.cumsum(profile) / profile.sum(), place)
-        off.append(float(np.average(place, weights=profile)))
-        displaced |= abs(low + high) / 2 > _OFF * size or abs(off[-1]) > _OFF_MEAN * size
+    off = [
+        float(np.average(np.arange(size) - (size - 1) / 2, weights=np.abs(light.psf).sum(axis=1 - axis)))
+        for axis, size in enumerate(light.psf.shape)
+    ]
     return PointSpreadFit(
         chi_square=chi_square,
         unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
@@ -270,7 +268,7 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         gain=others[reading] / max(objective, 1e-300) if others else None,
         reading=reading,
         off=(off[0], off[1]),
-        displaced=displaced,
+        displaced=any(abs(each) > _OFF * size for each, size in zip(off, light.psf.shape, strict=True)),
     )
 
 
