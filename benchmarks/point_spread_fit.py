@@ -3,7 +3,7 @@
     python benchmarks/point_spread_fit.py [--seeds 0 1 2 3] [--shape 64 80] [--json FILE]
 
 Each seed draws a camera (lenses, speckle, a coded mask), a photograph, noise of 0.2, 1 or 5 % of the mean, and a model
-error: none, light that is 2 % larger, or a tone curve. The scene goes on beyond the image, at a fifth of its brightness,
+error: none, light that is 2 % larger, or a tone curve. Beyond the image the scene goes on at a fifth of its brightness
 for half of the seeds. Right light is compared with the same turned and mirrored, moved by a quarter, that of another
 camera, and random numbers.
 """
@@ -93,10 +93,10 @@ def main() -> None:
             rows.append({"seed": seed, "noise": noise, "light": name, "fault": found.fault[0], **found.summary()})
             counts[name, noise][0] += bool(found.fault[0])
             counts[name, noise][1] += 1
+        if options.json:
+            options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     for (name, noise), (flagged, count) in sorted(counts.items()):
         print(f"{name}, noise {noise:.1%}: {flagged} of {count} flagged")
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

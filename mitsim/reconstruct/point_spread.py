@@ -162,7 +162,7 @@ class ShiftedLight:
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
     def reduce(self, factor: int) -> ShiftedLight:
-        """Return the same camera with pixels ``factor`` times as large."""
+        """Return the same camera with pixels ``factor`` times as large; with 1 itself."""
         rows, columns = (size // factor for size in self.sensor)
         return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
 

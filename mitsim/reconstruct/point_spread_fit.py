@@ -37,7 +37,7 @@ _CLEARLY = 2.0
 """Error by held-out pixels over measured noise above which it counts: pixels without model errors predict best with up
 to 2.2 times the noise, and with less than it where that is large."""
 _SIDE, _STEPS = 128, 60
-"""Pixels a side below which frames are not reduced for a comparison, and the most steps of each."""
+"""Pixels a side below which frames are not reduced, and the most steps for held-out pixels; twice as many to compare."""
 _BLOCKS, _KEPT = 12, 8
 """Blocks along the shorter side, of which one in eight is held out: larger than what a model error spreads over."""
 _HALVES = range(-16, 7)
@@ -75,20 +75,15 @@ def frame_noise(frame: Array) -> float:
 
 def _noise_variance(frames: Array) -> float:
     """Return the mean noise variance of ``frames``, by tiles, as bright parts have more."""
-    tiles = [
-        frame[row : row + 16, column : column + 16]
-        for frame in frames
-        for row in range(0, frame.shape[0], 16)
-        for column in range(0, frame.shape[1], 16)
-    ]
-    return float(np.mean([frame_noise(tile) ** 2 for tile in tiles if min(tile.shape) > 7] or [0.0]))
+    rows, columns = (max(size // 16, 1) for size in frames.shape[1:])
+    strips = [strip for frame in frames for strip in np.array_split(frame, rows)]
+    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
+    return float(np.mean([frame_noise(tile) ** 2 for tile in tiles]))
 
 
-def _reduced(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
+def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
     """Return camera and frames small enough for many solutions, and how much smaller they are."""
     factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape) // _SIDE, 1)
-    if factor == 1:
-        return light, frames, 1
     return light.reduce(factor), np.stack([reduce_frame(frame, factor) for frame in frames]), factor
 
 
@@ -107,7 +102,7 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
     noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
     if light.patterns is not None:
         return noise
-    small, seen, _ = _reduced(light, frames)
+    small, seen, _ = _shrink(light, frames)
     row, column = np.indices(small.sensor) // max(min(small.sensor) // _BLOCKS, 1)
     counted = (row + 3 * column) % _KEPT > 0
     part = replace(small, seen=counted.astype(small.precision))
@@ -129,9 +124,21 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
 
 
 def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
-    """Return ``prior`` with an automatic ridge or weight of TV, as ``kind`` says, for ``frames`` (K K', m, m').
+    """Return ``prior`` with an automatic ridge or weight of TV.
 
-    MitsimError for frames without light, and for a ridge under other patterns than uniform light.
+    Parameters
+    ----------
+    light, frames
+        the camera, and what it saw (K K', m, m').
+    prior
+        its bounds are kept.
+    kind
+        what is chosen.
+
+    Raises
+    ------
+    MitsimError
+        for frames without light, and for a ridge under other patterns than uniform light.
     """
     if kind == "weight":
         return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
@@ -160,8 +167,8 @@ class PointSpreadFit:
         how that copy lies.
     off
         rows and columns from the middle of its picture to the light's centre.
-    displaced
-        whether that is far.
+    size
+        rows and columns of the picture.
     """
 
     chi_square: float
@@ -170,7 +177,7 @@ class PointSpreadFit:
     gain: float | None
     reading: str
     off: tuple[float, float]
-    displaced: bool
+    size: tuple[int, int]
 
     @property
     def fault(self) -> tuple[str, str]:
@@ -186,8 +193,8 @@ class PointSpreadFit:
             return f"Misfit: the point spread function fits no better as given than {self.reading}; {left}", same
         if self.unexplained > _GROSS and self.chi_square > _GROSS_CHI_SQUARE:
             return f"Misfit: {left}", same
-        if self.displaced:
-            rows, columns = self.off
+        rows, columns = self.off
+        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > _OFF:
             return (
                 f"Misfit: the point's light is centred {rows:+.0f} rows and {columns:+.0f} columns from the middle of "
                 "its picture, and the image is displaced as much",
@@ -238,7 +245,7 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     variance
         mean noise variance of the frames; None: it is not stated, and measured.
     """
-    small, seen, factor = _reduced(light, frames)
+    small, seen, factor = _shrink(light, frames)
     noise = max(_noise_variance(seen) if variance is None else variance / factor**2, 1e-300)
     error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
 
@@ -246,29 +253,26 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         """Return the least objective by ``psf``, and its chi-square."""
         camera = replace(small, psf=np.ascontiguousarray(psf))
         prior = Prior(weight=rough * error * math.sqrt(camera.column_power), bounds=(0.0, math.inf))
-        found = minimise(camera, seen, prior, _STEPS, 0.01)
+        found = minimise(camera, seen, prior, 2 * _STEPS, 0.002)
         return found.objective, float(np.mean(np.square(camera.image_of(found.image) - seen))) / noise
 
     rough, fine = _ROUGH
     (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
-    if left > _LEFT:
-        rough, objective = fine, alternative
+    rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
     copies = {name: small.psf[::rows, ::columns] for name, (rows, columns) in _TURNED.items()}
     others = {name: cost(copy, rough)[0] for name, copy in copies.items() if _likeness(small.psf, copy) < _ALIKE}
     reading = min(others, key=lambda name: others[name], default="")
     energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
-    off = [
-        float(np.average(np.arange(size) - (size - 1) / 2, weights=np.abs(light.psf).sum(axis=1 - axis)))
-        for axis, size in enumerate(light.psf.shape)
-    ]
+    off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
+    rows, columns = light.psf.shape
     return PointSpreadFit(
         chi_square=chi_square,
         unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
         stated=variance is not None,
         gain=others[reading] / max(objective, 1e-300) if others else None,
         reading=reading,
-        off=(off[0], off[1]),
-        displaced=any(abs(each) > _OFF * size for each, size in zip(off, light.psf.shape, strict=True)),
+        off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
+        size=(rows, columns),
     )
 
 

@@ -231,8 +231,8 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
 
 
 def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
-    """Return a sentence for a status if the automatic lambda ``lam`` is an end of its search range and the image
-    depends on where that end is; otherwise nothing."""
+    """Return a sentence for a status if the automatic lambda ``lam`` of a ``problem`` is an end of its search range and
+    the image depends on where that end is; otherwise nothing."""
     lowest, highest = problem.scale * 10.0 ** np.array([_EXPONENTS[0], 0.0])
     if lam >= highest:
         return ("Automatic lambda is the largest that is tried: the frames show hardly more than noise.",)

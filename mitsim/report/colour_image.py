@@ -225,18 +225,15 @@ def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
     """Return one warning on the ``statuses`` of a run's lines by name: each verdict once, with the sentence of the
     first line that has it, and each flag once; nothing where all lines can be used as they are."""
     flagged = {name: status for name, status in statuses.items() if not status.ok}
-    if not flagged:
-        return ()
     parts = []
     for verdict in dict.fromkeys(status.verdict for status in flagged.values()):
         names = [name for name, status in flagged.items() if status.verdict is verdict]
         first = flagged[names[0]]
         alike = len({flagged[name].sentence for name in names}) == 1
         of_first = "" if alike else f" (so {names[0]}; the table has the others)"
-        remedy = f"; {first.remedy}" if first.remedy else ""
-        parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{remedy}.")
+        parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{'; ' if first.remedy else ''}{first.remedy}.")
     flags = dict.fromkeys(flag for status in flagged.values() for flag in status.flags)
-    return (" ".join([*parts, *flags]),)
+    return (" ".join([*parts, *flags]),) if parts else ()
 
 
 @dataclass(frozen=True, eq=False)
