@@ -29,6 +29,7 @@ PICTURES = "camera", "coins", "astronaut", "text", "cell", "page"
 
 def light_of(kind: int, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Light of a point, of sum 1: of lenses, speckle or a mask."""
+    light: np.ndarray
     row, column = ((np.indices(shape).T - np.array(shape) / 2) / np.array(shape)).T
     if kind == 0:
         light = np.zeros(shape)

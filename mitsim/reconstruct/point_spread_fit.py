@@ -37,7 +37,7 @@ _CLEARLY = 2.0
 """Error by held-out pixels over measured noise above which it counts: pixels without model errors predict best with up
 to 2.2 times the noise, and with less than it where that is large."""
 _SIDE, _STEPS = 128, 60
-"""Pixels a side below which frames are not reduced, and the most steps for held-out pixels; twice as many to compare."""
+"""Pixels a side below which frames are not reduced, and most steps for held-out pixels; twice as many to compare."""
 _BLOCKS, _KEPT = 12, 8
 """Blocks along the shorter side, of which one in eight is held out: larger than what a model error spreads over."""
 _HALVES = range(-16, 7)
