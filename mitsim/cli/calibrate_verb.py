@@ -346,16 +346,19 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
         moved = f"Moved: {moved_in_words(first['moved'])}"
         return finish_folder(limited, output, payload, [said, moved, left], warnings)
     rows, columns = first["scale"]
+    planes = dict[str, list[str]]()
+    for name, each in results.items():
+        text = (
+            f"{each['terms']} code{'s' if each['terms'] > 1 else ''} a side explain {each['explained']:.1%} of the "
+            f"frames, left over beyond noise {each['unexplained_residual']:.2%}, factor error "
+            f"{each['predicted_frame_error']:.1e} in frames of such pictures"
+        )
+        planes.setdefault(text, []).append(name)
     lines = [
         said,
         f"Pictures lie {first['orientation']}, a scene pixel shifts the shadow by {rows:.4g} rows and {columns:.4g} "
         "columns of pixels",
-        *(
-            f"{name and name + ': '}{each['terms']} code{'s' if each['terms'] > 1 else ''} a side explain "
-            f"{each['explained']:.1%} of the frames, left over beyond noise {each['unexplained_residual']:.2%}, "
-            f"factor error {each['predicted_frame_error']:.1e} in frames of such pictures"
-            for name, each in results.items()
-        ),
+        *(f"{', '.join(names)}: {text}" if any(names) else text for text, names in planes.items()),
     ]
     return finish_folder(limited, output, payload, lines, warnings)
 

@@ -216,9 +216,9 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> 
     inherits = image.status.verdict.good and not image.ok
     verdict = "Flagged" if inherits else image.status.verdict.value.capitalize()
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
-    trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit) if known)
+    trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit, image.fit) if known)
     lines = [
-        f"{'Flagged: ' if inherits else ''}{image.status.sentence}."
+        f"{f'Flagged: {image.status.flags[0]}' if inherits else f'{image.status.sentence}.'}"
         if result.quality is None
         else f"{verdict}: {result.quality}",
         f"Image: {payload['output']}",
@@ -324,6 +324,7 @@ def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
     return [
         f"{verdict}: {quality}",
         f"Image: {found.output}",
+        *(f"{name}: {row}" for name, row in found.table.items()),
         *(f"{text[0].upper()}{text[1:]}" for text in found.colours.sentences),
         *common.details(*found.described),
     ]

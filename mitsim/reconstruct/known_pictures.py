@@ -142,7 +142,8 @@ def _factors(
     status = _status(
         choice, codes, (explained, unexplained), bool(np.isfinite(read.noises).all()), float(np.hypot(*seen)), rank
     )
-    warnings = (*_warnings(captures, read, pose), *(() if status.ok else (str(status),)))
+    # Without its figures, which differ by plane.
+    warnings = (*_warnings(captures, read, pose), *(() if status.ok else (f"{status.sentence}; {status.remedy}.",)))
     lengths = [side.length * side.terms for side in codes.sides]
     result: dict[str, Any] = {
         "n": left.shape[1],

@@ -88,12 +88,15 @@ class ShiftedLight:
         P_L (n, K) and P_R (n', K'); None: uniform light of all that reaches the sensor.
     precision
         of all numbers.
+    seen
+        (m, m') 1 for pixels that count, 0 for those that are held out; None: all count.
     """
 
     psf: FloatArray
     sensor: tuple[int, int]
     patterns: tuple[FloatArray, FloatArray] | None = None
     precision: Any = np.float64
+    seen: Array | None = None
 
     def __post_init__(self) -> None:
         if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
@@ -137,7 +140,7 @@ class ShiftedLight:
             seen *= self.spectrum
             # Rows beside the sensor are not made: a quarter of the time.
             frame[:] = fft.irfft(fft.ifft(seen, axis=0, overwrite_x=True)[rows], self.grid[1])[:, columns]
-        return frames
+        return frames if self.seen is None else frames * self.seen
 
     def correlate(self, frames: Array) -> Array:
         """Adjoint of :meth:`image_of`: (n, n') of ``frames`` (K K', m, m')."""
@@ -153,12 +156,15 @@ class ShiftedLight:
         return total
 
     def half_size(self) -> ShiftedLight | None:
-        """The same at half the size; None under patterns, and where that is too small."""
-        smaller = min(*self.psf.shape, *self.sensor) // 2 >= _LEAST_SIDE
-        if self.patterns is not None or not smaller:
-            return None
-        rows, columns = self.sensor
-        return replace(self, psf=4 * reduce_frame(self.psf, 2), sensor=(rows // 2, columns // 2))
+        """Return the same camera at half the size; None under patterns, with pixels held out, and where that is too
+        small."""
+        small = min(*self.psf.shape, *self.sensor) // 2 < _LEAST_SIDE
+        return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
+
+    def reduce(self, factor: int) -> ShiftedLight:
+        """Return the same camera with pixels ``factor`` times as large; with 1 itself."""
+        rows, columns = (size // factor for size in self.sensor)
+        return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
 
     def double(self, smaller: Array) -> Array:
         """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it

@@ -18,54 +18,14 @@ from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
 from mitsim.reconstruct.convolution import check_lambda
 from mitsim.reconstruct.point_spread import Array, ShiftedLight, minimise, reduce_frame
+from mitsim.reconstruct.point_spread_fit import automatic_prior, find_fit
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import Prior
 
-_RIDGE, _WEIGHT = 50.0, 1.2
-"""Automatic lambda over the mean square of a scene pixel's light, by a frame's noise over its mean; and automatic
-weight of TV in units of the noise that the data term's gradient carries to a pixel. Chosen on photographs seen by a
-measured diffuser with noise of 0.1 to 8 %; losses on others: benchmarks/iterative_losses.py."""
 _NUMBERS = 24
 """Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
-
-
-# ---- Weights from the frames themselves ------------------------------------------------------------------------------
-
-
-def frame_noise(frame: Array) -> float:
-    """Standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer, Comput. Vis.
-    Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3 pixels."""
-    if min(frame.shape) < 3:
-        return 0.0
-    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
-    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
-    return float(np.median(np.abs(bent))) / 6 / 0.6745
-
-
-def automatic_ridge(light: ShiftedLight, frames: Array) -> float:
-    """Lambda for one frame under uniform light: proportional to its noise over its mean. MitsimError for patterns, and
-    for a frame without light.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and the frame (1, m, m') that it saw.
-    """
-    if light.patterns is not None:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
-    mean = float(frames.mean())
-    if mean <= 0:
-        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
-    return _RIDGE * frame_noise(frames[0]) / mean * light.column_power
-
-
-def automatic_weight(light: ShiftedLight, frames: Array) -> float:
-    """Weight of TV for ``frames`` (K K', m, m') of ``light``: 1.2 times the noise that the data term's gradient carries
-    to a scene pixel, by :func:`frame_noise`."""
-    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
-    return _WEIGHT * noise * math.sqrt(light.column_power)
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -91,7 +51,7 @@ def solve_point_spread(
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`automatic_ridge`, :func:`automatic_weight`.
+        lambda, or the weight of ``tv``; ``auto``: :func:`mitsim.reconstruct.point_spread_fit.automatic_prior`.
     bounds
         least and largest number; None: any of ``tikhonov``, 0 and inf of the others, as light is.
     iterations, tolerance
@@ -110,12 +70,13 @@ def solve_point_spread(
         )
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
-    if lam == "auto":
-        lam = automatic_weight(light, frames) if method == TV else automatic_ridge(light, frames)
-    lam = check_lambda(lam)
-    known = bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf))
-    prior = Prior(weight=lam, bounds=known) if method == TV else Prior(ridge=lam, bounds=known)
+    prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
     frames = frames.astype(light.precision)
+    if lam == "auto":
+        prior = automatic_prior(light, frames, prior, "weight" if method == TV else "ridge")
+    else:
+        known = check_lambda(lam)
+        prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
     energy = float(np.vdot(frames, frames))
     found = minimise(light, frames, prior, iterations, tolerance)
     residual = light.image_of(found.image) - frames
@@ -128,7 +89,7 @@ def solve_point_spread(
         status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", remedy, figures)
     return Solution(
         image=np.asarray(found.image[light.window], np.float64),
-        lam=lam,
+        lam=prior.weight or prior.ridge,
         residual=math.sqrt(float(np.vdot(residual, residual)) / energy) if energy else 0.0,
         status=status,
         iterations=found.iterations,
@@ -178,7 +139,7 @@ def reconstruct_psf(
     ------
     MitsimError
         for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
-        than is free, another lambda, method or bounds, and ``auto`` under patterns other than uniform light.
+        than is free, and another lambda, method or bounds.
     """
     return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds, iterations=iterations))
 
@@ -208,16 +169,20 @@ def reconstruct_psf_request(
         frames = seen.read()
     with clock.stage("solve"):
         solution = solve_point_spread(camera, frames, request.name, request.lam, **request.iterative)
+    with clock.stage("misfit"):
+        fit = find_fit(camera, frames, seen.variance)
+    status = fit.judge(solution.status)
     flags = [f"The capture was flagged: {' '.join(warning.split()).rstrip('.')}." for warning in shots.warnings]
     if seen.saturated:
         flags.append(f"{seen.saturated} readings are at the full well or the ADC's end: expose for less.")
     return Reconstruction(
-        **{**vars(solution), "status": replace(solution.status, flags=(*solution.status.flags, *flags))},
+        **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
         rank=None,
         condition=None,
         rank_sides=None,
         condition_sides=None,
         misfit=None,
+        fit=fit,
         uncertainties=None,
         seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
         inputs=psf_inputs(shots, light, reduce, request),
@@ -259,11 +224,13 @@ def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
 
 
 class _Frames:
-    """Frames of a capture, of which ``reduce`` x ``reduce`` pixels become one."""
+    """Frames of a capture, of which ``reduce`` x ``reduce`` pixels become one; and, once they are read, the mean
+    ``variance`` of their noise, where the sensor's is stated."""
 
     def __init__(self, shots: Capture, reduce: int) -> None:
         self._shots, self._reduce = shots, reduce
         self.saturated = 0
+        self.variance: float | None = 0.0 if shots.manifest.digital.noise_is_stated else None
         left, right = shots.patterns
         self.uniform = left.shape[1] == right.shape[1] == 1 and bool((left == 1).all() and (right == 1).all())
         first = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
@@ -278,4 +245,7 @@ class _Frames:
         for each in self._shots.pattern_measurements(self._shape):
             frames[each.row * self._columns + each.column] = reduce_frame(each.frame, self._reduce)
             self.saturated += each.saturated
+            if self.variance is not None:
+                variance = np.maximum(self._shots.manifest.digital.variance(each.light, each.shots), 0.0)
+                self.variance += float(np.mean(variance)) / self._reduce**2 / self._count
         return frames

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
+    from mitsim.reconstruct.point_spread_fit import PointSpreadFit
+
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
@@ -74,6 +76,8 @@ class Reconstruction(Solution):
         the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
     predicted
         seconds by stage and memory, before it was begun; None where nobody could tell.
+    fit
+        how well the frames fit a point spread function; None of an image by factors, whose ``misfit`` says so.
     """
 
     rank: int | None
@@ -86,6 +90,7 @@ class Reconstruction(Solution):
     inputs: dict[str, Any]
     focus: Depth | DepthMap | None = None
     predicted: ImageCost | None = None
+    fit: PointSpreadFit | None = None
 
     @property
     def depths(self) -> DepthMap | None:
@@ -112,7 +117,7 @@ class Reconstruction(Solution):
     @property
     def trust(self) -> tuple[str, ...]:
         """A line on the misfit, and one on the uncertainty by source, where these are known."""
-        return tuple(str(known) for known in (self.misfit, self.uncertainties) if known)
+        return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -133,7 +138,7 @@ class Reconstruction(Solution):
             "focus_range_mm": self.focus.range_mm if self.focus else None,
             "focus_alternatives": [asdict(other) for other in self.focus.alternatives] if self.focus else None,
             "depths": self.depths.summary() if self.depths else None,
-            "misfit": self.misfit and self.misfit.summary(),
+            "misfit": known.summary() if (known := self.misfit or self.fit) else None,
             **(self.uncertainties.summary() if self.uncertainties else NO_UNCERTAINTY),
             "status": str(self.status),
             "warnings": () if self.ok else (str(self.status),),
@@ -371,7 +376,8 @@ def reconstruct_request(
         data = accumulate(shots, factors, solver, **request.iterative)
     data, solution, misfit = _fit(data, depth, lam, clock)
     with clock.stage("uncertainty"):
-        uncertainties = uncertainty(data, solution) if solver.linear and not _by_pixel(depth) else None
+        shown = misfit.chi_square if misfit else 1.0
+        uncertainties = uncertainty(data, solution, shown) if solver.linear and not _by_pixel(depth) else None
         if uncertainties and misfit and misfit.picture and shots.manifest.plan is None:
             # Of a simulated run the lamp and the place of every frame are known.
             frames = misfit.picture.uncertainty(solution.image)

@@ -38,6 +38,10 @@ _TAKEN, _TAKEN_RISE = 30.0, 4
 the power of noise outside over noise within that this rises with: misfit that hardly shows outside is not most of what
 is within. 15 to 60 and 4 lose alike, 3 and less too little of heavy misfit
 (docs/decisions/0004-lambda-by-halves.md)."""
+_EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
+"""Powers of ten of the lambdas that are tried, over the largest sigma^2."""
+_FELT = 100.0
+"""Square of a singular value, over lambda, above which lambda changes its coefficient by less than one per cent."""
 _FAINT, _FEWEST = 2.0, 20
 """An octave's energy over its noise below which its signal may be noise that was not told, and numbers that tell it:
 twenty vary by a third."""
@@ -61,6 +65,8 @@ class DiagonalProblem:
         ``projected`` by quarters of the sensor, which tell its noise; None: the noise is taken for white.
     struck
         (r, r') what ``projected`` is known to have beside the image and noise, up to its sign.
+    least
+        smallest automatic lambda: :attr:`mitsim.reconstruct.solver.Prepared.least_lambda`.
     """
 
     sigma: FloatArray
@@ -69,6 +75,7 @@ class DiagonalProblem:
     data_count: int
     halves: Halves | None = None
     struck: FloatArray | float = 0.0
+    least: float = 0.0
 
     def residual_energy(self, lam: float) -> float:
         """||Y - model||^2 of the Tikhonov solution at ``lam``; rounding leaves about 1e-16 of ``energy``."""
@@ -202,11 +209,12 @@ def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
 
 
 def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
-    """Lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor tell.
+    """Return the lambda that minimises :func:`risk_score` of a ``problem``, with the noise that halves of the sensor
+    show, but at least ``problem.least``.
 
-    Where the model does not explain the frames, as they say themselves or as is known before (``explained`` is False),
-    that is a lower bound: what both halves agree on is then an error that follows no law, and the image that
-    :func:`movement` says to be the steadiest is taken, as far as misfit explains what that takes away.
+    Where the model does not explain the frames, as the frames show or as is known before (``explained`` is False), that
+    lambda is a lower bound: both halves then agree on an error that follows no law, so the image that
+    :func:`movement` finds steadiest is taken, as far as misfit explains what its lambda takes away.
 
     Returns lambda in the unit of sigma^2; 0 when no regularisation at all scores best. MitsimError when there
     are no more data than unknowns (the noise is then unknown) or no signal.
@@ -214,13 +222,26 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     noise = coefficient_noise(problem)
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
-    exponents = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
-    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, exponents)
+    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, _EXPONENTS)
     if is_misfit(problem) or not explained:
-        # Beyond the largest sigma^2 all goes to black.
-        candidates = problem.scale * 10.0 ** exponents[exponents <= 0]
-        lam = _steadiest(problem, [lam, *candidates[candidates > lam].tolist()])
-    return lam
+        # Beyond the largest sigma^2 all goes to black, and at lambda 0 nothing moves, however large its noise.
+        candidates = problem.scale * 10.0 ** _EXPONENTS[_EXPONENTS <= 0]
+        lam = _steadiest(problem, [max(lam, candidates[0]), *candidates[candidates > max(lam, candidates[0])].tolist()])
+    return max(lam, problem.least)
+
+
+def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
+    """Return a sentence for a status if the automatic lambda ``lam`` of a ``problem`` is an end of its search range and
+    the image depends on where that end is; otherwise nothing."""
+    lowest, highest = problem.scale * 10.0 ** np.array([_EXPONENTS[0], 0.0])
+    if lam >= highest:
+        return ("Automatic lambda is the largest that is tried: the frames show hardly more than noise.",)
+    if lam <= lowest and np.square(problem.sigma[problem.sigma > 0]).min() < _FELT * lowest:
+        return (
+            "Automatic lambda is the smallest that is tried, so that weakly measured directions of the image may be "
+            "noise; compare with a larger lambda.",
+        )
+    return ()
 
 
 def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:

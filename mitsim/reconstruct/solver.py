@@ -54,7 +54,7 @@ from mitsim.reconstruct.factorisation import (
     factorise,
     group_pixels,
 )
-from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, automatic_lambda
+from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, automatic_lambda, end_of_range
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 ROUNDING_LIMIT = 0.01
@@ -72,14 +72,38 @@ _UNSEEN = 1e-60
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Factorised model, ready for any number of scenes; applying it changes nothing in it. ``stated``: directions of
-    either factor that its calibration states to be above its noise, where it does."""
+    """Factorised model, ready for any number of scenes; applying it changes nothing in it.
+
+    Attributes
+    ----------
+    stated
+        directions of either factor that the calibration states to be above its noise; None: not stated.
+    noise
+        standard deviation of each number of the left and of the right factor, as the calibration states it.
+    light
+        mean over scene pixels of the sum of squared patterns, of either side.
+    """
 
     left: Side
     right: Side
     method: Method
     centre: bool
     stated: tuple[int, int] | None = None
+    noise: tuple[float, float] = (0.0, 0.0)
+    light: tuple[float, float] = (1.0, 1.0)
+
+    @property
+    def least_lambda(self) -> float:
+        """Lambda at which the stated noise of the factors alone outweighs the image.
+
+        Independent errors of deviation s_L in Phi_L put noise of the variance n s_L^2 x^2 sigma_R^2 into a datum whose
+        column has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``). Its ratio to x^2
+        is the weight that the datum deserves; the largest of all columns, and of all rows, is taken.
+        """
+        sides = zip((self.left, self.right), (self.right, self.left), self.noise, self.light, strict=True)
+        return max(
+            own.scene_size * light * float(noise * other.singular.max()) ** 2 for own, other, noise, light in sides
+        )
 
     @property
     def condition(self) -> float:
@@ -183,7 +207,8 @@ class Prepared:
             quarters = np.divide(rotated, sigma, out=np.zeros_like(quarters), where=sigma > 0)
         data_count = self.left.data_rows * self.right.data_rows
         halves = Halves(quarters, self.left, self.right)
-        return DiagonalProblem(sigma, quarters.sum(axis=(0, 1)), frames.energy, data_count, halves)
+        data = quarters.sum(axis=(0, 1))
+        return DiagonalProblem(sigma, data, frames.energy, data_count, halves, least=self.least_lambda)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
         """Scene image (n, n') of ``coefficients`` (r, r') in the diagonal basis: V_L coefficients V_R^T."""
@@ -221,12 +246,13 @@ class Prepared:
         MitsimError
             for missing frames or another lambda.
         """
-        problem = self.problem(frames)
+        problem, flags = self.problem(frames), tuple[str, ...]()
         if isinstance(lam, str):
             if lam != "auto":
                 raise MitsimError(f"lambda is {lam!r}; give a number of at least 0, or auto")
             known = replace(problem, struck=lack[0], energy=max(problem.energy - lack[1], 0.0)) if lack else problem
             lam = automatic_lambda(known, explained)
+            flags = end_of_range(problem, lam)
         lam = float(lam)
         if not (np.isfinite(lam) and lam >= 0):
             raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")
@@ -240,7 +266,7 @@ class Prepared:
             image=self.image(filtered),
             lam=lam,
             residual=float(np.sqrt(residual / problem.energy)) if problem.energy > 0 else 0.0,
-            status=self._status(lam, rounding, problem.scale),
+            status=replace(self._status(lam, rounding, problem.scale), flags=flags),
             rounding=rounding,
         )
 

@@ -36,7 +36,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.convolution import ConvolutionalCamera, check_lambda, solve_iteratively
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, noise_variance
+from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, end_of_range, noise_variance
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV, Bounds
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
@@ -56,6 +56,10 @@ _DAMPINGS = 10.0 ** np.arange(-20, 2.1, 0.5)
 """mu over the largest sigma^2: from where no direction feels it to where all do."""
 _NOTHING = 1e-300
 """In place of a zero that is divided by: the smallest power of ten above what underflows."""
+
+
+_SINGLE = float(np.finfo(np.float32).eps) ** 2 / 2
+"""Objective over the data's energy that rounding frames to single precision adds: a gap is relative to no less."""
 
 
 def automatic_weight(problem: DiagonalProblem) -> float:
@@ -165,7 +169,9 @@ def solve_nonnegative(
     """
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
-    return _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
+    found = _solve(prepared, problem, Prior(ridge=ridge, bounds=bounds or (0.0, math.inf)), iterations, tolerance)
+    flags = end_of_range(problem, ridge) if lam == "auto" else ()
+    return replace(found, status=replace(found.status, flags=flags))
 
 
 def _solve(prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float) -> Solution:
@@ -233,7 +239,7 @@ def _minimise(
             image = np.clip(smooth, *prior.bounds)
             objective = _objective(prepared, problem, image, prior)
             parts = _gap(prepared, problem, image, prior, bounded, pressed)
-            relative = sum(parts) / objective if objective > 0 else 0.0
+            relative = sum(parts) / max(objective, _SINGLE * problem.energy, _NOTHING)
             # Gradients that are bound too tightly leave the data behind, and the other way round.
             factor = _towards(*parts, power=0.25)
             rho_slopes, dual_slopes = rho_slopes * factor, dual_slopes / factor
@@ -343,9 +349,10 @@ def _solution(
     lost, limit = prepared.lost
     figures, name = f"{prepared.extent}.", "total variation" if prior.weight else "least squares"
     if not converged:
+        far = f"may still be {gap:.1e} above its minimum" if gap <= 1 else "is not proven to be near its minimum"
         status = Status(
             Verdict.NOT_CONVERGED,
-            f"Not converged: after {iterations} iterations {name} may still be {gap:.1e} above its minimum",
+            f"Not converged: after {iterations} iterations {name} {far}",
             f"take a {'weight' if prior.weight else 'lambda'} nearer the automatic one, or allow more iterations or a "
             "larger tolerance",
             figures,
@@ -427,7 +434,10 @@ class Tikhonov(Solver):
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
         """The ``camera``'s model under ``patterns``, factorised."""
         prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
-        return replace(prepared, stated=camera.stated_rank)
+        stated = camera.manifest.noise
+        left, right = (float(np.square(side).sum(axis=1).mean()) for side in patterns)
+        noise = (stated.left, stated.right) if stated else Prepared.noise
+        return replace(prepared, stated=camera.stated_rank, noise=noise, light=(left, right))
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any

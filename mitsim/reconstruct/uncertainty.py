@@ -294,6 +294,8 @@ _LOST = 1e-5
 _EXTRAPOLATED = 1.35
 """Factor by which a stated uncertainty may be off from which that is said: data then hold less than frequencies of half
 the detail that is lost."""
+_AS_STATED = 1.5
+"""Factor that chi-square may be off from 1 before noise counts as other than stated: 1.2 in its deviation."""
 _NEAR = 2.0
 """Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
 _UNSURE = 0.1
@@ -348,15 +350,21 @@ class Uncertainty:
         return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
 
     def loss(self, image: FloatArray) -> str:
-        """A sentence where lambda takes away more of an ``image`` (n, n') than it leaves; otherwise empty."""
-        lost, left = self.budget.get("regularisation_bias", 0.0), _rms(image)
-        if lost <= left:
-            return ""
-        return (
-            f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than it "
-            f"leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or give a "
-            "smaller lambda."
-        )
+        """Return a sentence if lambda takes away more of an ``image`` (n, n') than it leaves, or if the uncertainty
+        exceeds the image; otherwise nothing."""
+        lost, left, total = self.budget.get("regularisation_bias", 0.0), _rms(image), _rms(self.total)
+        if lost > left:
+            return (
+                f"Lambda takes away more of the image ({lost:.1e} rms of reflectance, as the uncertainty has it) than "
+                f"it leaves ({left:.1e}), so what is dark may be lost; expose longer, take more patterns or shots, or "
+                "give a smaller lambda."
+            )
+        if total > left:
+            return (
+                f"The image is hardly more than noise: its uncertainty is {total:.1e} rms, the image itself "
+                f"{left:.1e}; expose longer, take more patterns or shots, or give a larger lambda."
+            )
+        return ""
 
     @property
     def gist(self) -> str:
@@ -546,12 +554,26 @@ class Propagation:
         return self.model.prepared.sigma
 
 
-def uncertainty(data: Accumulation, solution: Solution) -> Uncertainty:
-    """Standard uncertainty of a ``solution`` of accumulated ``data`` that is linear in its frames."""
+def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0) -> Uncertainty:
+    """Compute the standard uncertainty of a ``solution`` that is linear in its frames.
+
+    Parameters
+    ----------
+    data
+        all frames, accumulated.
+    solution
+        their image.
+    chi_square
+        energy of the residual over what noise as stated puts there. Where it is far from 1 the frames do not have the
+        stated noise, and theirs is taken to be what the residual shows.
+    """
     noise, image, manifest = data.noise, solution.image, data.factors.manifest
     problem, lack = data.prepared.problem(data.frames), data.lack(image)
     propagation, zero = Propagation(data.model, solution.lam), np.zeros_like(image)
-    frames = propagation.of_frames(noise.rows, noise.columns)
+    # Terms that the factors are known to lack raise the residual, and are a source of their own.
+    as_stated = chi_square > 1 / _AS_STATED and (chi_square < _AS_STATED or lack is not None)
+    shown = 1.0 if as_stated else chi_square
+    frames = shown * propagation.of_frames(noise.rows, noise.columns)
     left, right = propagation.of_factors(manifest.noise, image) if manifest.noise else (zero, zero)
     known, told = (frames + left, frames + right), zero
     if problem.halves:
@@ -562,7 +584,7 @@ def uncertainty(data: Accumulation, solution: Solution) -> Uncertainty:
     exposure = math.hypot(data.digital.exposure_uncertainty, calibrated)
     variances = {
         "frame_noise": frames,
-        "ambient_frame": propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
+        "ambient_frame": shown * propagation.of_ambient_frame(*noise.ambient) if noise.ambient else zero,
         "rendering": of_sampling + propagation.of_light(noise.light_error**2),
         "calibration_noise": left + right,
         "print_detail": np.maximum(propagation.of_print(image), told),

@@ -25,6 +25,7 @@ from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.reconstruct import MADE_OF, RESULT_FILE
 from mitsim.reconstruct.request import IMAGE_FILE
+from mitsim.reconstruct.solution import Status
 from mitsim.report.folder_page import truth_of, write_folder, write_page
 from mitsim.report.folder_pictures import LARGEST, REFLECTANCE, SMALLEST, Picture, Scale, shown_error
 
@@ -220,6 +221,21 @@ def mean_of(values: Iterable[float]) -> float | None:
 # -------- An image in colour with what is known of it, and its files
 
 
+def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
+    """Return one warning on the ``statuses`` of a run's lines by name: each verdict once, with the sentence of the
+    first line that has it, and each flag once; nothing where all lines can be used as they are."""
+    flagged = {name: status for name, status in statuses.items() if not status.ok}
+    parts = []
+    for verdict in dict.fromkeys(status.verdict for status in flagged.values()):
+        names = [name for name, status in flagged.items() if status.verdict is verdict]
+        first = flagged[names[0]]
+        alike = len({flagged[name].sentence for name in names}) == 1
+        of_first = "" if alike else f" (so {names[0]}; the table has the others)"
+        parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{'; ' if first.remedy else ''}{first.remedy}.")
+    flags = dict.fromkeys(flag for status in flagged.values() for flag in status.flags)
+    return (" ".join([*parts, *flags]),) if parts else ()
+
+
 @dataclass(frozen=True, eq=False)
 class JudgedColours:
     """An image in colour, and how good it and the images of its lines are.
@@ -286,6 +302,17 @@ class JudgedColours:
         """What the command line says of it."""
         return [*self.described, *self.colours.sentences]
 
+    @property
+    def table(self) -> dict[str, str]:
+        """Return for each line that was solved by itself what differs between lines, in columns."""
+        rows = {}
+        for number, line in enumerate(self.colours.lines.names if self.of_lines else ()):
+            found, size = self.of_lines[line], float(np.sqrt(np.square(self.colours.images[..., number]).mean()))
+            fit = "" if found["misfit"] is None else f", chi-square {found['misfit']['chi_square']:.3g}"
+            known = "" if found["uncertainty"] is None else f" +- {found['uncertainty']:.2e}"
+            rows[line] = f"lambda {found['lambda']:.3g}{fit}, image {size:.2e}{known} rms"
+        return rows
+
     def summary(self) -> dict[str, Any]:
         """All but the pictures, by the keys of the command line's JSON."""
         known = [found.ssim for found in self.qualities.values() if found and found.ssim]
@@ -317,7 +344,11 @@ class JudgedColours:
         self.colours.write(folder)
         parts = {key: value for key, value in self.summary().items() if key != "channels"}
         lines = ColourManifest(kind="colour-image", channels=self.colours.lines.channels)
-        made = {"facts": self.facts, "board_reflectance": self.colours.board, "chart": self.colours.chart}
+        made = {
+            "facts": {**self.facts, **self.table},
+            "board_reflectance": self.colours.board,
+            "chart": self.colours.chart,
+        }
         write_colours(folder, lines, **inputs, **parts, **made)
 
     def _repr_html_(self) -> str:

@@ -174,7 +174,7 @@ def reconstruct_colours(
     MitsimError
         for folders of different lines, and as :func:`reconstruct`.
     """
-    from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
+    from mitsim.report.colour_image import ColourImage, JudgedColours, board_of, one_paragraph
     from mitsim.report.folders import report_folder
     from mitsim.report.mosaic_images import reconstruct_mosaic
 
@@ -219,7 +219,7 @@ def reconstruct_colours(
                 "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
                 "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
             },
-            warnings=tuple(f"{name}: {each.status}" for name, each in solved.items() if not each.ok),
+            warnings=one_paragraph({name: each.status for name, each in solved.items()}),
             seconds={"total": sum(each["seconds"]["total"] for each in summaries.values())},
             output=str(folder),
             of_lines=summaries,

@@ -19,7 +19,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.subpixel import EDGES, PRINT, Model, print_energy
-from mitsim.reconstruct.uncertainty import Propagation, _cosines, scene_spectrum
+from mitsim.reconstruct.uncertainty import Propagation, _cosines, scene_spectrum, uncertainty
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, bench, picture, shadow
 
 N, PIXELS = 6, 14
@@ -367,6 +367,21 @@ def test_truth_lies_within_twice_the_uncertainty(patterns: str) -> None:
         inside.append(np.abs(image.image - scene) < 1.96 * known)
         assert budget["calibration_noise"] > 0.3 * budget["frame_noise"], "it shall matter"
     assert np.mean(inside) == pytest.approx(0.95, abs=0.015)
+
+
+def test_noise_that_the_residual_does_not_show_is_not_stated() -> None:
+    """The random part follows chi-square where that is off by more than 1.5; all else stays. And noise larger than the
+    image is said."""
+    camera = bench()
+    data = accumulate(camera.run("dots:4", picture(), 1), camera.calibrated(1))
+    solution = data.solution("auto")
+    stated = uncertainty(data, solution)
+    for chi_square, factor in ((0.015, 0.015**0.5), (0.7, 1.0), (1.4, 1.0), (9.0, 3.0)):
+        found = uncertainty(data, solution, chi_square)
+        assert np.allclose(found.sources["frame_noise"], factor * stated.sources["frame_noise"])
+        assert np.allclose(found.sources["calibration_noise"], stated.sources["calibration_noise"])
+        assert found.loss(solution.image) == ""
+    assert "hardly more than noise" in uncertainty(data, solution, 1e8).loss(solution.image)
 
 
 def test_light_that_a_run_states_to_be_off_is_off_in_the_image() -> None:
