@@ -126,7 +126,8 @@ class LeftOut(DerivedCapture):
     data
         the capture added up.
     defects, moved, total
-        the pixels, by pattern what is added to their readings, and for signed patterns the sum of a pair's halves there.
+        the pixels, by pattern what is added to their readings, and for signed patterns the sum of a pair's halves
+        there.
     """
 
     def __init__(

@@ -3,8 +3,8 @@
 Where patterns overlap, the other frames predict a frame by the model: e^T (I - H_kk)^-1 e is the energy of the frame's
 difference from the prediction, in closed form. Signed patterns have a second redundancy, because the halves of every
 pair add up to the same light. Under shifting dots no scene pixel is in two frames, and the picture of the other frames
-predicts a frame (:mod:`mitsim.reconstruct.picture_check`). A closing frame repeats the first pattern, or all pixels lit,
-at the end of the session and is compared with the frames before it.
+predicts a frame (:mod:`mitsim.reconstruct.picture_check`). A closing frame repeats the first pattern, or all pixels
+lit, at the end of the session and is compared with the frames before it.
 """
 
 from __future__ import annotations
@@ -123,7 +123,9 @@ class FrameCheck:
             return
         for digest, shots in self._sums.same.items():
             if digest and len(shots) > 1:
-                yield self._fault("repeated", [self._of(*shot) for shot in shots], "are one and the same, noise and all")
+                yield self._fault(
+                    "repeated", [self._of(*shot) for shot in shots], "are one and the same, noise and all"
+                )
 
     def _clipped(self) -> Iterator[FrameFault]:
         if len(self._sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
@@ -138,10 +140,15 @@ class FrameCheck:
         tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
         if self._signed and sums.pairs:
             size = sums.squares.size
-            rest = np.array([[sums.pairs[row, column].rest for column in range(count_)] for row, count_ in self._rows()])
+            rest = np.array(
+                [[sums.pairs[row, column].rest for column in range(count_)] for row, count_ in self._rows()]
+            )
             noise = self._variance + self._variance.mean() / max(count - 1, 1)
             tests.append((rest - noise * size - share, 2 * noise * np.sqrt(2 * size)))
-        excess = float(sums.left.sum() - (self._variance * sums.squares.size).sum() * self._data.prepared.spare) - self._beside
+        excess = (
+            float(sums.left.sum() - (self._variance * sums.squares.size).sum() * self._data.prepared.spare)
+            - self._beside
+        )
         off = np.zeros(sums.left.shape)
         for beyond, chance in tests:
             part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
@@ -154,11 +161,13 @@ class FrameCheck:
                     continue
             off = np.maximum(off, np.where(bad, part, 0.0))
         if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
-            for row, column in sorted(map(tuple, np.argwhere(off)), key=lambda each: -off[each]):
-                part = float(np.sqrt(off[row, column]))
-                words = f"differ by {part:.1%} from what the other frames predict"
-                numbers = self._halves((int(row), int(column)))
-                yield self._fault("model", numbers, words if len(numbers) > 1 else words.replace("differ", "differs"), part)
+            for place in np.argsort(-off, axis=None)[: np.count_nonzero(off)]:
+                row, column = (int(index) for index in np.unravel_index(place, off.shape))
+                size = float(np.sqrt(off[row, column]))
+                numbers = self._halves((row, column))
+                differ = "differ" if len(numbers) > 1 else "differs"
+                words = f"{differ} by {size:.1%} from what the other frames predict"
+                yield self._fault("model", numbers, words, size)
 
     def _rows(self) -> Iterator[tuple[int, int]]:
         rows, columns = self._sums.left.shape
@@ -182,7 +191,9 @@ class FrameCheck:
         rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
         numbers = np.reshape(self._numbers, self._variance.shape)
         image = prepared.image(gain * self._sums.weights)
-        return check_picture(image, numbers[np.ix_(rows, columns)], self._variance.shape, bases[0] @ variance @ bases[1].T)
+        return check_picture(
+            image, numbers[np.ix_(rows, columns)], self._variance.shape, bases[0] @ variance @ bases[1].T
+        )
 
     def _unlike_picture(self) -> Iterator[FrameFault]:
         found = self.picture
@@ -218,7 +229,7 @@ class FrameCheck:
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
             for index in np.flatnonzero(single):
                 words = f"has {1 + power[index] - np.median(power):.2f} times the light that the others predict"
-                yield self._fault("power", [numbers[index]], words)
+                yield self._fault("power", [numbers[int(index)]], words)
         elif scatter > max(_POWER, most * usual):
             yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power", scatter)
 
@@ -264,7 +275,9 @@ class FrameCheck:
         cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * self._sums.squares.size, TINY)
         times = float(np.median(cost)) / _MEDIAN_SQUARE
         powers = np.array([power for pair in pairs.values() for power in pair.powers])
-        errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(2 * np.repeat(noise, 2))
+        errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(
+            2 * np.repeat(noise, 2)
+        )
         numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
         single = [fault for fault in self._powers(powers, errors, numbers, np.inf)]
         yield from single
@@ -283,7 +296,6 @@ class FrameCheck:
         predicted, variance = self._predicted(closing.kind)
         if predicted is None:
             return
-        noise = self._data.noise
         power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
         away = closing.light - predicted
         own = variance + closing.variance
@@ -291,8 +303,11 @@ class FrameCheck:
         chance = CHANCE * float(np.sqrt(2 * np.square(own).sum()))
         part = float(np.sqrt(max(beyond, 0.0) / max(sum_of_squares(predicted), TINY)))
         if beyond > chance and part > OFF:
-            words = f"{part:.1%} of the closing frame differs from the frames before it (its power is {power:.3f} of theirs)"
-            yield FrameFault("closing", tuple(range(len(self._shots))), (), f"{words}: lamp, camera or scene changed")
+            words = (
+                f"{part:.1%} of the closing frame differs from the frames before it, and its power is {power:.3f} of "
+                "theirs: lamp, camera or scene changed"
+            )
+            yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
 
     def _predicted(self, kind: str) -> tuple[FloatArray | None, FloatArray]:
         """Return what the frames predict of the closing frame, and its noise variance (m, m')."""
@@ -305,7 +320,8 @@ class FrameCheck:
                     return light, np.maximum(noise.of(light, 1), 0.0)
         # Shares of the patterns that add up to light of all pixels.
         shares = [np.linalg.lstsq(side, np.ones(len(side)), rcond=None)[0] for side in self._data.shots.patterns]
-        if any(np.abs(side @ share - 1).max() > 1e-6 for side, share in zip(self._data.shots.patterns, shares, strict=True)):
+        sums = [side @ share for side, share in zip(self._data.shots.patterns, shares, strict=True)]
+        if any(np.abs(each - 1).max() > 1e-6 for each in sums):
             return None, np.zeros(())
         light, variance = np.zeros(self._sums.squares.shape), np.zeros(self._sums.squares.shape)
         for each in measurements:

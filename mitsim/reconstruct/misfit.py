@@ -1,7 +1,7 @@
 """Misfit of a run: what the factorised model leaves of the measurements, held against their noise.
 
-A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the data
-that restore the fit. Four measurements decide, in this order:
+A run either fits its model at the level of its noise, or it is flagged, with the place and with the readings of the
+data that restore the fit. Four measurements decide, in this order:
 
 1. Noise: second differences of the residuals measure the noise of the frames (:mod:`mitsim.reconstruct.residuals`). Too
    much and too little are flagged as noise, apart from energy that is unexplained.
@@ -27,7 +27,16 @@ from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
-from mitsim.reconstruct.residuals import CHANCE, NOISE_OFF, TINY, NoiseTest, Place, Residuals, common_energy, common_weights
+from mitsim.reconstruct.residuals import (
+    CHANCE,
+    NOISE_OFF,
+    TINY,
+    NoiseTest,
+    Place,
+    Residuals,
+    common_energy,
+    common_weights,
+)
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
 
@@ -37,12 +46,13 @@ and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 
 UNEXPLAINED_TILE = 2e-2
 """The same part of a single tile, where print is not averaged: above all that fitting scenes left."""
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
-"""Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated: read
-noise of as many electrons makes 2."""
+"""Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated:
+read noise of as many electrons makes 2."""
 _SHOWN = 4
 """Faults that a sentence names; result.json has all of them."""
 _LAMBDA_BESIDE = 1e-3
-"""Lambda, over the largest sigma^2, of the image that frames are compared with if the method has no lambda of its own."""
+"""Lambda, over the largest sigma^2, of the image that frames are compared with if the method has no lambda of its
+own."""
 _MOSTLY = 0.5
 """Part of the unexplained energy at defective pixels from which nothing else is blamed."""
 _COMMON_IMAGE = 0.01
@@ -54,7 +64,10 @@ _STRUCTURE = 0.5
 class Cause(Enum):
     """Measurement that flags an image; the value is its name in words, and the remedy."""
 
-    NOISE = ("the frames' noise", "check the camera file's gain, read noise and black level, and that the numbers are raw")
+    NOISE = (
+        "the frames' noise",
+        "check the camera file's gain, read noise and black level, and that the numbers are raw",
+    )
     READING = ("another reading of the frames", "see which of the readings is true, and import the frames so")
     FRAMES = ("frames that do not fit the others", "capture these frames again")
     PIXELS = ("a part of the sensor or of the session", "look at the map of the misfit, and capture again")
@@ -63,7 +76,8 @@ class Cause(Enum):
     MODEL = (
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, gloss, "
         "indirect light, or another camera",
-        "try `--focus auto`, check that the camera is the calibrated one, and compare the map of the misfit with the scene",
+        "try `--focus auto`, check that the camera is the calibrated one, and compare the map of the misfit with the "
+        "scene",
     )
 
 
@@ -163,7 +177,11 @@ class Misfit:
     @property
     def _reading_sentence(self) -> str:
         ways = "; or if ".join(reading.words for reading in self.readings[:_SHOWN])
-        more = "" if len(self.readings) == 1 else f" ({len(self.readings)} readings fit alike, and the frames cannot decide)"
+        more = (
+            ""
+            if len(self.readings) == 1
+            else f" ({len(self.readings)} readings fit alike, and the frames cannot decide)"
+        )
         return f"the frames fit if {ways}{more}"
 
     def summary(self) -> dict[str, Any]:
@@ -246,7 +264,9 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     whole = float(sums.squares.sum())
     off = test is not None and _noise_is_off(test, noise, whole - beside, stated, beside)
     ratio = test.ratio if test and (off or not noise.stated) else 1.0
-    balance = Balance(sums.residual, sums.energy, sums.expected(ratio, factor_energy or 0.0), sums.pixels, factor_energy is not None)
+    balance = Balance(
+        sums.residual, sums.energy, sums.expected(ratio, factor_energy or 0.0), sums.pixels, factor_energy is not None
+    )
     found, excess = balance.misfit(noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
@@ -300,8 +320,8 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
 def _noise_is_off(test: NoiseTest, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
     """Return True if the residuals' noise is not what is stated.
 
-    Too little energy is too little noise, because structure only adds to it. Too much is noise only if second differences
-    see it, too.
+    Too little energy is too little noise, because structure only adds to it. Too much is noise only if second
+    differences see it, too.
 
     Parameters
     ----------
@@ -318,7 +338,11 @@ def _noise_is_off(test: NoiseTest, noise: FrameNoise, whole: float, stated: floa
     if whole < (1 - NOISE_OFF - chance) * stated:
         return True
     structure = whole > (1 + _STRUCTURE) * test.ratio * stated + beside
-    return not structure and whole > (1 + NOISE_OFF + chance) * stated + beside and test.off(True, beside / max(stated, TINY))
+    return (
+        not structure
+        and whole > (1 + NOISE_OFF + chance) * stated + beside
+        and test.off(True, beside / max(stated, TINY))
+    )
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
@@ -357,7 +381,10 @@ def _common_light(data: Accumulation, expected: float) -> FloatArray | None:
     total = data.prepared.as_solved(sum((each.frame for each in data.measurements_again()), start=np.zeros(())))
     data_weights = data.weights
     normal = np.array(
-        [[count * np.vdot(f, g) - np.vdot(v, w) for g, w in zip(fields, weights, strict=True)] for f, v in zip(fields, weights, strict=True)]
+        [
+            [count * np.vdot(f, g) - np.vdot(v, w) for g, w in zip(fields, weights, strict=True)]
+            for f, v in zip(fields, weights, strict=True)
+        ]
     )
     side = np.array([np.vdot(f, total) - np.vdot(w, data_weights) for f, w in zip(fields, weights, strict=True)])
     scale = np.sqrt(np.diag(normal))

@@ -1,14 +1,15 @@
 """Checks of shifting dots: each frame against the picture that all other frames show.
 
-Under shifting dots every scene pixel is in one frame only, so that a frame of another scene, of another lamp power or of
-a moved camera fits the model as well as a right one. The only redundancy is the picture: neighbouring scene pixels are
-in different frames. A symmetric stencil of neighbours, fitted to the run itself, predicts each pixel from other frames.
-Three measurements follow from the differences r between pixels and predictions:
+Under shifting dots every scene pixel is in one frame only, so that a frame of another scene, of another lamp power or
+of a moved camera fits the model as well as a right one. The only redundancy is the picture: neighbouring scene pixels
+are in different frames. A symmetric stencil of neighbours, fitted to the run itself, predicts each pixel from other
+frames. Three measurements follow from the differences r between pixels and predictions:
 
 1. the mean of log(1 + u^2) over a frame, u being r over its robust scale: a foreign frame stands out;
 2. least squares of the power and then of the shift of all frames, because a frame of power 1 + a adds a X at its own
    pixels and changes the predictions of its neighbours;
-3. the same mean as in 1 over windows of a few dots and one to four consecutive shots: a hand in a few frames stands out.
+3. the same mean as in 1 over windows of a few dots and one to four consecutive shots: a hand in a few frames stands
+out.
 
 What the picture leaves undecided is stated as a standard error of the power and of the place of single frames.
 """
@@ -68,8 +69,8 @@ class PictureCheck:
     disturbed: FloatArray
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames: their
-        scatter over the frames, beyond what the picture makes of it, which may be twice the errors."""
+        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames:
+        their scatter over the frames, beyond what the picture makes of it, which may be twice the errors."""
         power, *moves = (
             np.sqrt(max(robust_scatter(own) ** 2 - float(np.median(2 * error)) ** 2, 0.0))
             for own, error in ((self.power, self.power_error), *zip(self.shift, self.shift_error, strict=True))
@@ -83,7 +84,9 @@ def robust_scatter(values: FloatArray) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def check_picture(image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray) -> PictureCheck | None:
+def check_picture(
+    image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray
+) -> PictureCheck | None:
     """Compare each frame of shifting dots with the picture of the others; None where the picture is too small.
 
     Parameters
@@ -138,9 +141,7 @@ def _errors(weighted: csr_matrix, inverse: FloatArray, left_over: FloatArray, pr
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare))
 
 
-def _disturbed(
-    stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int
-) -> FloatArray:
+def _disturbed(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
     """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later ones.
 
     ``moved`` are the differences of pixels from their predictions in units of their scale, limited.
@@ -177,17 +178,15 @@ class _Stencil:
         width, own = self.shape[1], self._frames[self.pixels]
         offsets = [y * width + x for y in range(reach[0] + 1) for x in range(-reach[1], reach[1] + 1) if y or x > 0]
         self.offsets = [
-            each
-            for each in offsets
-            if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
+            each for each in offsets if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
         ]
 
     def fit(self, count: int, noise: FloatArray, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Fit the stencil together with the power of each frame.
 
         Returns the ``count`` relative powers, their standard errors, and the differences of the pixels from their
-        predictions in units of their scale. Least squares are reweighted by Cauchy's weights, because edges of the print
-        are outliers; powers have a normal ``prior``.
+        predictions in units of their scale. Least squares are reweighted by Cauchy's weights, because edges of the
+        print are outliers; powers have a normal ``prior``.
 
         The stencil has no negative weights, because these imitate a lamp that flickers in the period of the dots. A
         stencil along the other direction may still do so, and the errors of the powers then show it.
@@ -196,9 +195,10 @@ class _Stencil:
         own, target = self._pairs(self._image), self._image[self.pixels]
         self.weights, found = np.full(own.shape[1], 1.0 / len(self.offsets)), np.zeros(count)
         left_over = target - own @ self.weights
+        design = self._sensitivity([image], count)
         for wider in _SCALES:
             weights = self._robust(left_over, noise, wider)[0]
-            explained = target - (design @ found if found.any() else 0.0)
+            explained = target - design @ found
             normal = own.T @ (weights[:, None] * own)
             normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
             root = np.linalg.cholesky(normal)
@@ -213,8 +213,8 @@ class _Stencil:
     def fit_with_weights(
         self, image: FloatArray, changes: Sequence[FloatArray], count: int, noise: FloatArray, prior: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n') with the present stencil;
-        return the parameters and their standard errors."""
+        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n') with the present
+        stencil; return the parameters and their standard errors."""
         values = image.ravel()
         rest = values[self.pixels] - self._pairs(values) @ self.weights
         design, left_over = self._sensitivity(changes, count), rest

@@ -5,8 +5,8 @@ is the energy of numbers that the model leaves, in the numbers as they were read
 H g(y) is mapped back by the inverse of g. All misfits are therefore compared with the same noise.
 
 A reading is offered if it explains nearly all that the frames as they are leave unexplained. All readings that fit as
-well as the best one within noise are offered, because a symmetric camera cannot decide between them: with equal masks on
-both sides, transposed frames and shots of a loop over columns leave the same misfit.
+well as the best one within noise are offered, because a symmetric camera cannot decide between them: with equal masks
+on both sides, transposed frames and shots of a loop over columns leave the same misfit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.devices.patterns import shot_orders
 from mitsim.reconstruct.accumulation import Accumulation
-from mitsim.reconstruct.factorisation import group_pixels
+from mitsim.reconstruct.factorisation import IndexArray, group_pixels
 from mitsim.reconstruct.residuals import CHANCE, TINY
 from mitsim.reconstruct.solver import Prepared, prepare
 
@@ -75,19 +75,22 @@ class Reading:
 
 
 def multiple(factor: int, chi_square: float) -> Reading | None:
-    """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its ``chi_square``."""
+    """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its
+    ``chi_square``."""
     if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
         return None
     words = f"the numbers are divided by {factor}, because all of them are multiples of {factor}"
-    return Reading(words if factor & (factor - 1) else f"{words}, as of fewer bits that were moved up by {factor.bit_length() - 1}")
+    return Reading(
+        words if factor & (factor - 1) else f"{words}, as of fewer bits that were moved up by {factor.bit_length() - 1}"
+    )
 
 
-def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[FloatArray]]:
+def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
     """Return the scene rows and the scene columns that are lit alike, group by group, of ``patterns`` P_L and P_R."""
     return [[group.pixels for group in group_pixels(side, "block")] for side in patterns]
 
 
-def negative(prepared: Prepared, groups: list[list[FloatArray]], weights: FloatArray) -> bool:
+def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:
     """Return True if pixels that are lit alike have a negative reflectance in the mean, where noise is averaged.
 
     Parameters
@@ -98,7 +101,9 @@ def negative(prepared: Prepared, groups: list[list[FloatArray]], weights: FloatA
         of :func:`pixel_groups`.
     """
     sigma = prepared.sigma
-    gain = np.divide(sigma, np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2, out=np.zeros_like(sigma), where=sigma > 0)
+    gain = np.divide(
+        sigma, np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2, out=np.zeros_like(sigma), where=sigma > 0
+    )
     image = prepared.image(gain * weights)
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
     return bool(means.min() < -_NEGATIVE * np.abs(means).max())
@@ -219,11 +224,13 @@ class _Part:
             now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
             return self._misfit(now) * (1 - part) ** 2
 
-        found = []
+        found: list[tuple[tuple[str, str | None], float]] = []
         if not self.prepared.centre:  # without means of rows and columns, no number is known
             best = minimize_scalar(lambda log: bent(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded")
             if abs(best.x) > _LINEAR:
-                words = f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
+                words = (
+                    f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
+                )
                 found.append(((words, None), float(best.fun)))
         if not self._signed:
             best = minimize_scalar(lagging, bounds=_LAGS, method="bounded")

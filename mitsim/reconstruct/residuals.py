@@ -1,14 +1,14 @@
 """Residuals of all measurements against the factorised model, and the tests that need nothing else.
 
-Of data Y the model explains what lies in its range, H Y = U_L U_L^T Y U_R U_R^T, whatever the image. The residual e = Y -
-H Y therefore depends on no lambda. With noise of variance v in all data, its mean square at a datum is v (1 - h), h
+Of data Y the model explains what lies in its range, H Y = U_L U_L^T Y U_R U_R^T, whatever the image. The residual e = Y
+- H Y therefore depends on no lambda. With noise of variance v in all data, its mean square at a datum is v (1 - h), h
 being the diagonal of H, which is a product of the two sides.
 
 *Noise.* Second differences along rows and along columns hardly see what is smooth, such as light that the model lacks.
-Their mean square over 36 v, less the part that H takes, is the ratio of measured to stated noise. It is taken by tiles of
-single frames, of which the median is not moved by a few frames or places that are wrong. Numbers that were divided by a
-gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope of the
-noise over the light is rho times the stated one, whatever the read noise is.
+Their mean square over 36 v, less the part that H takes, is the ratio of measured to stated noise. It is taken by tiles
+of single frames, of which the median is not moved by a few frames or places that are wrong. Numbers that were divided
+by a gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope
+of the noise over the light is rho times the stated one, whatever the read noise is.
 
 *Map.* Energies by tile, row and column, of the first half of the shots beside the second, and for each pixel the sum of
 residuals and their slope over the light. Each is divided by its own robust scatter, so that a fault that is everywhere
@@ -26,8 +26,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.picture_check import robust_scatter
+from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.picture_check import IntArray, robust_scatter
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
@@ -47,9 +47,11 @@ _BRIGHT = 50.0
 _STEPS = 50
 """Steps of conjugate gradients at most; patterns that share little need a few."""
 _ALIKE = 1e-3
-"""Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as black."""
+"""Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as
+black."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
-"""Robust deviations from which a place stands out, and the part of the expected energy that its residual must exceed."""
+"""Robust deviations from which a place stands out, and the part of the expected energy that its residual must
+exceed."""
 
 
 @dataclass(frozen=True)
@@ -232,14 +234,18 @@ class Residuals:
         if measurement.shots == 2 and others:
             beyond = (measurement.light * (1 + others) - self.noise.light) / others
             self.pairs[pattern] = Pair.of(
-                beyond, measurement.light, measurement.frame, residual, float(self.noise.variance[pattern]) * residual.size / 2
+                beyond,
+                measurement.light,
+                measurement.frame,
+                residual,
+                float(self.noise.variance[pattern]) * residual.size / 2,
             )
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
 
-        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2 +
-        <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
+        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
+        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
         """
         grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
 
@@ -363,7 +369,10 @@ class Residuals:
                 beyond += np.where(away < -_PLACE, -squares, 0.0)
             if beyond.sum() > least:
                 found.append(Place(_words(name, beyond), float(beyond.sum())))
-        mean = {"offset": self._sum / np.sqrt(expected), "gain": self._slope / np.sqrt(variance * self._slope_weight + TINY)}
+        mean = {
+            "offset": self._sum / np.sqrt(expected),
+            "gain": self._slope / np.sqrt(variance * self._slope_weight + TINY),
+        }
         for off in mean.values():
             away = np.abs(off - np.median(off)) / max(robust_scatter(off), 1.0)
             beyond = np.where(away > _PLACE, np.maximum(self.squares - expected, 0.0), 0.0)
@@ -408,6 +417,6 @@ def _words(name: str, beyond: FloatArray) -> str:
     return f"tile rows {rows}, columns {columns}{of}{when}"
 
 
-def _span(numbers: FloatArray) -> str:
+def _span(numbers: IntArray) -> str:
     first, last = int(numbers[0]), int(numbers[-1])
     return f"{first}" if first == last else f"{first} to {last}"

@@ -225,8 +225,8 @@ class LitFrames:
 
 
 def _lit_groups(patterns: FloatArray) -> list[tuple[IndexArray, FloatArray]]:
-    """Return groups of scene pixels of one side, each with the weights (K,) of the measurements that add up to its light;
-    empty where pixels of patterns overlap."""
+    """Return groups of scene pixels of one side, each with the weights (K,) of the measurements that add up to its
+    light; empty where pixels of patterns overlap."""
     groups = group_pixels(patterns, "block")
     if any(group.shared is None for group in groups):
         return []

@@ -98,7 +98,8 @@ class Image:
 
 
 def reason_of(status: Status, misfit: Misfit | None = None) -> str:
-    """Return why an image of this ``status`` and ``misfit`` is flagged, reasons separated by "; "; empty if it is not."""
+    """Return why an image of this ``status`` and ``misfit`` is flagged, reasons separated by "; "; empty if it is
+    not."""
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
     own = () if status.verdict.good else (f"{status.verdict.value}{cause}",)
     return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))

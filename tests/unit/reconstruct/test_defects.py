@@ -32,7 +32,9 @@ def test_single_pixels(patterns: str) -> None:
     errors = [float(np.sqrt(np.mean(np.square(each.image - picture(1))))) for each in (good, mended)]
     assert errors[1] < 1.02 * errors[0]
     assert good.uncertainties is not None and mended.uncertainties is not None
-    assert mended.uncertainties.budget["frame_noise"] == pytest.approx(good.uncertainties.budget["frame_noise"], rel=0.02)
+    assert mended.uncertainties.budget["frame_noise"] == pytest.approx(
+        good.uncertainties.budget["frame_noise"], rel=0.02
+    )
 
 
 @pytest.mark.parametrize("place", [(40, 51), (10, 11), (70, 30)])

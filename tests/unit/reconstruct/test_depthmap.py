@@ -16,11 +16,11 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture, Measurement
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
 from mitsim.reconstruct.depth_map import Arrivals, DepthMap, PixelDepths, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import DerivedCapture
+from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PEAK, Bench, picture
 from tests.ideal_sessions import shadow as plain_shadow

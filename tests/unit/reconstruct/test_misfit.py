@@ -12,7 +12,6 @@ import pytest
 
 from mitsim.core.manifests import Digital
 from mitsim.core.runs import Capture
-
 from mitsim.reconstruct.misfit import UNEXPLAINED, Cause, Misfit, chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.residuals import CHANCE
@@ -98,16 +97,20 @@ def test_light_that_is_the_same_in_every_shot() -> None:
 @pytest.mark.parametrize("patterns", ["uniform", "dots:4", "hadamard:4", "random:4"])
 @pytest.mark.parametrize("gain", [0.5, 0.7, 1.5, 4.0])
 def test_a_wrong_gain_is_noise(patterns: str, gain: float) -> None:
-    """Frames of a camera whose gain is ``gain`` times the stated one: flagged as noise, with the measured gain where the
-    brightness of tiles differs enough. (Planted: only chi-square above 1 is flagged; the slope over the light without
-    the part that the fit takes.)"""
+    """Frames of a camera whose gain is ``gain`` times the stated one: flagged as noise, with the measured gain where
+    the brightness of tiles differs enough. (Planted: only chi-square above 1 is flagged; the slope over the light
+    without the part that the fit takes.)"""
     shots = bench().run(patterns, picture(), 0)
     digital = shots.manifest.digital
     # The same numbers by another gain: what was divided by g is now divided by g / gain.
     stated = digital.model_copy(update={"gain_dn_per_e": digital.gain_dn_per_e / gain})
-    image = reconstruct(Capture(shots.manifest.model_copy(update={"digital": stated}), memory=shots._memory), bench().calibrated(0))
+    image = reconstruct(
+        Capture(shots.manifest.model_copy(update={"digital": stated}), memory=shots._memory), bench().calibrated(0)
+    )
     found = misfit(image)
-    assert not image.ok and found.cause is Cause.NOISE and "measured" not in str(found.faults) and found.noise is not None
+    assert (
+        not image.ok and found.cause is Cause.NOISE and "measured" not in str(found.faults) and found.noise is not None
+    )
     assert found.noise.ratio == pytest.approx(gain, rel=0.25)
     if found.noise.gain_error < 0.05 * gain:
         assert abs(found.noise.gain - gain) < 5 * found.noise.gain_error

@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter
 
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import shot_orders
-
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import BLACK, CODES, Bench, bench, picture, shadow
@@ -30,7 +29,9 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def reported(patterns: str, change: Callable[[Frames], Frames], camera: Bench = CAMERA) -> tuple[Cause | None, list[str]]:
+def reported(
+    patterns: str, change: Callable[[Frames], Frames], camera: Bench = CAMERA
+) -> tuple[Cause | None, list[str]]:
     shots = with_frames(camera.run(patterns, picture(1), 1), change)
     misfit = reconstruct(shots, camera.calibrated(1)).misfit
     assert misfit is not None
@@ -146,7 +147,8 @@ def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
 
 
 def test_noise_of_the_factors_is_no_misfit_of_a_reading() -> None:
-    """Turned frames against factors of a fiftieth's error. (Planted: the factors' noise left out of what is allowed.)"""
+    """Turned frames against factors of a fiftieth's error. (Planted: the factors' noise left out of what is
+    allowed.)"""
     shots = with_frames(CAMERA.run("dots:4", picture(1), 1), lambda frames: [np.flipud(frame) for frame in frames])
     misfit = reconstruct(shots, CAMERA.calibrated(1, 0.02)).misfit
     assert misfit is not None and misfit.cause is Cause.READING

@@ -140,12 +140,14 @@ def oblong_residuals(frames: list[np.ndarray], lights: list[np.ndarray], shots: 
     patterns = rows, np.ones((2, 1))
     prepared = prepare(rng.random((16, 3)), rng.random((24, 2)), *patterns)
     sums = prepared.accumulator()
-    measurements = [Measurement(f, k, 0, light, shots, 0) for k, (f, light) in enumerate(zip(frames, lights, strict=True))]
+    measurements = [
+        Measurement(f, k, 0, light, shots, 0) for k, (f, light) in enumerate(zip(frames, lights, strict=True))
+    ]
     for each in measurements:
         sums.add(each.frame, each.row, each.column)
     noise = SimpleNamespace(
-        light=np.sum(lights, axis=0), shots=shots, variance=np.ones((len(frames), 1)), of=lambda light, _: 1.0 + 0 * light,
-        rendering=5.0,
+        light=np.sum(lights, axis=0), shots=shots, variance=np.ones((len(frames), 1)), rendering=5.0,
+        of=lambda light, _: 1.0 + 0 * light,
     )  # fmt: skip
     problem = prepared.problem(sums)
     data = SimpleNamespace(
@@ -194,9 +196,13 @@ def test_the_energy_of_a_frame_that_others_predict() -> None:
     measurements = [Measurement(frame, k, 0, frame, 1, 0) for k, frame in enumerate(frames)]
     for each in measurements:
         sums.add(each.frame, each.row, 0)
-    noise = SimpleNamespace(light=sum(frames), shots=1, variance=np.ones((2, 1)), of=lambda light, _: 1.0 + 0 * light, rendering=0.0)
+    noise = SimpleNamespace(
+        light=sum(frames), shots=1, variance=np.ones((2, 1)), of=lambda light, _: 1.0 + 0 * light, rendering=0.0
+    )
     problem = prepared.problem(sums)
-    data = SimpleNamespace(prepared=prepared, noise=noise, weights=problem.projected, measurements_again=lambda: measurements)
+    data = SimpleNamespace(
+        prepared=prepared, noise=noise, weights=problem.projected, measurements_again=lambda: measurements
+    )
     found = Residuals(data).leave_out[0, 0]  # type: ignore[arg-type]
     whole = np.kron(left, right)
     others = whole @ np.linalg.lstsq(whole, frames[1].ravel(), rcond=None)[0]
