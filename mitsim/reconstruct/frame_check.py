@@ -93,7 +93,7 @@ class FrameCheck:
 
     def faults(self, by_model: bool = True) -> tuple[FrameFault, ...]:
         """Return all frames that do not fit; ``by_model`` False for a scene that the model fits in part only."""
-        found = [*self._dark(), *self._equal(), *self._clipped()]
+        found = [*self._dark(), *self._equal(), *self._check_clipping()]
         by_others = [*self._unlike_model()] if by_model else []
         powers = [*self._unlike_picture(), *self._flicker()]
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
@@ -127,7 +127,7 @@ class FrameCheck:
                     "repeated", [self._of(*shot) for shot in shots], "are one and the same, noise and all"
                 )
 
-    def _clipped(self) -> Iterator[FrameFault]:
+    def _check_clipping(self) -> Iterator[FrameFault]:
         if len(self._sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
             for shot, count in self._sums.clipped.items():
                 yield self._fault("clipped", [self._of(*shot)], f"has {count} readings at its largest number")
@@ -139,12 +139,12 @@ class FrameCheck:
         # Single frames are at fault only if the rest fits without them.
         tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
         if self._signed and sums.pairs:
-            size = sums.squares.size
+            data = sums.squares.size
             rest = np.array(
                 [[sums.pairs[row, column].rest for column in range(count_)] for row, count_ in self._rows()]
             )
             noise = self._variance + self._variance.mean() / max(count - 1, 1)
-            tests.append((rest - noise * size - share, 2 * noise * np.sqrt(2 * size)))
+            tests.append((rest - noise * data - share, 2 * noise * np.sqrt(2 * data)))
         excess = (
             float(sums.left.sum() - (self._variance * sums.squares.size).sum() * self._data.prepared.spare)
             - self._beside
@@ -163,8 +163,7 @@ class FrameCheck:
         if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
             for place in np.argsort(-off, axis=None)[: np.count_nonzero(off)]:
                 row, column = (int(index) for index in np.unravel_index(place, off.shape))
-                size = float(np.sqrt(off[row, column]))
-                numbers = self._halves((row, column))
+                size, numbers = float(np.sqrt(off[row, column])), self._halves((row, column))
                 differ = "differ" if len(numbers) > 1 else "differs"
                 words = f"{differ} by {size:.1%} from what the other frames predict"
                 yield self._fault("model", numbers, words, size)
@@ -293,7 +292,7 @@ class FrameCheck:
         closing = self._data.shots.closing
         if closing is None:
             return
-        predicted, variance = self._predicted(closing.kind)
+        predicted, variance = self._prediction(closing.kind)
         if predicted is None:
             return
         power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
@@ -309,7 +308,7 @@ class FrameCheck:
             )
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
 
-    def _predicted(self, kind: str) -> tuple[FloatArray | None, FloatArray]:
+    def _prediction(self, kind: str) -> tuple[FloatArray | None, FloatArray]:
         """Return what the frames predict of the closing frame, and its noise variance (m, m')."""
         noise, measurements = self._data.noise, self._data.measurements_again()
         if kind == "first":

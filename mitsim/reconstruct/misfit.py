@@ -74,8 +74,8 @@ class Cause(Enum):
     LIGHT = ("light that is the same in all frames", "darken the room, or capture with ambient_frame=yes")
     SATURATION = ("readings at the full well or the ADC's end", "expose for less")
     MODEL = (
-        "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, gloss, "
-        "indirect light, or another camera",
+        "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
+        "gloss, indirect light, or another camera",
         "try `--focus auto`, check that the camera is the calibrated one, and compare the map of the misfit with the "
         "scene",
     )
@@ -265,12 +265,18 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     off = test is not None and _noise_is_off(test, noise, whole - beside, stated, beside)
     ratio = test.ratio if test and (off or not noise.stated) else 1.0
     balance = Balance(
-        sums.residual, sums.energy, sums.expected(ratio, factor_energy or 0.0), sums.pixels, factor_energy is not None
+        sums.residual,
+        sums.energy,
+        sums.expected_energy(ratio, factor_energy or 0.0),
+        sums.pixels,
+        factor_energy is not None,
     )
     found, excess = balance.misfit(noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
-        found = replace(found, chi_square=whole / max(float(sums.expected(1.0, factor_energy or 0.0).sum()), TINY))
+        found = replace(
+            found, chi_square=whole / max(float(sums.expected_energy(1.0, factor_energy or 0.0).sum()), TINY)
+        )
     if lack:
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale

@@ -35,6 +35,8 @@ _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
 _FEW, _OF_NORMAL = 0.35, 0.454
 """Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
+_DARK = 0.5
+"""Part of the predicted light of a frame whose lack counts as darkness."""
 _MOST = 3.0
 """Scales at which a single pixel's difference counts in full: edges of a print reach more."""
 _POWER, _SHIFT = 0.1, 0.5
@@ -80,7 +82,7 @@ class PictureCheck:
 
 
 def robust_scatter(values: FloatArray) -> float:
-    """Return 1.4826 times the median absolute deviation, which is the standard deviation of normal numbers."""
+    """Return 1.4826 times the median absolute deviation of ``values``, the standard deviation of normal numbers."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
@@ -105,6 +107,7 @@ def check_picture(
     if not stencil.offsets or stencil.pixels.size < _FEWEST * (count + len(stencil.offsets)):
         return None
     power, power_error, differences = stencil.fit(count, noise, _POWER)
+    predicted = stencil.predict(image)
     # A shift is looked for in the picture without the powers, because in even parts these look like a slope.
     even = image / np.maximum(1 + power, _POWER)[frame_of]
     shift, shift_error = stencil.fit_with_weights(even, [*np.gradient(even)], count, noise, _SHIFT)
@@ -113,7 +116,13 @@ def check_picture(
     roughness = np.log1p(np.square(differences))
     means = np.bincount(own, roughness, count) / lit
     foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
-    disturbed = _disturbed(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
+    # A black frame decides nothing of its own power, but its mean is far below the predicted one.
+    missing = np.bincount(own, predicted - image.ravel()[stencil.pixels], count) / lit
+    squares = np.bincount(own, np.square(predicted - image.ravel()[stencil.pixels]), count) / lit
+    dark = missing > _DARK * np.bincount(own, predicted, count) / lit
+    chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
+    foreign = np.maximum(foreign, np.where(dark, missing / chance, 0.0))
+    disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
     return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed)
 
 
@@ -141,7 +150,7 @@ def _errors(weighted: csr_matrix, inverse: FloatArray, left_over: FloatArray, pr
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare))
 
 
-def _disturbed(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
+def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
     """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later ones.
 
     ``moved`` are the differences of pixels from their predictions in units of their scale, limited.
@@ -215,14 +224,17 @@ class _Stencil:
     ) -> tuple[FloatArray, FloatArray]:
         """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n') with the present
         stencil; return the parameters and their standard errors."""
-        values = image.ravel()
-        rest = values[self.pixels] - self._pairs(values) @ self.weights
+        rest = image.ravel()[self.pixels] - self.predict(image)
         design, left_over = self._sensitivity(changes, count), rest
         for _ in range(2):
             weights = self._robust(left_over, noise, 1.0)[0]
             found, inverse, weighted = _solve(design, weights, rest, prior, count)
             left_over = rest - design @ found
         return found, _errors(weighted, inverse, left_over, prior, count)
+
+    def predict(self, image: FloatArray) -> FloatArray:
+        """Return the pixels inside as the stencil predicts them from an ``image`` (n, n')."""
+        return np.asarray(self._pairs(image.ravel()) @ self.weights)
 
     def _pairs(self, values: FloatArray) -> FloatArray:
         """Return the means of opposite neighbours (pixels, pairs), and a constant of either sign."""

@@ -192,7 +192,7 @@ class _Part:
         self.orders.setdefault(_TAKEN, np.arange(len(frames)))
         self.orders |= {name: np.roll(np.arange(len(frames)), step) for name, step in (("late", -1), ("early", 1))}
         self.size = len(range(*self._part[0].indices(shape[0]))) * len(range(*self._part[1].indices(shape[1])))
-        self.energy = sum(sum_of_squares(frame) for _, frame in self._measured(self._shots(_KEPT, _TAKEN)))
+        self.energy = sum(sum_of_squares(frame) for _, frame in self._measurements(self._shots(_KEPT, _TAKEN)))
 
     def candidates(self) -> Iterator[tuple[str, str]]:
         """Yield turns alone and orders alone."""
@@ -216,24 +216,26 @@ class _Part:
         """Return the best tone curve and the best lag, with their misfits."""
         shots = self._shots(_KEPT, _TAKEN)
 
-        def bent(exponent: float) -> float:
+        def misfit_of_power(exponent: float) -> float:
             return self._bent_misfit(shots, exponent)
 
-        def lagging(part: float) -> float:
+        def misfit_of_lag(part: float) -> float:
             earlier = [np.zeros_like(shots[0]), *shots[:-1]]
             now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
             return self._misfit(now) * (1 - part) ** 2
 
         found: list[tuple[tuple[str, str | None], float]] = []
         if not self.prepared.centre:  # without means of rows and columns, no number is known
-            best = minimize_scalar(lambda log: bent(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded")
+            best = minimize_scalar(
+                lambda log: misfit_of_power(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded"
+            )
             if abs(best.x) > _LINEAR:
                 words = (
                     f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
                 )
                 found.append(((words, None), float(best.fun)))
         if not self._signed:
-            best = minimize_scalar(lagging, bounds=_LAGS, method="bounded")
+            best = minimize_scalar(misfit_of_lag, bounds=_LAGS, method="bounded")
             if best.x > _NO_LAG:
                 found.append(((f"the sensor lags: each frame holds {best.x:.1%} of the frame before", None), best.fun))
         return found
@@ -251,7 +253,7 @@ class _Part:
         shots = self._turned[turn]
         return [shots[index] for index in self.orders[order]]
 
-    def _measured(self, shots: Sequence[FloatArray]) -> Iterator[tuple[tuple[int, int], FloatArray]]:
+    def _measurements(self, shots: Sequence[FloatArray]) -> Iterator[tuple[tuple[int, int], FloatArray]]:
         """Yield pattern and frame of every measurement: the difference of a signed pattern's halves."""
         waiting: dict[tuple[int, int], FloatArray] = {}
         for capture, light in zip(self._captures, shots, strict=True):
@@ -266,7 +268,7 @@ class _Part:
     def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
         weights = np.zeros_like(self.prepared.sigma)
         energy = 0.0
-        for pattern, frame in self._measured(shots):
+        for pattern, frame in self._measurements(shots):
             weights[self.prepared.places(pattern)] += self.prepared.weights(frame, pattern)
             energy += sum_of_squares(frame)
         return np.where(self.prepared.sigma > 0, weights, 0.0), energy
@@ -289,7 +291,7 @@ class _Part:
         total = 0.0
         if self._signed:  # the halves of a pair are known by their sum, which is the same for all pairs
             mean = 2 * np.mean(linear, axis=0)
-            frames = {pattern: self.prepared.frame(weights, pattern) for pattern, _ in self._measured(linear)}
+            frames = {pattern: self.prepared.frame(weights, pattern) for pattern, _ in self._measurements(linear)}
             for capture, shot in zip(self._captures, shots, strict=True):
                 model = (mean + capture.sign * frames[capture.row, capture.column]) / 2
                 total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))

@@ -114,9 +114,16 @@ class Pair:
     def of(
         cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray, noise: float
     ) -> Pair:
-        """Fit ``beyond`` to the two halves, (total +- difference) / 2, by least squares; all (m, m').
+        """Fit a sum of halves to the two halves, (total +- difference) / 2, by least squares.
 
-        A half with less than some times the energy of its ``noise`` would be fitted to its own noise.
+        Parameters
+        ----------
+        beyond
+            (m, m') difference of the sum of this pair from the mean of the others.
+        total, difference, residual
+            (m, m') sum and difference of its halves, and what the model leaves of the difference.
+        noise
+            energy of a half's noise; a half that is hardly brighter would be fitted to its own noise.
         """
         halves = (total + difference) / 2, (total - difference) / 2
         normal = np.array([[float(np.vdot(one, other)) for other in halves] for one in halves])
@@ -323,7 +330,7 @@ class Residuals:
         """(tiles, tiles) sum of the squares of residuals."""
         return self._tiles(self.squares)
 
-    def expected(self, ratio: float, beside: float) -> FloatArray:
+    def expected_energy(self, ratio: float, beside: float) -> FloatArray:
         """Return (tiles, tiles) the energy that residuals should have.
 
         Parameters
@@ -387,13 +394,13 @@ class Residuals:
 
 
 def common_weights(data: Accumulation, light: FloatArray) -> FloatArray:
-    """Return what one ``light`` (m, m') in every measurement adds to the coefficients W (r, r') of all."""
+    """Return what one ``light`` (m, m') in every measurement of ``data`` adds to the coefficients W (r, r') of all."""
     left, right = data.prepared.left.common, data.prepared.right.common
     return np.asarray(left.T @ data.prepared.as_solved(light) @ right)
 
 
 def common_energy(data: Accumulation, light: FloatArray) -> float:
-    """Return the energy outside the model's range of one ``light`` (m, m') in every measurement."""
+    """Return the energy outside the model's range of one ``light`` (m, m') in every measurement of ``data``."""
     whole = data.noise.variance.size * sum_of_squares(data.prepared.as_solved(light))
     return max(whole - sum_of_squares(common_weights(data, light)), 0.0)
 

@@ -142,6 +142,9 @@ def find_camera(
     return _Findings(maps, fit(maps.taken, stated.bits, maps.short, spatial), spatial).camera(stated)
 
 
+# ---- Maps of single pixels ----
+
+
 @dataclass(frozen=True, eq=False)
 class Maps:
     """Mean images, with defect pixels replaced, and counts of defects.
@@ -272,6 +275,9 @@ def _surface(image: FloatArray) -> FloatArray:
     found = weights[0] @ image @ weights[1].T
     keep = np.add.outer(np.arange(3), np.arange(3)) <= 2
     return np.asarray(legendre[0] @ (found * keep) @ legendre[1].T)
+
+
+# ---- Findings ----
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,7 +162,7 @@ def test_expected_energies_add_up() -> None:
     frame = np.random.default_rng(2).random((16, 24))
     sums = oblong_residuals([frame], [frame])
     assert sums.pixels.sum() == 384
-    assert sums.expected(2.0, 7.0).sum() == pytest.approx(2.0 * (384 - 6) + 5 + 7)
+    assert sums.expected_energy(2.0, 7.0).sum() == pytest.approx(2.0 * (384 - 6) + 5 + 7)
 
 
 def test_tiles_of_an_oblong_sensor_have_their_own_pixels() -> None:
