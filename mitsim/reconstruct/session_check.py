@@ -64,10 +64,10 @@ _NOISY = 4.0
 _WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.05, 15.0, 15.0
-"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too: good
-sessions have 0.93 at 30 and a deviation of 10 (128 patterns), 0.03 at 9 (32 patterns); swapped patterns have about 1 at
-17 and more and a deviation of 20, a pattern that is rolled by a line 0.08 at 22 and 133."""
+_FOREIGN = 0.5, 15.0, 15.0
+"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too, in noisy
+sessions: good ones have 0.93 at 30 and a deviation of 10 (128 patterns), 0.1 at 18 and 17 (64 patterns); swapped
+patterns have about 1 at 17 and more, and a deviation of 20."""
 _KNOWN = 5.0, 25.0
 """Squared deviation, as a part of its own square, of a pattern that the others determine: 4 if its sign is wrong, and
 thousands if they do not; and the deviation from which that does not matter."""
@@ -717,10 +717,8 @@ class _Check:
             gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
-            if gains[0] > _WRONG and shadow.unlike[0] > _UNLIKE:
-                turn(range(1, self.count))  # the sign of pattern 0 is known
-            elif best and gains[best] > max(_LEAST, _TURNED * far.max()):
-                turn([best])
+            if gains[best] > max(_LEAST, _TURNED * far.max()):
+                turn([best] if best else range(1, self.count))  # the light decides on the sign of pattern 0
             elif far.any():
                 foreign.append(int(np.argmax(far)))
             else:
