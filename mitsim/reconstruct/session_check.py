@@ -740,7 +740,8 @@ class _Check:
                 else "in each other's place"
             )
             repair = "they count in their right order"
-            self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
+            sign = None if self.paired else 1
+            self.faults.append(SessionFault(own.side, index, sign, "exchanged", detail, repair))
         if shadow.predicts and shadow.lines.max() > _LINE:
             raise MitsimError(
                 f"all frames: line {int(np.argmax(shadow.lines))} of the {own.side} stripes is not as bright as its "

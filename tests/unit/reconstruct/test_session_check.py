@@ -356,7 +356,7 @@ def test_bands_are_refused() -> None:
 def test_a_sign_is_turned_without_pairs() -> None:
     half, clean = ("vertical", 20, 1), error(checked(frames(), pairs=False))[0]
     found = checked({**frames(), half: light(("vertical", 20, -1))}, pairs=False)
-    assert [(fault.index, fault.kind) for fault in found.faults] == [(20, "exchanged")]
+    assert [(fault.index, fault.sign, fault.kind) for fault in found.faults] == [(20, 1, "exchanged")]
     assert error(found)[0] == pytest.approx(clean, rel=0.1)
 
 
