@@ -413,7 +413,7 @@ class _Check:
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
         self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
         self.faults: list[SessionFault] = []
-        self.doubts: dict[str, str] = {}
+        self.doubts = {"power": "frames are of different power; use a steadier lamp, or pairs"}
         self.lamp, self.ambient_moved = Lamp(), 0.0
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -465,7 +465,13 @@ class _Check:
         elif self.taken.wrong:
             known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
             self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
+        parts = [
+            abs(float(np.dot(own.vectors[:, 0], own.uniform) / np.dot(own.uniform, own.uniform))) for own in self.sides
+        ]
+        apart = abs(parts[0] - parts[1])  # both sides' uniform responses are one
         for own in self.sides:
+            if not self.paired and apart > _SLIGHT:
+                own.add("power", (apart / 2) ** 2 * own.size)
             if len(own.dead):
                 own.add("dead", own.lost)
                 word = "row" if own.axis == 0 else "column"
@@ -752,7 +758,6 @@ class _Check:
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
             own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
-            self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
     def _report(self) -> list[str]:
         """Return sentences on the errors that matter, the largest first; MitsimError for more than a tenth."""
