@@ -241,7 +241,8 @@ class Session:
             if moved not in terms:
                 terms[moved] = None if moved == (0.0, 0.0) else camera.terms(moved)
             target = self.shows[half]
-            still = traits["ambient"] * mean + self.ambient(time, half)
+            # Without pairs ambient light is in the factors, unless dark frames subtract it.
+            still = traits["ambient"] * mean * (not self.uniform) + self.ambient(time, half)
             if target is None:
                 light = np.zeros(traits["shape"])
             else:

@@ -64,10 +64,10 @@ _NOISY = 4.0
 _WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.05, 15.0, 15.0
-"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too: good
-sessions have 0.93 at 30 and a deviation of 10 (128 patterns), 0.03 at 9 (32 patterns); swapped patterns have about 1 at
-17 and more and a deviation of 20, a pattern that is rolled by a line 0.08 at 22 and 133."""
+_FOREIGN = 0.5, 15.0, 15.0
+"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too, in noisy
+sessions: good ones have 0.93 at 30 and a deviation of 10 (128 patterns), 0.1 at 18 and 17 (64 patterns); swapped
+patterns have about 1 at 17 and more, and a deviation of 20."""
 _KNOWN = 5.0, 25.0
 """Squared deviation, as a part of its own square, of a pattern that the others determine: 4 if its sign is wrong, and
 thousands if they do not; and the deviation from which that does not matter."""
@@ -413,7 +413,7 @@ class _Check:
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
         self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
         self.faults: list[SessionFault] = []
-        self.doubts: dict[str, str] = {}
+        self.doubts = {"power": "frames are of different power; use a steadier lamp, or pairs"}
         self.lamp, self.ambient_moved = Lamp(), 0.0
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -465,7 +465,13 @@ class _Check:
         elif self.taken.wrong:
             known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
             self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
+        parts = [
+            abs(float(np.dot(own.vectors[:, 0], own.uniform) / np.dot(own.uniform, own.uniform))) for own in self.sides
+        ]
+        apart = abs(parts[0] - parts[1])  # both sides' uniform responses are one
         for own in self.sides:
+            if not self.paired and apart > _SLIGHT:
+                own.add("power", (apart / 2) ** 2 * own.size)
             if len(own.dead):
                 own.add("dead", own.lost)
                 word = "row" if own.axis == 0 else "column"
@@ -717,10 +723,8 @@ class _Check:
             gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
-            if gains[0] > _WRONG and shadow.unlike[0] > _UNLIKE:
-                turn(range(1, self.count))  # the sign of pattern 0 is known
-            elif best and gains[best] > max(_LEAST, _TURNED * far.max()):
-                turn([best])
+            if gains[best] > max(_LEAST, _TURNED * far.max()):
+                turn([best] if best else range(1, self.count))  # the light decides on the sign of pattern 0
             elif far.any():
                 foreign.append(int(np.argmax(far)))
             else:
@@ -742,7 +746,8 @@ class _Check:
                 else "in each other's place"
             )
             repair = "they count in their right order"
-            self.faults.append(SessionFault(own.side, index, None, "exchanged", detail, repair))
+            sign = None if self.paired else 1
+            self.faults.append(SessionFault(own.side, index, sign, "exchanged", detail, repair))
         if shadow.predicts and shadow.lines.max() > _LINE:
             raise MitsimError(
                 f"all frames: line {int(np.argmax(shadow.lines))} of the {own.side} stripes is not as bright as its "
@@ -753,7 +758,6 @@ class _Check:
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
             own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
-            self.doubts["power"] = "frames are of different power; use a steadier lamp, or pairs"
 
     def _report(self) -> list[str]:
         """Return sentences on the errors that matter, the largest first; MitsimError for more than a tenth."""

@@ -356,7 +356,7 @@ def test_bands_are_refused() -> None:
 def test_a_sign_is_turned_without_pairs() -> None:
     half, clean = ("vertical", 20, 1), error(checked(frames(), pairs=False))[0]
     found = checked({**frames(), half: light(("vertical", 20, -1))}, pairs=False)
-    assert [(fault.index, fault.kind) for fault in found.faults] == [(20, "exchanged")]
+    assert [(fault.index, fault.sign, fault.kind) for fault in found.faults] == [(20, 1, "exchanged")]
     assert error(found)[0] == pytest.approx(clean, rel=0.1)
 
 
@@ -380,6 +380,15 @@ def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
     uniform = {("horizontal", 0, 0): 0.9 * frames()["horizontal", 0, 1]}
     with pytest.raises(MitsimError, match=r"^all frames: "):
         checked({**frames(), **uniform}, pairs=False)
+
+
+def test_sides_of_different_power_without_pairs_count() -> None:
+    """The lamp is 3 % brighter for vertical stripes. (Planted: the whole difference in place of half.)"""
+    found = checked(frames(lambda frame, time, half: (1.03 if half[0] == SIDES[1] else 1.0) * frame), pairs=False)
+    assert holds(found) and any("frames are of different power" in words for words in found.doubts)
+    shown = frames()
+    with pytest.raises(MitsimError, match=r"^all frames: "):
+        checked({**shown, ("vertical", 0, 1): 0.7 * shown["vertical", 0, 1]}, pairs=False)
 
 
 # ---- The moving shadow -----------------------------------------------------------------------------------------------
