@@ -84,6 +84,7 @@ class FrameCheck:
         self._variance = ratio * data.noise.variance
         self._shots = data.shots.manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
+        self._patterns = [(shot.row, shot.column) for shot in self._shots]
         self._signed = any(shot.sign for shot in self._shots)
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
         self._exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
@@ -91,22 +92,20 @@ class FrameCheck:
         self.picture = self._check_picture(lam) if self._exclusive else None
         self.power = self._joint_powers() if not (self._signed or self._exclusive) else None
 
-    def faults(self, by_model: bool = True) -> tuple[FrameFault, ...]:
-        """Return all frames that do not fit; ``by_model`` False for a scene that the model fits in part only."""
+    def faults(self) -> tuple[FrameFault, ...]:
+        """Return all frames that do not fit the others."""
         found = [*self._dark(), *self._equal(), *self._check_clipping()]
-        by_others = [*self._unlike_model()] if by_model else []
+        by_others = [*self._unlike_model()]
         powers = [*self._unlike_picture(), *self._flicker()]
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
         flicker = max((fault.part for fault in powers if len(fault.numbers) > 1 and fault.kind == "power"), default=0.0)
-        if by_others and by_others[0].part < _SCATTERS * flicker:
-            by_others = []
-        found += by_others
-        named = {self._pattern(number) for fault in found for number in fault.numbers}
-        for fault in powers:
-            own = {self._pattern(number) for number in fault.numbers}
-            if fault.kind != "power" or not (named & own):
-                found.append(fault)
-        return (*found, *self._closing())
+        if by_others and by_others[0].part >= _SCATTERS * flicker:
+            found += by_others
+        named = {self._patterns[number] for fault in found for number in fault.numbers}
+        known = [
+            fault for fault in powers if fault.kind == "power" and named & {self._patterns[n] for n in fault.numbers}
+        ]
+        return (*found, *(fault for fault in powers if fault not in known), *self._closing())
 
     # ---- Tests of single frames
 
@@ -123,9 +122,7 @@ class FrameCheck:
             return
         for digest, shots in self._sums.same.items():
             if digest and len(shots) > 1:
-                yield self._fault(
-                    "repeated", [self._of(*shot) for shot in shots], "are one and the same, noise and all"
-                )
+                yield self._fault("repeated", [self._of(*each) for each in shots], "are equal, noise and all")
 
     def _check_clipping(self) -> Iterator[FrameFault]:
         if len(self._sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
@@ -140,15 +137,11 @@ class FrameCheck:
         tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
         if self._signed and sums.pairs:
             data = sums.squares.size
-            rest = np.array(
-                [[sums.pairs[row, column].rest for column in range(count_)] for row, count_ in self._rows()]
-            )
+            rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(sums.left.shape)], sums.left.shape)
             noise = self._variance + self._variance.mean() / max(count - 1, 1)
             tests.append((rest - noise * data - share, 2 * noise * np.sqrt(2 * data)))
-        excess = (
-            float(sums.left.sum() - (self._variance * sums.squares.size).sum() * self._data.prepared.spare)
-            - self._beside
-        )
+        expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
+        excess = float(sums.left.sum()) - expected
         off = np.zeros(sums.left.shape)
         for beyond, chance in tests:
             part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
@@ -167,10 +160,6 @@ class FrameCheck:
                 differ = "differ" if len(numbers) > 1 else "differs"
                 words = f"{differ} by {size:.1%} from what the other frames predict"
                 yield self._fault("model", numbers, words, size)
-
-    def _rows(self) -> Iterator[tuple[int, int]]:
-        rows, columns = self._sums.left.shape
-        return ((row, columns) for row in range(rows))
 
     def _halves(self, pattern: Pattern) -> list[int]:
         """Return the shots of a pattern that may be wrong: one half of a pair where the sums decide which."""
@@ -331,9 +320,6 @@ class FrameCheck:
         return light, variance
 
     # ---- Words
-
-    def _pattern(self, number: int) -> Pattern:
-        return self._shots[number].row, self._shots[number].column
 
     def _of(self, pattern: Pattern, half: int) -> int:
         return self._number[(*pattern, (1 - 2 * half) if self._signed else 0)]

@@ -29,13 +29,13 @@ from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import (
     CHANCE,
-    NOISE_OFF,
     TINY,
     NoiseTest,
     Place,
     Residuals,
     common_energy,
     common_weights,
+    noise_chance,
 )
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
@@ -57,8 +57,6 @@ _MOSTLY = 0.5
 """Part of the unexplained energy at defective pixels from which nothing else is blamed."""
 _COMMON_IMAGE = 0.01
 """Change of the image, rms, by light that is the same in all frames, from which it is reported."""
-_STRUCTURE = 0.5
-"""Energy of structure over that of noise up to which residuals count as white."""
 
 
 class Cause(Enum):
@@ -262,21 +260,14 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     change, energy = _change(data, solution, common), float(sums.energy.sum())
     test = sums.noise_test
     whole = float(sums.squares.sum())
-    off = test is not None and _noise_is_off(test, noise, whole - beside, stated, beside)
+    off = test is not None and test.off(noise, whole, stated, beside)
     ratio = test.ratio if test and (off or not noise.stated) else 1.0
-    balance = Balance(
-        sums.residual,
-        sums.energy,
-        sums.expected_energy(ratio, factor_energy or 0.0),
-        sums.pixels,
-        factor_energy is not None,
-    )
+    expected, known = sums.expected_energy(ratio, factor_energy or 0.0), factor_energy is not None
+    balance = Balance(sums.residual, sums.energy, expected, sums.pixels, known)
     found, excess = balance.misfit(noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
-        found = replace(
-            found, chi_square=whole / max(float(sums.expected_energy(1.0, factor_energy or 0.0).sum()), TINY)
-        )
+        found = replace(found, chi_square=whole / max(stated + beside, TINY))
     if lack:
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
@@ -290,7 +281,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     signed = any(shot.sign for shot in data.shots.manifest.patterns.captures)
     turned = signed and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.
-    hint = 1 + _chance(noise, float(sums.pixels.sum())) / 2
+    hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
     fitting = not (found.flagged or faults or places or off or turned or hinted)
     if scaled:
@@ -321,34 +312,6 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     elif change > _COMMON_IMAGE:
         cause = Cause.LIGHT
     return replace(found, flagged=cause is not None, cause=cause)
-
-
-def _noise_is_off(test: NoiseTest, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
-    """Return True if the residuals' noise is not what is stated.
-
-    Too little energy is too little noise, because structure only adds to it. Too much is noise only if second
-    differences see it, too.
-
-    Parameters
-    ----------
-    test
-        second differences of the residuals.
-    noise
-        as it is stated.
-    whole, stated, beside
-        energy of all residuals, of their stated noise, and of what calibration and rendering add.
-    """
-    if not noise.stated:
-        return test.off(False, 0.0)
-    chance = _chance(noise, float(noise.light.size))
-    if whole < (1 - NOISE_OFF - chance) * stated:
-        return True
-    structure = whole > (1 + _STRUCTURE) * test.ratio * stated + beside
-    return (
-        not structure
-        and whole > (1 + NOISE_OFF + chance) * stated + beside
-        and test.off(True, beside / max(stated, TINY))
-    )
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
@@ -484,19 +447,10 @@ class Balance:
         chi_squares = self.residual / np.maximum(self.expected, TINY)
         stated = noise.stated and self.stated
         if stated:
-            flagged = unexplained > UNEXPLAINED and chi_square > 1 + _chance(noise, float(self.pixels.sum()))
-            local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + _chance(noise, float(self.pixels.min())))
+            flagged = unexplained > UNEXPLAINED and chi_square > 1 + noise_chance(noise, float(self.pixels.sum()))
+            local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + noise_chance(noise, float(self.pixels.min())))
             flagged = flagged or bool(local.any())
         else:
             flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
         cause = Cause.MODEL if flagged else None
         return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess
-
-
-def _chance(noise: FrameNoise, pixels: float) -> float:
-    """Return what chance may add to the chi-square of that many ``pixels`` in all measurements.
-
-    The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
-    """
-    total = max(float(noise.variance.sum()), TINY)
-    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total

@@ -53,7 +53,7 @@ _TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
 }
 """States of frames, and the turns that bring them back."""
-_KEPT, _TAKEN = "as they are", "row-major"
+_KEPT, _TAKEN = "as they are", ""
 _STEPS = {
     "late": "the frames are one step late: each shot shows the pattern of the shot before",
     "early": "the frames are one step early: each shot shows the pattern of the next",
@@ -132,14 +132,14 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     unexplained = min(max(now - allowed, 0.0), whole)
     if unexplained <= chance / 2:
         return ()
-    found = [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.candidates()]
+    found = [(_describe(*each), run.misfit(*each)) for each in run.candidates(together=False)]
     by_chance = min(chance, unexplained / 2)
 
     def fits(misfit: float) -> bool:
         return misfit - allowed < max(min(_FITS * unexplained, _AT_MOST**2 * whole), by_chance)
 
     if not any(fits(misfit) for _, misfit in found):
-        found += [(_describe(turn, order), run.misfit(turn, order)) for turn, order in run.combinations()]
+        found += [(_describe(*each), run.misfit(*each)) for each in run.candidates(together=True)]
     if not any(fits(misfit) for _, misfit in found):
         found += run.curves()
     good = sorted((each for each in found if fits(each[1])), key=lambda each: each[1])
@@ -170,9 +170,8 @@ class _Part:
         steps = [max(int(len(side) / (_ROWS * side.shape[1])), 1) for side in (left, right)]
         self._part = tuple(slice(None, None, step) for step in steps)
         patterns = data.shots.patterns
-        self.prepared: Prepared = prepare(
-            left[self._part[0]], right[self._part[1]], *patterns, centre=data.prepared.centre
-        )
+        sides = left[self._part[0]], right[self._part[1]]
+        self.prepared: Prepared = prepare(*sides, *patterns, centre=data.prepared.centre)
         self._groups = pixel_groups(patterns)
         self._captures = manifest.patterns.captures
         self._signed = any(shot.sign for shot in self._captures)
@@ -188,36 +187,24 @@ class _Part:
         self._turned: dict[str, list[FloatArray]] = {}
         self._frames, shape = frames, frames[0].shape
         self._turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape]
-        self.orders = shot_orders(manifest.patterns, manifest.order)
-        self.orders.setdefault(_TAKEN, np.arange(len(frames)))
-        self.orders |= {name: np.roll(np.arange(len(frames)), step) for name, step in (("late", -1), ("early", 1))}
-        self.size = len(range(*self._part[0].indices(shape[0]))) * len(range(*self._part[1].indices(shape[1])))
+        taken = np.arange(len(frames))
+        self.orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
+        self.orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
+        self.size = len(sides[0]) * len(sides[1])
         self.energy = sum(sum_of_squares(frame) for _, frame in self._measurements(self._shots(_KEPT, _TAKEN)))
 
-    def candidates(self) -> Iterator[tuple[str, str]]:
-        """Yield turns alone and orders alone."""
-        yield from ((turn, _TAKEN) for turn in self._turns if turn != _KEPT)
-        yield from ((_KEPT, order) for order in self._distinct())
-
-    def combinations(self) -> Iterator[tuple[str, str]]:
-        """Yield turns with orders."""
-        yield from product([turn for turn in self._turns if turn != _KEPT], self._distinct())
-
-    def _distinct(self) -> list[str]:
-        """Return orders that differ from each other, and from the one that was taken."""
-        seen, found = {tuple(self.orders[_TAKEN])}, []
-        for name, order in self.orders.items():
-            if tuple(order) not in seen:
-                seen.add(tuple(order))
-                found.append(name)
-        return found
+    def candidates(self, together: bool) -> Iterator[tuple[str, str]]:
+        """Yield turns alone and orders alone, or turns ``together`` with orders; orders that differ from each other."""
+        distinct = {tuple(order): name for name, order in reversed(self.orders.items())}
+        orders = [name for name in distinct.values() if name != _TAKEN]
+        if together:
+            yield from product(self._turns[1:], orders)
+        else:
+            yield from (*((turn, _TAKEN) for turn in self._turns[1:]), *((_KEPT, order) for order in orders))
 
     def curves(self) -> list[tuple[tuple[str, str | None], float]]:
         """Return the best tone curve and the best lag, with their misfits."""
         shots = self._shots(_KEPT, _TAKEN)
-
-        def misfit_of_power(exponent: float) -> float:
-            return self._bent_misfit(shots, exponent)
 
         def misfit_of_lag(part: float) -> float:
             earlier = [np.zeros_like(shots[0]), *shots[:-1]]
@@ -226,14 +213,10 @@ class _Part:
 
         found: list[tuple[tuple[str, str | None], float]] = []
         if not self.prepared.centre:  # without means of rows and columns, no number is known
-            best = minimize_scalar(
-                lambda log: misfit_of_power(np.exp(log)), bounds=np.log(_EXPONENTS), method="bounded"
-            )
+            best = minimize_scalar(self._bent_misfit, bounds=np.log(_EXPONENTS), args=(shots,), method="bounded")
             if abs(best.x) > _LINEAR:
-                words = (
-                    f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
-                )
-                found.append(((words, None), float(best.fun)))
+                words = "the numbers went through a tone curve: they are the light to the power of "
+                found.append(((f"{words}{np.exp(-best.x):.2g}", None), float(best.fun)))
         if not self._signed:
             best = minimize_scalar(misfit_of_lag, bounds=_LAGS, method="bounded")
             if best.x > _NO_LAG:
@@ -277,8 +260,9 @@ class _Part:
         weights, energy = self._weights(shots)
         return float("inf") if negative(self.prepared, self._groups, weights) else energy - sum_of_squares(weights)
 
-    def _bent_misfit(self, shots: Sequence[FloatArray], exponent: float) -> float:
-        """Return the misfit, in numbers as they were read, of light that is their power ``exponent``."""
+    def _bent_misfit(self, logarithm: float, shots: Sequence[FloatArray]) -> float:
+        """Return the misfit, in numbers as they were read, of light that is a power of them, exp(``logarithm``)."""
+        exponent = float(np.exp(logarithm))
         top = max(float(shot.max()) for shot in shots) + self._dark or 1.0
 
         def bend(values: FloatArray, power: float) -> FloatArray:
@@ -289,15 +273,11 @@ class _Part:
         linear = [shot - even for shot in bent]
         weights, _ = self._weights(linear)
         total = 0.0
-        if self._signed:  # the halves of a pair are known by their sum, which is the same for all pairs
-            mean = 2 * np.mean(linear, axis=0)
-            frames = {pattern: self.prepared.frame(weights, pattern) for pattern, _ in self._measurements(linear)}
-            for capture, shot in zip(self._captures, shots, strict=True):
-                model = (mean + capture.sign * frames[capture.row, capture.column]) / 2
-                total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
-            spare = self.prepared.spare
-            return total * 2 * spare / (1 + spare)
+        # The halves of a pair are known by their sum, which is the same for all pairs.
+        mean = 2 * np.mean(linear, axis=0) if self._signed else None
         for capture, shot in zip(self._captures, shots, strict=True):
             model = self.prepared.frame(weights, (capture.row, capture.column))
+            model = model if mean is None else (mean + capture.sign * model) / 2
             total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
-        return total
+        spare = self.prepared.spare
+        return total if mean is None else total * 2 * spare / (1 + spare)

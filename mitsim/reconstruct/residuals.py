@@ -26,7 +26,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.picture_check import IntArray, robust_scatter
 
 CHANCE = 6.0
@@ -37,9 +37,11 @@ _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
 _NOISE_TILE, _NOISE_ROWS = 16, 160
 """Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
-NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
+_NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
+_STRUCTURE = 0.5
+"""Energy of structure over that of noise up to which residuals count as white."""
 _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
 _BRIGHT = 50.0
@@ -71,20 +73,29 @@ class NoiseTest:
     gain: float
     gain_error: float
 
-    def off(self, stated: bool, beside: float) -> bool:
-        """Return True if the noise is more than what is stated.
+    def off(self, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
+        """Return True if the noise is not what is stated.
+
+        Too little energy is too little noise, because structure only adds to it. Too much is noise only if second
+        differences see it, too. Where read noise is not stated, only the slope over the light is compared.
 
         Parameters
         ----------
-        stated
-            whether read noise is stated; otherwise only the slope over the light is compared, in both directions.
-        beside
-            energy that calibration and rendering add, over that of the noise.
+        noise
+            as it is stated.
+        whole, stated, beside
+            energy of all residuals, of their stated noise, and of what calibration and rendering add.
         """
-        if not stated:
+        if not noise.stated:
             known = self.gain_error < _SLOPE_KNOWN
             return bool(known and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error)
-        return self.ratio > (1 + beside) * (1 + NOISE_OFF) + CHANCE / 2 * self.error
+        chance = noise_chance(noise, float(noise.light.size))
+        if whole - beside < (1 - _NOISE_OFF - chance) * stated:
+            return True
+        white = whole < (1 + _STRUCTURE) * self.ratio * stated + beside
+        more = whole > (1 + _NOISE_OFF + chance) * stated + beside
+        seen = self.ratio > (1 + beside / max(stated, TINY)) * (1 + _NOISE_OFF) + CHANCE / 2 * self.error
+        return white and more and seen
 
 
 @dataclass(frozen=True)
@@ -360,37 +371,40 @@ class Residuals:
         variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
         expected = variance * self._freedom
         least = _PLACE_ENERGY * float(expected.sum())
-        found = []
         late, early = (self._tiles(half) for half in self.halves[::-1])
+        whole = self.squares, expected, self._freedom
+        tiles = [self._tiles(each) for each in whole]
         groups = {
-            "tile": (self._tiles(self.squares), self._tiles(expected), self._tiles(self._freedom)),
-            "row": tuple(each.sum(axis=1) for each in (self.squares, expected, self._freedom)),
-            "column": tuple(each.sum(axis=0) for each in (self.squares, expected, self._freedom)),
-            "late": (late - early, self._tiles(expected), self._tiles(self._freedom)),
+            "tile": tiles,
+            "row": [each.sum(axis=1) for each in whole],
+            "column": [each.sum(axis=0) for each in whole],
+            "late": [late - early, *tiles[1:]],
         }
+        beyond = {}
         for name, (squares, own, freedom) in groups.items():
-            off = (squares / own - (name != "late")) / np.sqrt(2 / freedom)
-            away = (off - np.median(off)) / max(robust_scatter(off), 1.0)
-            beyond = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
-            if name == "late":
-                beyond += np.where(away < -_PLACE, -squares, 0.0)
-            if beyond.sum() > least:
-                found.append(Place(_words(name, beyond), float(beyond.sum())))
-        mean = {
-            "offset": self._sum / np.sqrt(expected),
-            "gain": self._slope / np.sqrt(variance * self._slope_weight + TINY),
-        }
-        for off in mean.values():
-            away = np.abs(off - np.median(off)) / max(robust_scatter(off), 1.0)
-            beyond = np.where(away > _PLACE, np.maximum(self.squares - expected, 0.0), 0.0)
-            if beyond.sum() > least:
-                found.append(Place(_words("pixel", beyond), float(beyond.sum())))
+            away = _deviations((squares / own - (name != "late")) / np.sqrt(2 / freedom))
+            beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
+            beyond[name] -= np.where((name == "late") & (away < -_PLACE), squares, 0.0)
+        slope = self._slope / np.sqrt(variance * self._slope_weight + TINY)
+        for name, off in (("offset", self._sum / np.sqrt(expected)), ("gain", slope)):
+            far = np.abs(_deviations(off)) > _PLACE
+            beyond[name] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
+        found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
 
     def _tiles(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
         rows = np.stack([values[strip].sum(axis=0) for strip in self._strips])
         return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
+
+
+def noise_chance(noise: FrameNoise, pixels: float) -> float:
+    """Return what chance may add to the chi-square of that many ``pixels`` in all measurements of a ``noise``.
+
+    The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
+    """
+    total = max(float(noise.variance.sum()), TINY)
+    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
 
 
 def common_weights(data: Accumulation, light: FloatArray) -> FloatArray:
@@ -409,6 +423,11 @@ def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return eigenvectors and eigenvalues, 0 to 1, of U^T U of a ``slab`` U (m, c)."""
     values, vectors = np.linalg.eigh(slab.T @ slab)
     return vectors, np.clip(values, 0.0, 1.0)
+
+
+def _deviations(values: FloatArray) -> FloatArray:
+    """Return the ``values`` less their median over their robust scatter, which counts as one at least."""
+    return np.asarray((values - np.median(values)) / max(robust_scatter(values), 1.0))
 
 
 def _words(name: str, beyond: FloatArray) -> str:
