@@ -167,7 +167,7 @@ class Misfit:
         if self.noise is None:
             return ""
         words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
-        if self.gain and self.noise.gain > 0 and self.noise.gain_error < 0.1 * self.noise.gain:
+        if self.gain and self.noise.gain_error < 0.1 * self.noise.gain:
             measured, error = self.gain * self.noise.gain, self.gain * self.noise.gain_error
             words += f"; stated gain {self.gain:.4g} DN per electron, measured {measured:.3g} +- {error:.1g}"
         return words

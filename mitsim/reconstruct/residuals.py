@@ -65,7 +65,8 @@ class NoiseTest:
     ratio, error
         measured variance over the stated one, and its standard error.
     gain, gain_error
-        gain that the noise shows over the stated one; NaN where brightness hardly differs.
+        gain that the noise shows over the stated one: by its slope over the light where brightness differs enough, and
+        otherwise by the stated read noise.
     """
 
     ratio: float
@@ -322,11 +323,16 @@ class Residuals:
         weights = 1 / np.square(ratio * stated * spread)[kept]
         columns = np.stack([light[kept], np.ones(int(kept.sum()))], axis=1)
         normal = columns.T @ (weights[:, None] * columns)
-        if kept.sum() < 8 or np.linalg.cond(normal / np.sqrt(np.outer(*2 * [np.diag(normal)]))) > 1e6:
-            return NoiseTest(ratio, error, float("nan"), float("inf"))
-        slope, _ = np.linalg.solve(normal, columns.T @ (weights * found[kept]))
-        own = float(self.noise.of(1.0, self.noise.shots) - self.noise.of(0.0, self.noise.shots))
-        return NoiseTest(ratio, error, float(slope) / own, float(np.sqrt(np.linalg.inv(normal)[0, 0])) / own)
+        still = float(self.noise.of(0.0, self.noise.shots))
+        own = float(self.noise.of(1.0, self.noise.shots)) - still
+        known = kept.sum() >= 8 and np.linalg.cond(normal / np.sqrt(np.outer(*2 * [np.diag(normal)]))) < 1e6
+        if known and (spread_of_slope := float(np.sqrt(np.linalg.inv(normal)[0, 0])) / own) < _SLOPE_KNOWN * ratio:
+            slope = np.linalg.solve(normal, columns.T @ (weights * found[kept]))[0]
+            return NoiseTest(ratio, error, float(slope) / own, spread_of_slope)
+        # By the stated read noise: ratio = gain (1 - share) + gain^2 share, the read noise having a share of the noise.
+        share = min(still / max(float(np.median(stated)), TINY), 1.0)
+        gain = 2 * ratio / (1 - share + float(np.sqrt((1 - share) ** 2 + 4 * share * ratio)))
+        return NoiseTest(ratio, error, gain, error if self.noise.stated else float("inf"))
 
     @cached_property
     def variance(self) -> FloatArray:
