@@ -252,7 +252,6 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     if prepared.spare <= 0:
         return None
     factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
-    lack = data.lack(image)
     beside = noise.rendering + (factor_energy or 0.0)
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
     common = _common_light(data, stated + beside)
@@ -268,7 +267,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
         found = replace(found, chi_square=whole / max(stated + beside, TINY))
-    if lack:
+    if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
     if with_defects and noise.stated and not sums.clipped and (defects := _defects(data, sums, ratio)):
