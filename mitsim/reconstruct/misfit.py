@@ -260,7 +260,9 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     test = sums.noise_test
     whole = float(sums.squares.sum())
     off = test is not None and test.off(noise, whole, stated, beside)
-    ratio = test.ratio if test and (off or not noise.stated) else 1.0
+    if off and test and test.ratio < 1 and not data.digital.step_dn:
+        off = False  # numbers without an ADC may be means of many shots
+    ratio = test.ratio if test and off else max(test.ratio, 1.0) if test and not noise.stated else 1.0
     expected, known = sums.expected_energy(ratio, factor_energy or 0.0), factor_energy is not None
     balance = Balance(sums.residual, sums.energy, expected, sums.pixels, known)
     found, excess = balance.misfit(noise, of_ramps)
