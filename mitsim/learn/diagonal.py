@@ -147,18 +147,19 @@ class Binning(Accumulator):
         bins = (-(-side.sensor_size // BIN) for side in sides)
         self.frames = np.zeros((*(side.pattern_count for side in sides), *bins), np.float32)
 
-    def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
-        """Add one frame.
+    def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
+        """Add one frame, and return what it adds to W at its places (c, c').
 
         Parameters
         ----------
         frame, row, column
             as :class:`mitsim.reconstruct.solver.Accumulator` takes them.
         """
-        super().add(frame, row, column)
+        own = super().add(frame, row, column)
         values = np.asarray(frame)
         pixels = np.outer(*(_bin(np.ones(size)) for size in values.shape))
         self.frames[row, column] = _bin(_bin(values).T).T / pixels
+        return own
 
 
 def _bin(values: FloatArray) -> FloatArray:

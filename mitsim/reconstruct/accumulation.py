@@ -221,6 +221,8 @@ class Accumulation:
         sums of all frames, and of their noise.
     kept
         the frames themselves while they are few; all or none.
+    coefficients
+        by pattern, what its frame adds to W (c, c'), while the frames are kept.
     iterative
         what the method is told besides (:attr:`mitsim.reconstruct.request.ImageRequest.iterative`).
     """
@@ -232,6 +234,7 @@ class Accumulation:
     frames: Accumulator
     noise: FrameNoise
     kept: tuple[Measurement, ...]
+    coefficients: Mapping[tuple[int, int], FloatArray] = field(default_factory=dict)
     iterative: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -291,14 +294,16 @@ def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHON
     ambient = None if variance is None else (variance.mean(axis=1), variance.mean(axis=0))
     noise = FrameNoise(shots.manifest, ambient)
     frames, kept = prepared.accumulator(), list[Measurement]()
+    coefficients: dict[tuple[int, int], FloatArray] = {}
     few = keeps_frames(shots, factors)
     for measurement in shots.pattern_measurements((len(factors.left), len(factors.right))):
-        frames.add(measurement.frame, measurement.row, measurement.column)
+        own = frames.add(measurement.frame, measurement.row, measurement.column)
         noise.add(measurement)
         if few:
             kept.append(measurement)
+            coefficients[measurement.row, measurement.column] = own
     model = Model(prepared, factors.sides, shots.patterns)
-    return Accumulation(shots, factors, solver, model, frames, noise, tuple(kept), iterative)
+    return Accumulation(shots, factors, solver, model, frames, noise, tuple(kept), coefficients, iterative)
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:

@@ -136,10 +136,11 @@ class FrameCheck:
         # Single frames are at fault only if the rest fits without them.
         tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
         if self._signed and sums.pairs:
-            data = sums.squares.size
+            data = sums.pairs[0, 0].size
             rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(sums.left.shape)], sums.left.shape)
             noise = self._variance + self._variance.mean() / max(count - 1, 1)
-            tests.append((rest - noise * data - share, 2 * noise * np.sqrt(2 * data)))
+            part_of = data / sums.squares.size
+            tests.append(((rest - noise * data) / part_of - share, 2 * noise * np.sqrt(2 * data) / part_of))
         expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
         excess = float(sums.left.sum()) - expected
         off = np.zeros(sums.left.shape)
@@ -260,7 +261,7 @@ class FrameCheck:
         if len(pairs) < _FEWEST_PAIRS or not self._data.noise.stated:
             return
         noise = np.array([self._variance[pattern] for pattern in pairs])
-        cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * self._sums.squares.size, TINY)
+        cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * pairs[0, 0].size, TINY)
         times = float(np.median(cost)) / _MEDIAN_SQUARE
         powers = np.array([power for pair in pairs.values() for power in pair.powers])
         errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(

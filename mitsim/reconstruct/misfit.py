@@ -212,12 +212,8 @@ class Misfit:
             return status
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
         part = f"{self.unexplained:.1%} of the measurements fit no image{times}"
-        sentences = {
-            Cause.NOISE: f"Noise is not as stated: {self.reason}",
-            Cause.READING: f"Misfit: {part}, but {self.reason}",
-            Cause.FRAMES: f"Faulty frames: {self.reason}",
-        }
-        sentence = sentences.get(self.cause, f"Misfit: {part}; {self.reason}")
+        heads = {Cause.NOISE: "Noise is not as stated: ", Cause.FRAMES: "Faulty frames: "}
+        sentence = heads.get(self.cause, f"Misfit: {part}; ") + self.reason
         if self.predicted:
             sentence += f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
         if len(self.faults) > _SHOWN and self.cause is Cause.FRAMES:
@@ -285,33 +281,25 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
     fitting = not (found.flagged or faults or places or off or turned or hinted)
-    if scaled:
-        readings: tuple[Reading, ...] = (scaled,)
-    else:
-        readings = () if fitting else find_readings(data, ratio, beside + of_ramps)
-    found = replace(found, readings=readings)
-    detail = _detail(data, sums, excess, beside) if found.flagged and not (readings or faults) else 0.0
+    others = () if fitting or scaled else find_readings(data, ratio, beside + of_ramps)
+    found = replace(found, readings=(scaled,) if scaled else others)
+    detail = _detail(data, sums, excess, beside) if found.flagged and not (found.readings or faults) else 0.0
     if detail:
         fine, _ = balance.misfit(noise, max(of_ramps, detail))
         if not fine.flagged:
             found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
             found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
-    saturated = noise.saturated > 1e-5 * noise.readings
-    cause = None
-    if readings:
-        cause = Cause.READING
-    elif faults:
-        cause = Cause.FRAMES
-    elif found.flagged:
-        cause = Cause.SATURATION if saturated else Cause.PIXELS if found.places else Cause.MODEL
-    elif found.places:
-        cause = Cause.PIXELS
-    elif turned:
-        cause = Cause.MODEL
-    elif off:
-        cause = Cause.NOISE
-    elif change > _COMMON_IMAGE:
-        cause = Cause.LIGHT
+    full = noise.saturated > 1e-5 * noise.readings
+    findings = (
+        (found.readings, Cause.READING),
+        (faults, Cause.FRAMES),
+        (found.flagged, Cause.SATURATION if full else Cause.PIXELS if found.places else Cause.MODEL),
+        (found.places, Cause.PIXELS),
+        (turned, Cause.MODEL),
+        (off, Cause.NOISE),
+        (change > _COMMON_IMAGE, Cause.LIGHT),
+    )
+    cause = next((cause for finding, cause in findings if finding), None)
     return replace(found, flagged=cause is not None, cause=cause)
 
 
@@ -346,24 +334,19 @@ def _common_light(data: Accumulation, expected: float) -> FloatArray | None:
     fields = [each for each in fields if common_energy(data, each) > 1e-9 * data.noise.variance.size * each.size]
     if not fields:
         return None
-    weights = [common_weights(data, field) for field in fields]
+    pairs = [(field, common_weights(data, field)) for field in fields]
     count = data.noise.variance.size
-    total = data.prepared.as_solved(sum((each.frame for each in data.measurements_again()), start=np.zeros(())))
+    frames = (each.frame for each in data.measurements_again()) if data.shots.ambient else (data.noise.light,)
+    total = data.prepared.as_solved(sum(frames, start=np.zeros(())))
     data_weights = data.weights
-    normal = np.array(
-        [
-            [count * np.vdot(f, g) - np.vdot(v, w) for g, w in zip(fields, weights, strict=True)]
-            for f, v in zip(fields, weights, strict=True)
-        ]
-    )
-    side = np.array([np.vdot(f, total) - np.vdot(w, data_weights) for f, w in zip(fields, weights, strict=True)])
+    normal = np.array([[count * np.vdot(f, g) - np.vdot(v, w) for g, w in pairs] for f, v in pairs])
+    side = np.array([np.vdot(f, total) - np.vdot(w, data_weights) for f, w in pairs])
     scale = np.sqrt(np.diag(normal))
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-6) / np.outer(scale, scale)
     found = inverse @ side
     explained = float(found @ side)
-    variance = float(data.noise.variance.mean())
     energy = max(float(data.frames.energy), TINY)
-    least = max(2 * CHANCE**2 * variance, (UNEXPLAINED / 4) ** 2 * energy)
+    least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * energy)
     excess = energy - sum_of_squares(data_weights) - expected
     if explained < max(least, _MOSTLY * excess):
         return None

@@ -35,7 +35,7 @@ TINY = 1e-300
 """Replaces 0 in a denominator."""
 _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
-_NOISE_TILE, _NOISE_ROWS = 16, 160
+_NOISE_TILE, _NOISE_ROWS = 16, 66
 """Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
@@ -44,6 +44,8 @@ _STRUCTURE = 0.5
 """Energy of structure over that of noise up to which residuals count as white."""
 _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
+_PAIR_ROWS = 96
+"""Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
 _BRIGHT = 50.0
 """Energy of a half over that of its noise from which its power is known."""
 _STEPS = 50
@@ -51,6 +53,8 @@ _STEPS = 50
 _ALIKE = 1e-3
 """Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as
 black."""
+_SAMPLE = 20_000
+"""Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
 """Robust deviations from which a place stands out, and the part of the expected energy that its residual must
 exceed."""
@@ -112,8 +116,8 @@ class Pair:
         energy that no power of the halves explains.
     side
         correlation of the rest with the residual of the difference: 1 if the first half is wrong, -1 if the second is.
-    cost
-        energy that the powers put into the difference.
+    cost, size
+        energy that the powers put into the difference, and number of the data that are compared.
     """
 
     powers: tuple[float, float]
@@ -121,6 +125,7 @@ class Pair:
     rest: float
     side: float
     cost: float
+    size: int
 
     @classmethod
     def of(
@@ -149,7 +154,7 @@ class Pair:
         energies = sum_of_squares(rest), sum_of_squares(residual)
         side = float(np.vdot(rest, residual)) / max(float(np.sqrt(energies[0] * energies[1])), TINY)
         cost = sum_of_squares(powers[0] * halves[0] - powers[1] * halves[1])
-        return cls((powers[0], powers[1]), (errors[0], errors[1]), energies[0], side, cost)
+        return cls((powers[0], powers[1]), (errors[0], errors[1]), energies[0], side, cost, beyond.size)
 
 
 @dataclass(frozen=True)
@@ -199,8 +204,9 @@ class Residuals:
         self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
-        self.squares, self._sum, self._slope, self._slope_weight = (np.zeros(sizes) for _ in range(4))
-        self.halves = np.zeros((2, *sizes))
+        self.squares, self._early, self._sum = (np.zeros(sizes) for _ in range(3))
+        # Arrays of one frame, because to make them anew takes longer than to fill them.
+        self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
         self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
         self.weights = data.weights if light is None else data.weights - common_weights(data, light)
         self._grams = [[_gram(slab.matrix) for slab in side.slabs] for side in (prepared.left, prepared.right)]
@@ -211,39 +217,42 @@ class Residuals:
         self._noises: list[FloatArray] = []
         total = max(counts[0] * counts[1], 1)
         for number, measurement in enumerate(data.measurements_again()):
-            self._add(measurement, 2 * number >= total)
+            if 2 * number < total <= 2 * number + 2:
+                self._early = self.squares.copy()
+            self._add(measurement, data.coefficients.get((measurement.row, measurement.column)))
 
-    def _add(self, measurement: Measurement, late: bool) -> None:
+    def _add(self, measurement: Measurement, coefficients: FloatArray | None) -> None:
         pattern, prepared = (measurement.row, measurement.column), self._prepared
         frame = prepared.as_solved(measurement.frame if self._light is None else measurement.frame - self._light)
         left, right = prepared.slabs(pattern)
-        modelled = left.matrix @ self.weights[left.columns][:, right.columns] @ right.matrix.T
-        residual = frame - modelled
-        squared = np.square(residual)
-        self.squares += squared
-        self.halves[int(late)] += squared
+        own = self.weights[left.columns][:, right.columns]
+        residual = np.matmul(left.matrix @ own, right.matrix.T, out=self._residual)
+        np.subtract(frame, residual, out=residual)
+        self.squares += np.multiply(residual, residual, out=self._squared)
         self._sum += residual
-        self._slope += residual * modelled
-        self._slope_weight += np.square(modelled)
-        energy = self._tiles(np.square(frame))
-        light = energy if frame is measurement.light else self._tiles(np.square(measurement.light))
+        energy = self._squares(frame)
+        light = energy if frame is measurement.light else self._squares(measurement.light)
         if measurement.shots == 2:  # as Measurement.power has it
             light = (light + energy) / 2
         self.energy += energy
         self.power += light
         # Behind a mask with a constant term most of the light contributes nothing to the image.
         self.shots[pattern] = float((energy if prepared.centre else light).sum())
-        self.left[pattern] = float(squared.sum())
-        (turn, own), (other_turn, other) = (self._grams[side][index] for side, index in enumerate(pattern))
-        known = np.outer(own, other)
+        flat = residual.ravel()
+        self.left[pattern] = float(np.dot(flat, flat))
+        (turn, values), (other_turn, other_values) = (self._grams[side][index] for side, index in enumerate(pattern))
+        known = np.outer(values, other_values)
         alone = known > 1 - 1e-6
         self.free[pattern] = residual.size - np.count_nonzero(alone)
         self.leave_out[pattern] = self.left[pattern]
         if not alone.all():
-            self._seen[pattern] = left.matrix.T @ residual @ right.matrix
+            if coefficients is None or self._light is not None:
+                coefficients = left.matrix.T @ frame @ right.matrix
+            explained = (turn * values) @ (turn.T @ own @ other_turn) @ (other_turn * other_values).T
+            self.fitted[pattern] = float(np.vdot(own, coefficients - explained))
+            self._seen[pattern] = coefficients - explained
             seen = turn.T @ self._seen[pattern] @ other_turn
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
-        self.fitted[pattern] = float(np.vdot(residual, modelled))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
             self.same.setdefault(digest, []).append((pattern, half))
@@ -251,14 +260,12 @@ class Residuals:
                 self.clipped[pattern, half] = cut
         others = self.noise.variance.size - 1
         if measurement.shots == 2 and others:
-            beyond = (measurement.light * (1 + others) - self.noise.light) / others
-            self.pairs[pattern] = Pair.of(
-                beyond,
-                measurement.light,
-                measurement.frame,
-                residual,
-                float(self.noise.variance[pattern]) * residual.size / 2,
+            some = slice(None, None, max(min(residual.shape) // _PAIR_ROWS, 1))
+            total, difference, left_over, every = (
+                each[some, some] for each in (measurement.light, measurement.frame, residual, self.noise.light)
             )
+            noise = float(self.noise.variance[pattern]) * total.size / 2
+            self.pairs[pattern] = Pair.of((total * (1 + others) - every) / others, total, difference, left_over, noise)
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
@@ -294,7 +301,8 @@ class Residuals:
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
-        rows = slice(0, min(len(residual), _NOISE_ROWS))
+        first = max(len(residual) - _NOISE_ROWS, 0) // 2
+        rows = slice(first, first + _NOISE_ROWS)
         rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1))
         light = measurement.light[rows][1:-1, 1:-1]
         size = 36 * (len(residual) - 2) * (residual.shape[1] - 2)
@@ -377,11 +385,12 @@ class Residuals:
         variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
         expected = variance * self._freedom
         least = _PLACE_ENERGY * float(expected.sum())
-        late, early = (self._tiles(half) for half in self.halves[::-1])
+        late, early = self._tiles(self.squares - self._early), self._tiles(self._early)
         whole = self.squares, expected, self._freedom
         tiles = [self._tiles(each) for each in whole]
         groups = {
             "tile": tiles,
+            "pixel": list(whole),
             "row": [each.sum(axis=1) for each in whole],
             "column": [each.sum(axis=0) for each in whole],
             "late": [late - early, *tiles[1:]],
@@ -391,12 +400,14 @@ class Residuals:
             away = _deviations((squares / own - (name != "late")) / np.sqrt(2 / freedom))
             beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
             beyond[name] -= np.where((name == "late") & (away < -_PLACE), squares, 0.0)
-        slope = self._slope / np.sqrt(variance * self._slope_weight + TINY)
-        for name, off in (("offset", self._sum / np.sqrt(expected)), ("gain", slope)):
-            far = np.abs(_deviations(off)) > _PLACE
-            beyond[name] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
+        far = np.abs(_deviations(self._sum / np.sqrt(expected))) > _PLACE
+        beyond["offset"] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
         found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
+
+    def _squares(self, values: FloatArray) -> FloatArray:
+        rows = np.stack([np.einsum("ij,ij->j", values[strip], values[strip]) for strip in self._strips])
+        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
     def _tiles(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
@@ -433,7 +444,8 @@ def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _deviations(values: FloatArray) -> FloatArray:
     """Return the ``values`` less their median over their robust scatter, which counts as one at least."""
-    return np.asarray((values - np.median(values)) / max(robust_scatter(values), 1.0))
+    some = values.ravel()[:: max(values.size // _SAMPLE, 1)]
+    return np.asarray((values - np.median(some)) / max(robust_scatter(some), 1.0))
 
 
 def _words(name: str, beyond: FloatArray) -> str:

@@ -459,8 +459,8 @@ class Accumulator:
         """Pattern indices (i, j) whose frame has not been added."""
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
-    def add(self, frame: npt.ArrayLike, row: int, column: int) -> None:
-        """Add one frame; sums are float64.
+    def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
+        """Add one frame, and return what it adds to W at its places (c, c'); sums are float64.
 
         Parameters
         ----------
@@ -484,9 +484,11 @@ class Accumulator:
         left, right = self.prepared.slabs((row, column))
         where = self.prepared.places((row, column))
         halves = self.prepared.left.halves, self.prepared.right.halves
-        self._quarters[(slice(None), slice(None), *where)] += _project(values, left.matrix, right.matrix, halves)
+        found = _project(values, left.matrix, right.matrix, halves)
+        self._quarters[(slice(None), slice(None), *where)] += found
         self._energy += energy
         self._seen[row, column] = True
+        return np.asarray(found.sum(axis=(0, 1)))
 
     def _check_index(self, row: int, column: int) -> None:
         rows, columns = self._seen.shape

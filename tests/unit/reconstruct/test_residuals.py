@@ -146,13 +146,13 @@ def oblong_residuals(frames: list[np.ndarray], lights: list[np.ndarray], shots: 
     for each in measurements:
         sums.add(each.frame, each.row, each.column)
     noise = SimpleNamespace(
-        light=np.sum(lights, axis=0), shots=shots, variance=np.ones((len(frames), 1)), rendering=5.0,
+        light=np.sum(lights, axis=0), shots=shots, variance=np.ones((len(frames), 1)), rendering=5.0, stated=True,
         of=lambda light, _: 1.0 + 0 * light,
     )  # fmt: skip
     problem = prepared.problem(sums)
     data = SimpleNamespace(
         prepared=prepared, noise=noise, weights=np.where(problem.sigma > 0, problem.projected, 0.0),
-        measurements_again=lambda: measurements,
+        coefficients={}, measurements_again=lambda: measurements,
     )  # fmt: skip
     return Residuals(data)  # type: ignore[arg-type]
 
@@ -201,7 +201,11 @@ def test_the_energy_of_a_frame_that_others_predict() -> None:
     )
     problem = prepared.problem(sums)
     data = SimpleNamespace(
-        prepared=prepared, noise=noise, weights=problem.projected, measurements_again=lambda: measurements
+        prepared=prepared,
+        noise=noise,
+        weights=problem.projected,
+        coefficients={},
+        measurements_again=lambda: measurements,
     )
     found = Residuals(data).leave_out[0, 0]  # type: ignore[arg-type]
     whole = np.kron(left, right)
