@@ -471,8 +471,10 @@ def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | 
 def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: Request) -> Iterator[str]:
     accuracy, total = light.plan.accuracy, light.plan.total(totals.noise)
     # The light may have been planned for other patterns, which do not give the same numbers.
-    planned = obstacles(light.bench, light.bench.family(light.plan.known_request.patterns, light.seed))
-    yield from obstacles(light.bench, shooting.family)
+    own, patterns = obstacles(light.bench, shooting.family), light.plan.known_request.patterns
+    same = patterns == shooting.family.name
+    planned = own if same else obstacles(light.bench, light.bench.family(patterns, light.seed))
+    yield from own
     yield from (text for text in light.warnings if text not in planned)
     predicted_warnings = {*light.plan.warnings} - {*known_losses(light.bench.loaded, request.effects), *planned}
     if not light.reached:

@@ -290,10 +290,11 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
             found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
             found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
     full = noise.saturated > 1e-5 * noise.readings
+    local = bool(found.places) and found.places[0].energy > _MOSTLY * excess
     findings = (
         (found.readings, Cause.READING),
         (faults, Cause.FRAMES),
-        (found.flagged, Cause.SATURATION if full else Cause.PIXELS if found.places else Cause.MODEL),
+        (found.flagged, Cause.SATURATION if full else Cause.PIXELS if local else Cause.MODEL),
         (found.places, Cause.PIXELS),
         (turned, Cause.MODEL),
         (off, Cause.NOISE),

@@ -33,10 +33,11 @@ _SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
 _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
-_FEW, _OF_NORMAL = 0.35, 0.454
+_FEW, _OF_NORMAL = 0.2, 0.253
 """Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
-_DARK = 0.5
-"""Part of the predicted light of a frame whose lack counts as darkness."""
+_DARK, _DARKER = 0.5, 1.5
+"""Part of the predicted light of a frame whose lack counts as darkness, and weight of its deviation, because no good
+frame lacks so much."""
 _MOST = 3.0
 """Scales at which a single pixel's difference counts in full: edges of a print reach more."""
 _POWER, _SHIFT = 0.1, 0.5
@@ -121,7 +122,7 @@ def check_picture(
     squares = np.bincount(own, np.square(predicted - image.ravel()[stencil.pixels]), count) / lit
     dark = missing > _DARK * np.bincount(own, predicted, count) / lit
     chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
-    foreign = np.maximum(foreign, np.where(dark, missing / chance, 0.0))
+    foreign = np.maximum(foreign, np.where(dark, _DARKER * missing / chance, 0.0))
     disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
     return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed)
 

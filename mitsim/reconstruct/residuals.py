@@ -60,6 +60,9 @@ _PLACE, _PLACE_ENERGY = 7.0, 0.02
 exceed."""
 
 
+# ---- Findings ----
+
+
 @dataclass(frozen=True)
 class NoiseTest:
     """Noise of the frames as they show it, over what is stated.
@@ -163,6 +166,9 @@ class Place:
 
     words: str
     energy: float
+
+
+# ---- Sums over all frames ----
 
 
 class Residuals:
@@ -385,23 +391,22 @@ class Residuals:
         variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
         expected = variance * self._freedom
         least = _PLACE_ENERGY * float(expected.sum())
-        late, early = self._tiles(self.squares - self._early), self._tiles(self._early)
         whole = self.squares, expected, self._freedom
         tiles = [self._tiles(each) for each in whole]
-        groups = {
-            "tile": tiles,
-            "pixel": list(whole),
-            "row": [each.sum(axis=1) for each in whole],
-            "column": [each.sum(axis=0) for each in whole],
-            "late": [late - early, *tiles[1:]],
-        }
+        lines = ([each.sum(axis=axis) for each in whole] for axis in (1, 0))
         beyond = {}
-        for name, (squares, own, freedom) in groups.items():
-            away = _deviations((squares / own - (name != "late")) / np.sqrt(2 / freedom))
+        for name, (squares, own, freedom) in zip(
+            ("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True
+        ):
+            # The cube root of a chi-square is nearly normal (Wilson and Hilferty 1931).
+            spread = 2 / (9 * np.maximum(freedom, 0.5))
+            away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
             beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
-            beyond[name] -= np.where((name == "late") & (away < -_PLACE), squares, 0.0)
+        change = tiles[0] - 2 * self._tiles(self._early)
+        far = np.abs(_deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))) > _PLACE
+        beyond["half"] = np.where(far, np.abs(change), 0.0)
         far = np.abs(_deviations(self._sum / np.sqrt(expected))) > _PLACE
-        beyond["offset"] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
+        beyond["mean"] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
         found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
 
@@ -450,17 +455,14 @@ def _deviations(values: FloatArray) -> FloatArray:
 
 def _words(name: str, beyond: FloatArray) -> str:
     """Return where the energy ``beyond`` is: by rows and columns of the sensor, or tiles of it."""
-    if name in ("row", "column"):
-        lines = np.flatnonzero(beyond)
-        return f"sensor {name}{'s' if len(lines) > 1 else ''} {_span(lines)}"
+    if beyond.ndim == 1:
+        return f"sensor {name} {_span(np.flatnonzero(beyond))}"
     rows, columns = (_span(np.unique(each)) for each in np.nonzero(beyond))
-    if name == "pixel":
+    if name in ("pixel", "mean"):
         return f"{np.count_nonzero(beyond)} pixels in rows {rows}, columns {columns}"
-    of = f" of {beyond.shape[0]} x {beyond.shape[1]} tiles"
-    when = " in one half of the session" if name == "late" else ""
-    return f"tile rows {rows}, columns {columns}{of}{when}"
+    when = " in one half of the session" if name == "half" else ""
+    return f"tile rows {rows}, columns {columns} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"
 
 
 def _span(numbers: IntArray) -> str:
-    first, last = int(numbers[0]), int(numbers[-1])
-    return f"{first}" if first == last else f"{first} to {last}"
+    return f"{numbers[0]}" if numbers[0] == numbers[-1] else f"{numbers[0]} to {numbers[-1]}"
