@@ -10,9 +10,9 @@ of single frames, of which the median is not moved by a few frames or places tha
 by a gain that is wrong by the factor rho have the noise rho (y + dark) + rho^2 read^2 at the light y, so that the slope
 of the noise over the light is rho times the stated one, whatever the read noise is.
 
-*Map.* Energies by tile, row and column, of the first half of the shots beside the second, and for each pixel the sum of
-residuals and their slope over the light. Each is divided by its own robust scatter, so that a fault that is everywhere
-does not hide behind one that is in one place, and sensors of uneven response raise no alarm.
+*Map.* Energies by tile, row, column and pixel, of the first half of the shots less the second, and the sum of residuals
+of each pixel. Each is divided by its own robust scatter, so that a fault that is everywhere does not hide behind one
+that is in one place, and sensors of uneven response raise no alarm.
 """
 
 from __future__ import annotations
