@@ -158,9 +158,7 @@ class FrameCheck:
             for place in np.argsort(-off, axis=None)[: np.count_nonzero(off)]:
                 row, column = (int(index) for index in np.unravel_index(place, off.shape))
                 size, numbers = float(np.sqrt(off[row, column])), self._halves((row, column))
-                differ = "differ" if len(numbers) > 1 else "differs"
-                words = f"{differ} by {size:.1%} from what the other frames predict"
-                yield self._fault("model", numbers, words, size)
+                yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
 
     def _halves(self, pattern: Pattern) -> list[int]:
         """Return the shots of a pattern that may be wrong: one half of a pair where the sums decide which."""
@@ -329,6 +327,9 @@ class FrameCheck:
         """Make a fault of some shots, of which the words name the first few with their files."""
         numbers = tuple(sorted(int(number) for number in numbers))
         files = tuple(self._shots[number].file for number in numbers)
+        verb, rest = words.split(" ", 1)
+        if len(numbers) == 1 and verb in ("differ", "show"):
+            words = f"{verb}s {rest}"
         if len(numbers) == len(self._shots) and len(numbers) > 1:
             return FrameFault(kind, numbers, files, f"all frames {words}", part)
         shown = ", ".join(f"{number} ({file})" for number, file in zip(numbers[:4], files[:4], strict=True))
