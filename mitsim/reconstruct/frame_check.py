@@ -19,6 +19,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation
 from mitsim.reconstruct.picture_check import PictureCheck, check_picture, robust_scatter
 from mitsim.reconstruct.residuals import CHANCE, TINY, Residuals
+from mitsim.reconstruct.uncertainty import Propagation
 
 Pattern = tuple[int, int]
 
@@ -28,7 +29,7 @@ _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 """Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
 does not fit as a whole, and no single frames are named."""
 _FOREIGN, _DISTURBED = 6.5, 7.5
-"""Robust deviations from which a frame, and a window of frames, contradict the picture: 0 of 300 good runs."""
+"""Robust deviations from which a frame, and a window of frames, contradict the picture: no good run does."""
 _FLICKERS, _POWER = 15.0, 0.01
 """Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a
 print of a regular texture imitates smaller ones; all are part of the uncertainty."""
@@ -171,23 +172,18 @@ class FrameCheck:
     # ---- The picture of shifting dots
 
     def _check_picture(self, lam: float) -> PictureCheck | None:
-        prepared, sigma = self._data.prepared, self._data.prepared.sigma
-        gain = np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
-        variance = float(self._variance.mean()) * np.square(gain)
-        bases = [np.square(side.basis) for side in (prepared.left, prepared.right)]
+        seen = Propagation(self._data.model, lam)
         rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
         numbers = np.reshape(self._numbers, self._variance.shape)
-        image = prepared.image(gain * self._sums.weights)
-        return check_picture(
-            image, numbers[np.ix_(rows, columns)], self._variance.shape, bases[0] @ variance @ bases[1].T
-        )
+        image, noise = self._data.prepared.image(seen.gain * self._sums.weights), float(self._variance.mean())
+        return check_picture(image, numbers[np.ix_(rows, columns)], self._variance.shape, seen.of_white(noise))
 
     def _unlike_picture(self) -> Iterator[FrameFault]:
         found = self.picture
         if found is None:
             return
         foreign = np.flatnonzero(found.foreign > _FOREIGN)
-        if 0 < len(foreign) <= max(1, _MOST_BAD * len(self._shots)):
+        if len(foreign):
             yield self._fault("picture", foreign, "show another picture than the frames around, dot by dot")
         disturbed = np.setdiff1d(np.flatnonzero(found.disturbed > _DISTURBED), foreign)
         if len(disturbed) and not len(foreign):
@@ -217,7 +213,7 @@ class FrameCheck:
             for index in np.flatnonzero(single):
                 words = f"has {1 + power[index] - np.median(power):.2f} times the light that the others predict"
                 yield self._fault("power", [numbers[int(index)]], words)
-        elif scatter > max(_POWER, most * usual):
+        elif single.any() or scatter > max(_POWER, most * usual):
             yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power", scatter)
 
     # ---- The power of frames that overlap
@@ -281,7 +277,9 @@ class FrameCheck:
         if closing is None:
             return
         predicted, variance = self._prediction(closing.kind)
-        if predicted is None:
+        if predicted is None or closing.saturated:
+            reason = "it is saturated" if closing.saturated else "the patterns do not add up to even light"
+            yield FrameFault("closing", (), (), f"the closing frame decides nothing, because {reason}")
             return
         power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
         away = closing.light - predicted

@@ -39,6 +39,7 @@ from mitsim.reconstruct.residuals import (
 )
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
+from mitsim.reconstruct.uncertainty import Propagation
 
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
@@ -358,10 +359,8 @@ def _change(data: Accumulation, solution: Solution, common: FloatArray | None) -
     """Return the relative change of the image, rms, by a ``common`` light (m, m')."""
     if common is None or not solution.image.any():
         return 0.0
-    sigma = data.prepared.sigma
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * data.prepared.problem(data.frames).scale
-    gain = np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
-    moved = data.prepared.image(gain * common_weights(data, common))
+    moved = data.prepared.image(Propagation(data.model, lam).gain * common_weights(data, common))
     return float(np.sqrt(sum_of_squares(moved) / sum_of_squares(solution.image)))
 
 

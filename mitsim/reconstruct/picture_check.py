@@ -35,9 +35,9 @@ _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
 _FEW, _OF_NORMAL = 0.2, 0.253
 """Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
-_DARK, _DARKER = 0.5, 1.5
-"""Part of the predicted light of a frame whose lack counts as darkness, and weight of its deviation, because no good
-frame lacks so much."""
+_BLACK, _DARK, _DARKER = 6.0, 0.5, 1.5
+"""Deviations of noise up to which a frame has no light; part of its predicted light whose lack counts as
+darkness; and weight of its deviation, because no good frame lacks so much."""
 _MOST = 3.0
 """Scales at which a single pixel's difference counts in full: edges of a print reach more."""
 _POWER, _SHIFT = 0.1, 0.5
@@ -120,7 +120,9 @@ def check_picture(
     # A black frame decides nothing of its own power, but its mean is far below the predicted one.
     missing = np.bincount(own, predicted - image.ravel()[stencil.pixels], count) / lit
     squares = np.bincount(own, np.square(predicted - image.ravel()[stencil.pixels]), count) / lit
-    dark = missing > _DARK * np.bincount(own, predicted, count) / lit
+    shown = np.bincount(own, predicted, count) / lit
+    black = np.square(shown - missing) < _BLACK**2 * np.bincount(own, noise.ravel()[stencil.pixels], count) / lit**2
+    dark = black & (missing > _DARK * shown)
     chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
     foreign = np.maximum(foreign, np.where(dark, _DARKER * missing / chance, 0.0))
     disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)

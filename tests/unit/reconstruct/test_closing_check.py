@@ -24,6 +24,12 @@ def closed(kind: str, patterns: str, power: float, seed: int = 2) -> Reconstruct
     return reconstruct(shots, bench().calibrated(1))
 
 
+def test_a_closing_frame_that_decides_nothing() -> None:
+    """Random patterns do not add up to even light, which is said. (Planted: nothing said.)"""
+    found = closed("uniform", "random:4", 1.0)
+    assert not found.ok and "closing frame decides nothing" in str(found.status)
+
+
 @pytest.mark.parametrize(("kind", "patterns"), [("first", "dots:4"), ("first", "hadamard:4"), ("uniform", "dots:4")])
 def test_a_closing_frame_of_another_power(kind: str, patterns: str) -> None:
     """3 % of drift is reported with the power, and none is reported without it. (Planted: a prediction of another

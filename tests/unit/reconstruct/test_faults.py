@@ -169,6 +169,14 @@ def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
     assert misfit is not None and not misfit.faults and not misfit.flagged and misfit.defects is None
 
 
+def test_more_than_a_quarter_of_the_dots_black() -> None:
+    """(Planted: named up to a quarter of all frames, so that five of sixteen passed in silence.)"""
+    page = np.where(np.random.default_rng(3).random((32, 32)) < 0.35, 0.4, 0.85)
+    camera = Bench(shadow(n=32), shadow(n=32))
+    shots = with_frames(camera.run("dots:4", page, 1), lambda f: [dark(f[k], k) if k < 5 else f[k] for k in range(16)])
+    assert not reconstruct(shots, camera.calibrated(1)).ok
+
+
 def test_the_only_frame_without_light() -> None:
     black = image("uniform", lambda frames: [dark(frames[0])])
     assert not black.ok and "frame 0 (frame_00000.exr) holds no light" in str(black.status)
