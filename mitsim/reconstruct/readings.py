@@ -209,7 +209,7 @@ class _Part:
         def misfit_of_lag(part: float) -> float:
             earlier = [np.zeros_like(shots[0]), *shots[:-1]]
             now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
-            return self._misfit(now) * (1 - part) ** 2
+            return min(self._misfit(now), self.energy) * (1 - part) ** 2  # the search needs finite numbers
 
         found: list[tuple[tuple[str, str | None], float]] = []
         if not self.prepared.centre:  # without means of rows and columns, no number is known
