@@ -277,8 +277,8 @@ class Residuals:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
 
         That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
-        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952). Directions that no other
-        pattern sees have no curvature: the steps end there, which scipy's cg would not do.
+        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
+        Directions that no other pattern sees have no curvature: the steps end there, which scipy's cg would not do.
         """
         grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
 
