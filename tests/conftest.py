@@ -4,6 +4,7 @@ Everything here uses the variant ``llvm_ad_mono``. Another variant is tested in 
 variant must not be used after switching.
 """
 
+import ctypes
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -29,6 +30,33 @@ def pytest_configure() -> None:
         own = sorted(os.sched_getaffinity(0))[int(worker.removeprefix("gw")) :: count]
         if own:
             os.sched_setaffinity(0, own)
+    if width := os.environ.get("MITSIM_VECTOR_WIDTH"):
+        set_vector_width(int(width))
+
+
+def set_vector_width(width: int) -> None:
+    """Let Dr.Jit compile for vectors of 4, 8 or 16 floats, as it does on processors with SSE, AVX2 and AVX-512.
+
+    MITSIM_VECTOR_WIDTH=4 make test tries the suite so. A width that this processor lacks is emulated by LLVM.
+    """
+    from mitsim.core.environment import load_variant
+
+    load_variant("llvm_ad_mono")
+    import drjit
+
+    library = ctypes.CDLL(str(next(Path(drjit.__file__).parent.glob("libdrjit-core.*"))))
+    processor, features, set_target, read_width = (  # exported as C++ functions
+        library[name]
+        for name in (
+            "_Z19jit_llvm_target_cpuv",
+            "_Z24jit_llvm_target_featuresv",
+            "_Z19jit_llvm_set_targetPKcS0_j",
+            "_Z21jit_llvm_vector_widthv",
+        )
+    )
+    processor.restype = features.restype = ctypes.c_char_p
+    set_target(ctypes.c_char_p(processor()), ctypes.c_char_p(features()), ctypes.c_uint(width))
+    assert read_width() == width
 
 
 SMALL_SCENE = """<scene version="3.0.0">
