@@ -20,10 +20,10 @@ from collections.abc import Iterator
 
 import numpy as np
 from skimage import color, data
+from solver import dots, paper_factor
 
 from mitsim.metrics import psnr
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.solver_study import dots, paper_factor
 
 N = 128
 PHOTOGRAPHS = ("astronaut", "camera", "coffee", "chelsea", "rocket", "moon", "hubble_deep_field", "coins")

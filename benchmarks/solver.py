@@ -1,6 +1,7 @@
 """Speed and accuracy of the solver at the anchor geometry: 49 frames of 512 x 512 to a 128 x 128 image.
 
     python benchmarks/solver.py [--json FILE] [--repeat 15] [--seed 0]
+    python benchmarks/solver.py --forms [--json FILE] [--seed 0]
 
 Speed: streaming sums against dense Phi_L^T Y Phi_R products of the same frames, and block against full
 factorisation, each the median of warm repetitions within this run. Accuracy: noise-free recovery at
@@ -8,6 +9,9 @@ lambda = 0, block against full, and the error of three forms of the solution aga
 lambda (gram: the paper's; svd+Q: singular vectors of the stacked matrix but the paper's Q; svd: projected
 frames). Trust: seconds of the stages of whole reconstructions from noisy frames in memory, the best of the repetitions,
 and what the uncertainty takes of adding up and solving; slopes of the factors, which the misfit needs too, count there.
+
+``--forms`` measures what the solver's precision costs in time: error against exact arithmetic (tests/exact_solver.py)
+and seconds of both methods and layouts in double and single precision, at three lambdas.
 """
 
 from __future__ import annotations
@@ -19,14 +23,17 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import mpmath
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from mitsim.studies.solver_study import dots, paper_factor
+from tests.exact_solver import SolverRow, dots, paper_factor, time_solver
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)
@@ -170,12 +177,30 @@ def trust(factor: np.ndarray, repeat: int, seed: int) -> dict[str, float]:
     return result
 
 
+def print_forms(rows: tuple[SolverRow, ...]) -> None:
+    """Print all forms by lambda and time; a star marks those that no other form beats in both time and error."""
+    for row in sorted(rows, key=lambda row: (-row.lambda_rel, row.seconds)):
+        others = [each for each in rows if each.lambda_rel == row.lambda_rel and each is not row]
+        beaten = any(each.seconds <= row.seconds and each.error <= row.error for each in others)
+        print(
+            f"lambda {row.lambda_rel:.0e} {row.method:>4} {row.layout:<5} {row.precision:<16} {row.seconds:7.3f} s "
+            f"(to {row.most_s:.3f}, {row.repeats} runs)  error {row.error:.1e}{'' if beaten else '  *'}"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="write the figures to this file")
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--forms", action="store_true", help="error and seconds of every form of the solver")
     options = parser.parse_args()
+    if options.forms:
+        rows = time_solver(options.seed, lambda stage, part: None)
+        print_forms(rows)
+        if options.json:
+            Path(options.json).write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+        return
     factor = paper_factor()
     report = {
         "seed": options.seed,

@@ -434,6 +434,10 @@ def _study_of_a_bench(
     """A study of one bench, or of none."""
     from mitsim.studies.framework.run import check_study_folder, find_study
 
+    if name in OF_NO_SCENE:
+        if scene is not None:
+            raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
+        _refuse(given, _OF_SCENES, f"on the study {name}, which is of no scene")
     settings: dict[str, Any] = {} if asked.recipe is None else {"recipe": load_recipe(asked.recipe)}
     if name in OF_CAPTURES:
         from mitsim.studies.twin_files import TwinFiles
@@ -445,9 +449,6 @@ def _study_of_a_bench(
         raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")
     _refuse(given, ["quick"], f"on the study {name}, which has no points to leave out")
     if name in OF_NO_SCENE:
-        if scene is not None:
-            raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
-        _refuse(given, _OF_SCENES, f"on the study {name}, which is of no scene")
         check_study_folder(output, name)
         return partial(run_study, None, output, request, job)
     check_study_folder(output, name)

@@ -395,7 +395,6 @@ WITHOUT_NUMPY = (
     "study drift -o s --camera endless.toml",
     "study accuracy photograph -o full",
     "study calibration photograph -o s --camera endless.toml",
-    "study solver -o full",
     "study transfer -o s",
     "study twin -o s",
     "study twin --data none -o s",

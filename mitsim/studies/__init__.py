@@ -5,10 +5,10 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("accuracy", "calibration", "diffraction", "solver", "transfer", "twin")
+STUDIES = ("accuracy", "calibration", "diffraction", "transfer", "twin")
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.run.Findings`."""
-OF_NO_SCENE = ("solver", "transfer", "twin")
+OF_NO_SCENE = ("transfer", "twin")
 """Those whose bench is None."""
 OF_CAPTURES = ("transfer", "twin")
 """Those of real captures (`--data`)."""

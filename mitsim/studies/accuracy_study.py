@@ -11,7 +11,7 @@ is cheap is repeated:
 4. whole runs at other accuracies, and the reference on one frame, extrapolated to all;
 5. repeats of all but the reference.
 
-What the solver's precision costs is no matter of the scene: `mitsim study solver`.
+The time of the solver depends on no scene; `python benchmarks/solver.py --forms` measures it.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.factorisation import pattern_blocks
 from mitsim.reconstruct.solver import ROUNDING_LIMIT, prepare
 from mitsim.reconstruct.solvers import solve_tv
-from mitsim.studies.solver_study import dots
+from tests.exact_solver import dots
 from tests.hard.hard_models import EPS, LAMBDAS, check_ending, frames_of, shadow, spread, summed
 from tests.robustness import Recorder
 

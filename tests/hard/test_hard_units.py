@@ -13,7 +13,7 @@ from scipy.linalg import hadamard
 
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.solver_study import dots
+from tests.exact_solver import dots
 from tests.hard.hard_models import LAMBDAS, frames_of, shadow, spread, summed
 from tests.robustness import Recorder
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.solver_study import Judge, dots, make_problem
+from tests.exact_solver import Judge, dots, make_problem
 from tests.hard.hard_models import EPS, Frames, frames_of, shadow
 from tests.robustness import Recorder
 

@@ -141,7 +141,7 @@ def test_reconstruct_refuses(refused: Refused, lab: Any, options: list[str], fra
     ("arguments", "fragments"),
     [
         (["study", "weather", "photograph", *NEW], ["'weather'", "accuracy"]),
-        (["study", "solver", "photograph", *NEW], ["study solver photograph", "leave the scene out"]),
+        (["study", "twin", "photograph", *NEW], ["study twin photograph", "leave the scene out"]),
         (["study", "twin", *NEW], ["needs real captures", "--data FOLDER", "flatnet"]),
         (["study", "transfer", *NEW], ["study transfer: needs real captures", "--data FOLDER", "flatnet"]),
         (["study", "twin", "--data", "nowhere", *NEW], ["--data nowhere", "no such folder"]),

@@ -22,8 +22,6 @@ import pytest
 from mitsim.bench.layout import Preview
 from mitsim.report import bench_view
 from mitsim.studies import accuracy_study as accuracy
-from mitsim.studies import solver_study
-from mitsim.studies.solver_study import make_problem, time_solver
 
 VERBS = (
     *(
@@ -244,30 +242,6 @@ def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monk
     assert study["rows"] and study["left_out"] and number(study["took"])
     written = {path.name for path in (tmp_path / "study").iterdir()}
     assert written == {"accuracy.json", "accuracy.html", "stages.png", "effects.png"}, "one run is no curve"
-
-
-def test_study_solver(call: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of no scene, and of a small problem here."""
-    problem = make_problem(np.random.default_rng(1).random((12, 8)), 2, 0)
-    monkeypatch.setattr(solver_study, "time_solver", lambda seed, progress: time_solver(seed, progress, problem, 1))
-    study = call("study", "solver", "-o", tmp_path / "study", "--json", "--quiet").payload
-    assert study["scene"] is None and study["patterns"] is None
-    keys = {
-        "method",
-        "precision",
-        "layout",
-        "lambda_rel",
-        "seconds",
-        "most_s",
-        "repeats",
-        "error",
-        "judge_error",
-        "seed",
-    }
-    assert study["rows"] and all(keys == row.keys() for row in study["rows"])
-    assert {path.name for path in (tmp_path / "study").iterdir()} == {"solver.json", "solver.html", "solver.png"}
-    text = call("study", "solver", "-o", tmp_path / "study", "--quiet").out
-    assert "lambda 1e-04  svd" in text and "runs)" in text
 
 
 def test_doctor(call: Callable[..., Any]) -> None:

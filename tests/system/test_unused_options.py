@@ -64,9 +64,8 @@ CASES = [
     ("study distance -o {out}", "--patterns dots:7"),
     ("study distance --scheduler tcp://a:1 -o {out}", "--jobs 1"),
     ("study accuracy -o {out}", "--quick"),
-    ("study solver -o {out}", "--camera imx249"),
-    ("study solver -o {out}", "-D a=1"),
-    ("study solver -o {out}", "--data {folder}"),
+    ("study transfer -o {out}", "--camera imx249"),
+    ("study transfer -o {out}", "-D a=1"),
 ]
 
 

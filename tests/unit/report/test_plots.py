@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,23 @@ import mitsim as ms
 from mitsim.acquire.reference import Rendered
 from mitsim.core.images import lightness, linear_light
 from mitsim.report import demo_page, plots
-from mitsim.report.pages import Mean, typeset
-from mitsim.studies import diffraction_study, solver_study
+from mitsim.report.pages import Mean
+from mitsim.studies import diffraction_study
 from mitsim.studies.diffraction_study import ASSUMED, SEPARABLE, QualityRow
-from mitsim.studies.solver_study import LAMBDAS, LAYOUTS, METHODS, PRECISIONS, SolverRow
 from tests.exchanged import made
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
-SOLVER_ROWS = [
-    SolverRow(method, precision, layout, lam, seconds=0.02 * 1.2**index, error=1e-3 * 0.1**index, judge_error=0, seed=0)
-    for lam in LAMBDAS
-    for index, (method, precision, layout) in enumerate(product(METHODS, PRECISIONS, LAYOUTS))
-]
+NAMES = [f"{method}, {layout}" for method in ("svd", "gram") for layout in ("block", "full")]
+COSTS = {
+    f"lambda {lam:.0e}": [
+        plots.Cost(name, 1e-3 * 0.1**index, 3 * (0.02 * 1.2**index,)) for index, name in enumerate(NAMES)
+    ]
+    for lam in (1e-4, 1e-8)
+}
+
+
+def costs() -> Figure:
+    return plots.costs(COSTS, "relative error of the image [1]")
 
 
 def test_every_axis_has_a_unit() -> None:
@@ -37,7 +41,7 @@ def test_every_axis_has_a_unit() -> None:
         plots.singular_values({"a": np.ones(3)}),
         plots.error_bars({"a": 1e-3}, 1e-2),
         plots.quality_bars({"a": (Mean(20.0, 1.0, 8), Mean(10.0, float("nan"), 1))}),
-        solver_study.solver_costs(SOLVER_ROWS),
+        costs(),
     )
     for figure in figures:
         axes = figure.axes[0]
@@ -112,24 +116,23 @@ def test_the_front_is_what_nothing_beats() -> None:
 
 
 def test_legends_cover_no_point_and_lie_inside_the_figure() -> None:
-    figure = solver_study.solver_costs(SOLVER_ROWS)
+    figure = costs()
     figure.canvas.draw()
     box = figure.legends[0].get_window_extent()
     assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
     assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
 
 
-def test_solver_costs_shows_every_row_in_the_panel_of_its_lambda() -> None:
-    """And rings around what nothing beats."""
-    figure = solver_study.solver_costs(SOLVER_ROWS)
-    for axes, lam in zip(figure.axes, LAMBDAS, strict=True):
-        assert axes.get_title().endswith(typeset(f"{lam:.0e}"))
+def test_costs_show_every_row_in_its_panel() -> None:
+    """Rings are around what no other row beats in both."""
+    figure = costs()
+    for axes, (title, rows) in zip(figure.axes, COSTS.items(), strict=True):
+        assert axes.get_title() == title
         shown = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines[:-1]]
-        assert sorted(shown) == sorted((row.seconds, row.error) for row in SOLVER_ROWS if row.lambda_rel == lam)
-        front = plots.pareto_front(shown)
-        assert list(zip(*axes.lines[-1].get_data(), strict=True)) == front
+        assert sorted(shown) == sorted((row.seconds[0], row.error) for row in rows)
+        assert list(zip(*axes.lines[-1].get_data(), strict=True)) == plots.pareto_front(shown)
     looks = {(line.get_color(), line.get_marker()) for line in figure.axes[0].lines[:-1]}
-    assert len(looks) == len(METHODS) * len(LAYOUTS) * len(PRECISIONS)
+    assert len(looks) == len(NAMES)
 
 
 def test_an_error_of_nothing_has_no_dot() -> None:

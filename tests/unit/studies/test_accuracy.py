@@ -165,7 +165,7 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
     kept = json.loads((folder / "accuracy.json").read_text())
     assert len(kept["rows"]) == len(study.rows) and kept["judge"]["seed"] == SEED + 1
     assert {row["extrapolated"] for row in kept["rows"] if row["estimator"] == "factored"} == {False}
-    assert kept["opening"] == {"start": OPENING} and kept["solver"] == "mitsim study solver"
+    assert kept["opening"] == {"start": OPENING} and kept["solver"] == "python benchmarks/solver.py --forms"
     assert kept["sensor_noise"] == pytest.approx(study.sensor_noise) and 1e-4 < kept["sensor_noise"] < 1
     keys = {"estimator", "setting", "seconds", "least_s", "most_s", "repeats", "error", "mc_error", "knob", "on_front"}
     assert all(keys <= row.keys() and row["extrapolated"] is bool(row["by"]) for row in kept["rows"])
@@ -178,7 +178,7 @@ def test_what_is_written(result: StudyResult, study: AccuracyFindings, folder: P
     assert (
         "diffraction                 error without it" in text and "judge's own error" in text and str(folder) in text
     )
-    assert "extrapolated: one of 4 frames" in text and "mitsim study solver" in text
+    assert "extrapolated: one of 4 frames" in text and "python benchmarks/solver.py --forms" in text
 
 
 def test_the_plan_is_a_stage_of_its_own(study: AccuracyFindings) -> None:

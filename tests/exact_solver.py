@@ -1,4 +1,4 @@
-"""`mitsim study solver`: what the solver's precision costs in time, at the paper's geometry; no scene is in it.
+"""The exact image of the solver's problem, and error and seconds of every form of the solver against it.
 
 At the paper's geometry (49 dots, 49 frames of 512 x 512, an image of 128 x 128) the noise-free frames of a random image
 are solved in every combination of
@@ -20,21 +20,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
-from mitsim.bench.request import Request
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.job import Job, Progress
+from mitsim.core.job import Progress
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, centred_edges
@@ -42,82 +40,6 @@ from mitsim.metrics import relative_error
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factorisation import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
-from mitsim.report import plots
-from mitsim.report.pages import typeset
-from mitsim.studies.framework.findings import Part
-from mitsim.studies.framework.run import Findings
-
-
-@dataclass(frozen=True)
-class SolverFindings(Findings):
-    """Error and seconds of every form of the solution."""
-
-    rows: tuple[SolverRow, ...]
-    title: ClassVar[str] = "What the solver's precision costs in time"
-
-    def payload(self) -> dict[str, Any]:
-        """The JSON of the command line."""
-        return {"rows": [asdict(row) for row in self.rows]}
-
-    def lines(self) -> list[str]:
-        """For people, the best for its time marked at each lambda."""
-        best = self._best()
-        return [
-            f"lambda {row.lambda_rel:.0e} {row.method:>4} {row.layout:<5} {row.precision:<16} {row.seconds:7.3f} s "
-            f"({row.seconds:.3f} to {row.most_s:.3f}, {row.repeats} runs)  error {row.error:.1e}"
-            f"{'  *' if row in best else ''}"
-            for row in self._by_time()
-        ] + ["* nothing measured is as good in less time"]
-
-    def _by_time(self) -> list[SolverRow]:
-        return sorted(self.rows, key=lambda row: (-row.lambda_rel, row.seconds))
-
-    def _best(self) -> list[SolverRow]:
-        """Rows that nothing beats in both seconds and error at their lambda."""
-        fronts = {
-            lam: plots.pareto_front([(row.seconds, row.error) for row in self.rows if row.lambda_rel == lam])
-            for lam in {row.lambda_rel for row in self.rows}
-        }
-        return [row for row in self.rows if (row.seconds, row.error) in fronts[row.lambda_rel]]
-
-    def parts(self) -> Sequence[Part]:
-        """Of the page: error and seconds of all forms."""
-        best = self._best()
-        rows = [
-            (f"{row.lambda_rel:.0e}", row.method, row.layout, row.precision, f"{row.seconds:.3f}",
-             f"{row.error:.1e}", "best for its time" if row in best else "")
-            for row in self._by_time()
-        ]  # fmt: skip
-        return [
-            Part(
-                "Error and time",
-                f"Error of the image against an exact one, and the least of {REPEATS} wall times of one reconstruction "
-                "on one thread: prepare, add all frames, solve. A ring is around what no other form beats in both.",
-                ("Relative lambda", "Method", "Layout", "Precision", "Time [s]", "Error [1]", ""),
-                tuple(rows),
-                ("solver.png",),
-            )
-        ]
-
-    def figures(self) -> dict[str, Figure]:
-        """Error against time, a panel for each lambda."""
-        return {"solver.png": solver_costs(self.rows)}
-
-
-def measure(bench: None, request: Request, job: Job) -> SolverFindings:
-    """Error and seconds of every form.
-
-    Parameters
-    ----------
-    bench
-        none: the solver's cost is the same for all scenes.
-    request, job
-        the seed of the image, and who is told how far the work is.
-    """
-    return SolverFindings(time_solver(request.seed, job.progress))
-
-
-# -------- What the solver's accuracy costs
 
 Precision = Literal["float64", "float32 frames", "float32 products"]
 Form = tuple[Method, Structure, Precision]
@@ -341,7 +263,7 @@ class Judge:
             gap = gap + _whole(correction, _FRACTION_BITS)
             if step < _DIGITS:
                 return _double(target - gap, _FRACTION_BITS), step
-        raise MitsimError(f"solver study: the exact image did not settle ({step:.1e} left); raise lambda ({lam:g})")
+        raise MitsimError(f"solver cost: the exact image did not settle ({step:.1e} left); raise lambda ({lam:g})")
 
 
 def _whole(values: FloatArray, bits: int) -> Any:
@@ -354,13 +276,3 @@ def _double(values: Any, bits: int) -> FloatArray:
     """Integers in units of 2^-bits, rounded to double precision."""
     unit = 2**bits
     return np.array([value / unit for value in values.ravel().tolist()], dtype=np.float64).reshape(values.shape)
-
-
-def solver_costs(rows: Sequence[SolverRow]) -> Figure:
-    """Error of the image against seconds of the solver in ``rows``, a panel for each lambda."""
-    panels: dict[str, list[plots.Cost]] = {}
-    for row in sorted(rows, key=lambda row: -row.lambda_rel):
-        seconds = row.seconds, row.seconds, max(row.most_s, row.seconds)
-        cost = plots.Cost(f"{row.method}, {row.layout}, {row.precision}", row.error, seconds)
-        panels.setdefault(typeset(f"relative \N{GREEK SMALL LETTER LAMDA} {row.lambda_rel:.0e}"), []).append(cost)
-    return plots.costs(panels, "relative error of the image [1]")

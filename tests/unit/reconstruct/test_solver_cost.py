@@ -12,7 +12,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.reconstruct.solver import prepare
-from mitsim.studies.solver_study import (
+from tests.exact_solver import (
     LAMBDAS,
     LAYOUTS,
     METHODS,
