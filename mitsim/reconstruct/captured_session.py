@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -172,7 +172,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
     readings = _Readings(session)
     estimate, noise, found = _estimate(readings, job)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
-    warnings += (*found.warnings(session.frame_name), *readings.odd.values())
+    warnings += (*found.warnings, *readings.odd.values())
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -188,8 +188,8 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "phi_error": None,
         "predicted_phi_error": error,
         "response_noise": noise,
-        "faults": found.faults_for_manifest(session.frame_name),
-        "lamp": found.lamp.for_manifest(),
+        "faults": [asdict(fault) for fault in found.faults],
+        "lamp": found.lamp,
         "condition": estimate.condition,
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),

@@ -86,10 +86,10 @@ class MovingShadow:
         parts = np.concatenate([turned.real, turned.imag], axis=1)
         shown = (parts.reshape(-1, n) @ signs).reshape(*parts.shape[:2], count)
         own = np.maximum(n / count - np.square(shown).sum(axis=1), 1e-9)
-        for index in [None, *unknown * _FITS]:
-            if index is not None:
-                spectra[:, index] -= left[:, index] / own[:, index]
-                columns = spectra @ signs.T
+        left = np.zeros_like(spectra)
+        for index in [0, *[*unknown] * _FITS]:
+            spectra[:, index] -= left[:, index] / own[:, index]
+            columns = spectra @ signs.T
             rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
             left = rest @ signs
         self._spectra, self._left, self._own = spectra, left, own

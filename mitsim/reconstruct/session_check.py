@@ -17,9 +17,8 @@ if the moving shadow, estimated afterwards, agrees. Every other fault is refused
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +37,8 @@ from mitsim.reconstruct.estimate_factors import (
     without_plane,
 )
 from mitsim.reconstruct.moving_shadow import MovingShadow
+from mitsim.reconstruct.picture_check import robust_scatter
 
-Single = npt.NDArray[np.float32]
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, the usual sum is in doubt."""
 _MATTERS = 0.5
@@ -56,116 +55,32 @@ _SLIGHT = 0.02
 """Change of a single frame's power that is not reported by itself: a lamp's flicker makes as much."""
 _NEAR = 5
 """Pairs next in time that give the sum which a wrong pair should have had."""
-_UNEXPLAINED = 0.05
-"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
-of its amplitude."""
-_NOISY = 4.0
-"""Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.5, 15.0, 15.0
-"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too, in noisy
-sessions: good ones have 0.93 at 30 and a deviation of 10 (128 patterns), 0.1 at 18 and 17 (64 patterns); swapped
-patterns have about 1 at 17 and more, and a deviation of 20."""
-_KNOWN = 5.0, 25.0
-"""Squared deviation, as a part of its own square, of a pattern that the others determine: 4 if its sign is wrong, and
-thousands if they do not; and the deviation from which that does not matter."""
+_FOREIGN = 0.5, 15.0
+"""Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good ones have at most
+0.25 at 6, and swapped patterns about 1 at 23 and more."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
 """The same in deviations of the median pattern."""
-_FEW_LINES, _LINE = 30, 0.15
-"""Lines beside those at the ends that predict each other, and the squared deviation of one from the prediction, over
-the mean square, from which it is wrong: good cameras of 24 lines reach 0.43."""
+_LINE = 0.15
+"""Squared deviation of a line of the stripes from what its neighbours predict, over the mean square, from which it
+counts: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
 """Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
 the sign turned; and theirs over the median row's at least."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
-
-
-# ---- Helper functions ------------------------------------------------------------------------------------------------
-
-
-def robust_scatter(values: FloatArray, middle: float = 0.0) -> float:
-    """Return the standard deviation of normal ``values`` about their ``middle`` by the median, which outliers do not
-    move."""
-    return 1.4826 * float(np.median(np.abs(values - middle)))
-
-
-def odd_responses(misfits: FloatArray, energies: FloatArray, numbers: int) -> npt.NDArray[np.intp]:
-    """Return the responses that no separable camera explains, where it explains the others.
-
-    Parameters
-    ----------
-    misfits, energies
-        (N,) of all responses of a side, with their noise: squares that no common shape explains, and all.
-    numbers
-        of a response.
-    """
-    middle = float(np.median(misfits))
-    scatter = robust_scatter(misfits, middle)
-    excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
-    # Where no separable camera explains any, one that is no worse than others says nothing.
-    least = 4 * middle if scatter > _NOISY * middle * float(np.sqrt(2 / numbers)) else 0.0
-    return np.flatnonzero((excess > _UNEXPLAINED * energies) & (misfits >= least))
-
-
-def too_many(patterns: int, count: int) -> bool:
-    """Return True if so many wrong ``patterns`` leave a session of ``count`` a side in doubt."""
-    return patterns > max(2, MOST_FAULTS * 2 * count)
+_UNKNOWN = 1e30
+"""Variance of a number that nothing shows."""
 
 
 def frame_words(half: Half) -> str:
     """Return which frame of a session a ``half`` is, in words."""
     side, index, sign = half
     return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
-
-
-def _shrunk(
-    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
-    variance that they share, 0 where it cannot be told from 0.
-
-    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
-    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
-    """
-    beyond, pooled, tiny = np.square(values) - variances, 0.0, np.finfo(np.float64).tiny
-    middle = max(float(np.median((beyond / variances)[good])), 0.0)
-    usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
-    for _ in range(4):
-        weights = np.where(usual, 1 / np.square(variances + pooled), 0.0)
-        total = max(float(weights.sum()), tiny)
-        pooled = max(float(np.dot(weights, beyond)) / total, 0.0)
-    deviation = float(np.sqrt(2 * np.dot(np.square(weights), np.square(variances)))) / total
-    pooled, sure = pooled * (pooled > _LIKELY * deviation), pooled > _SURE * deviation
-    prior = np.maximum(np.maximum(least, pooled if sure else 0.0), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
-    weight = prior / np.maximum(prior + variances, tiny)
-    return weight * values, np.where(prior > 0, weight * variances, pooled), pooled if sure else 0.0
-
-
-def _pooled_mean(values: FloatArray, variances: FloatArray) -> float:
-    """Return the mean of all pairs' ``values``, 0 where it cannot be told from 0."""
-    usable = variances > 0
-    middle = float(np.median(values[usable]))
-    usable &= np.abs(values - middle) <= _DEVIATIONS * max(robust_scatter(values[usable], middle), 1e-300)
-    weights = 1 / variances[usable]
-    mean = float(np.average(values[usable], weights=weights))
-    scatter = float(np.average(np.square(values[usable] - mean), weights=weights))
-    return mean if abs(mean) > _SURE * np.sqrt(scatter / usable.sum()) else 0.0
-
-
-def _least_squares(shapes: Single, values: Single) -> tuple[FloatArray, FloatArray, Single]:
-    """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (0 for a
-    shape that is zero), and the residual."""
-    products = (shapes @ shapes.T).astype(np.float64)
-    sizes = np.sqrt(np.diag(products))
-    scale = np.where(sizes > 0, sizes, np.inf)
-    inverse = np.linalg.pinv(products / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
-    found = inverse @ (shapes @ values)
-    return found, np.diag(inverse), values - found.astype(np.float32) @ shapes
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -199,10 +114,12 @@ class SessionConditions:
 
 @dataclass(frozen=True)
 class SessionFault:
-    """One pattern, or one of its frames, that was wrong and is mended.
+    """One pattern, or one of its frames, that was wrong and is mended; a manifest has it with these keys.
 
     Attributes
     ----------
+    frames
+        names of its frames.
     side, index
         of the pattern.
     sign
@@ -213,78 +130,25 @@ class SessionFault:
         the same in words, after the frame's name.
     repair
         what is done about it, in words.
-    other
-        always None; older manifests have a frame here.
     cost
         relative error of its factor that this leaves beyond the noise.
+    other
+        always None; older manifests have a frame here.
     """
 
+    frames: list[str]
     side: Side
     index: int
     sign: int | None
     kind: str
     detail: str
     repair: str
-    other: Half | None = None
     cost: float = 0.0
+    other: None = None
 
-    def _names(self, name: Callable[[Half], str]) -> list[str]:
-        return [name((self.side, self.index, sign)) for sign in ((1, -1) if self.sign is None else (self.sign,))]
-
-    def words(self, name: Callable[[Half], str]) -> str:
-        """Return a sentence; ``name`` gives the name of a frame."""
+    def __str__(self) -> str:
         cost = f", at a factor error of {self.cost:.1e}" if self.cost else ""
-        return f"frames: {' and '.join(self._names(name))}: {self.detail}; {self.repair}{cost}"
-
-    def for_manifest(self, name: Callable[[Half], str]) -> dict[str, Any]:
-        """Return the fault for a manifest; ``name`` gives the name of a frame."""
-        return {"frames": self._names(name), **asdict(self)}
-
-
-@dataclass(frozen=True)
-class Lamp:
-    """Power of the projector over the session.
-
-    Attributes
-    ----------
-    drift
-        change from the session's begin to its end, as a part of its mean.
-    flicker
-        from frame to frame, rms, as a part of it.
-    drift_cost, flicker_cost
-        relative error of both factors that each would leave, or leaves, in them.
-    remaining
-        the error that is left after correction.
-    corrected
-        whether factors are corrected for it.
-    """
-
-    drift: float = 0.0
-    flicker: float = 0.0
-    drift_cost: float = 0.0
-    flicker_cost: float = 0.0
-    remaining: float = 0.0
-    corrected: bool = False
-
-    def for_manifest(self) -> dict[str, float] | None:
-        """Return the lamp for a manifest; None if it is steady."""
-        return asdict(self) if self.drift or self.flicker else None
-
-    def warnings(self) -> Iterator[str]:
-        """Yield a sentence on drift and on flicker, where there is any."""
-        drift, flicker = (
-            f"drifts by {self.drift:+.1%} over the session",
-            f"flickers by {self.flicker:.2%} between frames",
-        )
-        for size, words, cost, remedy in (
-            (self.drift, drift, self.drift_cost, "let it warm up"),
-            (self.flicker, flicker, self.flicker_cost, "use a steadier one, or expose for whole periods"),
-        ):
-            if size:
-                yield (
-                    f"lamp: its power {words}, a factor error of {cost:.1e} if nothing is done; frames are divided by "
-                    f"its power, and {self.remaining:.1e} is left: {remedy}"
-                )
+        return f"frames: {' and '.join(self.frames)}: {self.detail}; {self.repair}{cost}"
 
 
 @dataclass
@@ -298,19 +162,21 @@ class CheckedSession:
     faults
         in the order of the sides and patterns.
     lamp
-        how steady it is.
+        None if the projector is steady. ``drift`` from the session's begin to its end, ``flicker`` from frame to frame,
+        rms, both as a part of its power; ``drift_cost``, ``flicker_cost``: relative error of both factors of each
+        without correction; ``remaining``: with it; ``corrected``.
     doubts
-        sentences on errors that are not mended and count in the stated error.
+        sentences on the lamp, and on errors that are not mended and count in the stated error.
     extra
         squared error of each side's vectors beyond their noise.
     uniform
         (rows, columns) uniform response that all patterns share, where that of the uniform frames is wrong: the session
-        must then be read again with this one. None where it is right.
+        must then be read again with this one, and nothing else is judged. None where it is right.
     """
 
     sums: tuple[StripeSums, StripeSums]
     faults: list[SessionFault] = field(default_factory=list)
-    lamp: Lamp = field(default_factory=Lamp)
+    lamp: dict[str, float] | None = None
     doubts: list[str] = field(default_factory=list)
     extra: tuple[float, float] = (0.0, 0.0)
     uniform: FloatArray | None = None
@@ -327,13 +193,10 @@ class CheckedSession:
         """
         return factors_of_sums(*self.sums, signs, noise, self.extra)
 
-    def warnings(self, name: Callable[[Half], str]) -> tuple[str, ...]:
-        """Return a sentence for each fault and doubt; ``name`` gives the name of a frame."""
-        return (*(fault.words(name) for fault in self.faults), *self.lamp.warnings(), *self.doubts)
-
-    def faults_for_manifest(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
-        """Return the faults for a manifest; ``name`` gives the name of a frame."""
-        return [fault.for_manifest(name) for fault in self.faults]
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each fault and doubt."""
+        return (*map(str, self.faults), *self.doubts)
 
 
 def check_session(
@@ -350,8 +213,8 @@ def check_session(
     taken
         how the session was taken.
     uniform_given
-        whether the sums were made with the ``uniform`` response of an earlier check. If not, and the uniform frames of
-        one side are wrong, nothing else is judged.
+        whether the sums are judged even if the uniform frames are wrong, because they were made with the ``uniform``
+        response of an earlier check, or cannot be made again.
 
     Raises
     ------
@@ -359,6 +222,48 @@ def check_session(
         for faults that cannot be mended, with the frames that do not fit, or "all frames".
     """
     return _Check(sums, signs, taken).result(uniform_given)
+
+
+# ---- Statistics ------------------------------------------------------------------------------------------------------
+
+
+def _shrunk(
+    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
+    variance that they share, 0 where it cannot be told from 0.
+
+    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
+    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
+    """
+    beyond, pooled = np.square(values) - variances, 0.0
+    middle = max(float(np.median((beyond / variances)[good])), 0.0)
+    usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
+    for _ in range(4):
+        weights = usual / np.square(variances + pooled)
+        pooled = max(float(weights @ beyond / weights.sum()), 0.0)
+    deviation = float(np.sqrt(2 * np.square(weights) @ np.square(variances)) / weights.sum())
+    sure = pooled * (pooled > _SURE * deviation)
+    prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
+    weight = prior / (prior + variances)
+    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
+
+
+def _scatter(values: FloatArray, variances: FloatArray) -> bool:
+    """Return True if ``values`` differ by more than their ``variances``."""
+    away = np.square(values - np.median(values)) / variances
+    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / len(away)))
+
+
+def _least_squares(shapes: npt.NDArray[np.float32], values: npt.NDArray[np.float32]) -> tuple[FloatArray, ...]:
+    """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (huge
+    for a shape that is zero), and the residual."""
+    products = (shapes @ shapes.T).astype(np.float64)
+    sizes = np.sqrt(np.diag(products))
+    scale = np.where(sizes > 0, sizes, np.inf)
+    inverse = np.linalg.pinv(products / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
+    found = inverse @ (shapes @ values)
+    return found, np.where(sizes > 0, np.diag(inverse), _UNKNOWN), values - found.astype(np.float32) @ shapes
 
 
 # ---- The check -------------------------------------------------------------------------------------------------------
@@ -381,24 +286,19 @@ class _Side:
                 self.misfits -= self.ambient.energies(self.pairs.ambient)
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
-        light = np.square(self.vectors).sum(axis=1)
-        around = np.pad(light, 1, constant_values=np.inf)
-        around = np.minimum(around[:-2], around[2:])
-        self.dead = np.flatnonzero((light < _DARK[sums.centre] * around) & (around > _LIT * np.median(light)))
-        self.lost = float(around[self.dead].sum())
 
     @property
     def size(self) -> float:
         return max(float(np.square(self.vectors).sum()), 1e-300)
 
-    def shadow(self, signs: FloatArray, unknown: Sequence[int] = ()) -> MovingShadow:
-        vectors = self.vectors.copy()
-        last = len(vectors) - 1
-        vectors[self.dead] = (vectors[(self.dead - 1).clip(0)] + vectors[(self.dead + 1).clip(max=last)]) / 2
-        return MovingShadow(vectors, signs, unknown)
-
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
+
+    def add_motion(self, moves: FloatArray, ends: FloatArray) -> None:
+        """Count ``moves`` (N,) [pixels] against either end of the session."""
+        # Differences of neighbours: those of every second pixel do not see the finest detail.
+        steep = np.square(np.diff(self.vectors, axis=0)).sum(axis=0)
+        self.add("motion", max(float(np.square(moves - end) @ steep) for end in ends))
 
     def result(self) -> StripeSums:
         if np.array_equal(self.vectors, self.sums.vectors):
@@ -410,82 +310,68 @@ class _Check:
     """A session while it is checked. Pairs of both sides are numbered one after the other."""
 
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
-        self.sums, self.signs, self.taken, self.count = sums, signs, taken, signs.shape[1]
+        self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
         self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
-        self.faults: list[SessionFault] = []
-        self.doubts = {"power": "frames are of different power; use a steadier lamp, or pairs"}
-        self.lamp, self.ambient_moved = Lamp(), 0.0
+        self.found = CheckedSession(sums)
+        self.refused: list[tuple[Half, str]] = []
+        self.lag = self.moved = self.ambient_moved = 0.0
+        self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
         return [(own.side, index, sign) for sign in ((1, -1) if self.paired else (1,))]
 
-    def _of(self, own: _Side, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def _of(self, own: _Side, values: FloatArray) -> FloatArray:
         """Return those of the ``values`` (2 N, ...) that belong to a side."""
         return values[own.axis * self.count : (own.axis + 1) * self.count]
 
-    def _noise(self) -> float:
-        return float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
+    def _refuse(self, own: _Side, index: int, reason: str) -> None:
+        self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _refuse(self, wrong: Sequence[tuple[_Side, int]], reason: str) -> NoReturn:
-        """Raise MitsimError that names the frames of ``wrong`` patterns."""
-        names = [self.taken.name(half) for own, index in wrong for half in self._halves(own, index)]
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
+    def _mend(
+        self, own: _Side, index: int, sign: int | None, kind: str, detail: str, repair: str, cost: float = 0
+    ) -> None:
+        halves = [half for half in self._halves(own, index) if sign in (None, half[2])]
+        names = [self.taken.name(half) for half in halves]
+        self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
 
     def result(self, uniform_given: bool) -> CheckedSession:
-        uniform = None
+        found = self.found
         if self.paired:
             bad = self._fit_sums()
-            if self.taken.saturated and too_many(int(bad.sum()), self.count):
-                return CheckedSession(self.sums)
-            wrong = [(own, int(index)) for own in self.sides for index in np.flatnonzero(self._of(own, bad))]
-            if too_many(len(wrong), self.count):
+            if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
+                if self.taken.saturated:
+                    return found
                 raise MitsimError(
-                    f"all frames: the two frames of {len(wrong)} of {2 * self.count} patterns do not add up to what "
+                    f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
                     f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
                     "that numbers are in proportion to light"
                 )
-            uniforms = [(own, 0) for own, index in wrong if index == 0]
-            if len(uniforms) == 2:
-                self._refuse(uniforms, "the uniform frames of both sides do not add up to what others do")
-            if uniforms and not uniform_given:
-                doubt = f"frames: the uniform frames of {uniforms[0][0].side} stripes are wrong; take them again"
-                return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform())
+            if bad[:: self.count].all():
+                raise MitsimError("all frames: the uniform frames of both sides do not add up to what others do")
+            uniform = self._uniform()
+            away = np.linalg.norm(uniform - np.outer(*(own.uniform for own in self.sides))) / np.linalg.norm(uniform)
+            if not uniform_given and away > max(_MATTERS * self.noise, _SLIGHT / 4):
+                found.uniform = uniform
+                return found
             self._correct()
-            powers, deviations = self.values[[0, self.count], 1], np.sqrt(self.variances[[0, self.count], 1])
-            # Ambient light or power that differ in the uniform frames are in the vectors that all responses share.
-            if not uniform_given and (
-                abs(powers[0] - powers[1]) > max(_SLIGHT, _DEVIATIONS * deviations.max())
-                or self.ambient_moved > (_MATTERS * self._noise()) ** 2
-            ):
-                uniform = self._uniform()
-            self._report()
-            for own, index in wrong:
-                self._use_one_frame(own, index)
-        elif self.taken.wrong:
-            known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
-            self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
-        parts = [
-            abs(float(np.dot(own.vectors[:, 0], own.uniform) / np.dot(own.uniform, own.uniform))) for own in self.sides
-        ]
-        apart = abs(parts[0] - parts[1])  # both sides' uniform responses are one
+            for own in self.sides:
+                for index in np.flatnonzero(self._of(own, bad)):
+                    self._use_one_frame(own, int(index))
+        else:
+            self._compare_sides()
         for own in self.sides:
-            if not self.paired and apart > _SLIGHT:
-                own.add("power", (apart / 2) ** 2 * own.size)
-            if len(own.dead):
-                own.add("dead", own.lost)
-                word = "row" if own.axis == 0 else "column"
-                self.doubts["dead"] = f"sensor {word} {own.dead[0]} shows no light; check the sensor"
             self._check_shadow(own)
-        return self._judge(uniform)
+        self._judge()
+        return found
 
     # ---- sums of pairs -----------------------------------------------------------------------------------------------
 
     def _fit_sums(self) -> npt.NDArray[np.bool_]:
         """Fit the sums of all pairs; return (2 N,) whether pairs do not fit."""
-        places = {half: place for place, half in enumerate(self.taken.order)}
         halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
+        numbers = {half: number for number, each in enumerate(halves) for half in each}
+        places = {half: place for place, half in enumerate(self.taken.order)}
         self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
         sums = np.concatenate([own.pairs.blocks for own in self.sides])
         lit = sums.mean(axis=0)  # noise of light is larger where there is more
@@ -493,37 +379,37 @@ class _Check:
         if self.centre:
             sums -= sums.mean(axis=2, keepdims=True)
             sums -= sums.mean(axis=1, keepdims=True)
-        self.shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
-        self.along = [block_means(own.uniform) for own in self.sides]
-        self.squares = [max(float(np.square(each).sum()), 1e-300) for each in self.along[::-1]]
+        shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
+        along = [block_means(own.uniform) for own in self.sides]
         moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
-        fixed = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
+        fixed = [np.outer(*along), np.outer(moved[0], along[1]), np.outer(along[0], moved[1])]
         if not self.centre:
-            (y, x), (one, same) = ([make(k) for k in self.shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
+            (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
         shown = [block_means(own.sums.vectors) for own in self.sides]
-        left, right = np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
+        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
         responses = np.concatenate([left, right]).reshape(len(sums), -1).astype(np.float32)
-        first = np.arange(2) * self.count
-        lagged, self.own_before = np.zeros_like(sums), np.zeros(len(sums))
-        numbers = {half: number for number, each in enumerate(halves) for half in each}
+        lagged, own_before = np.zeros_like(sums), np.zeros(len(sums))
         for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
             if numbers[last] == numbers[half]:
-                self.own_before[numbers[half]] += last[2] / 2
+                own_before[numbers[half]] += last[2] / 2
             elif last[1]:  # the uniform pattern's light looks like the lamp's power
                 lagged[numbers[half]] += np.float32(last[2] / 2) * responses[numbers[last]]
-        responses[first] = 0.0  # the uniform pattern has one lit frame
-        usual, shapes = np.median(sums, axis=0), np.stack(fixed).reshape(len(fixed), -1).astype(np.float32)
-        found = [
-            _least_squares(np.vstack([responses[k], shapes, lagged[k]]), one - usual) for k, one in enumerate(sums)
-        ]
-        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
-        self.lag = _pooled_mean(self.values[:, -1], variances[:, -1])
-        sums -= usual + np.median(rest, axis=0) + np.float32(self.lag) * lagged
-        found = [_least_squares(np.vstack([responses[k], shapes]), one) for k, one in enumerate(sums)]
-        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
+        responses[:: self.count] = 0.0  # the uniform pattern has one lit frame
+        shapes = np.stack(fixed).reshape(len(fixed), -1).astype(np.float32)
+        usual = np.median(sums, axis=0)
+        sums -= usual
+        sums -= np.median(sums - sums @ np.linalg.pinv(shapes) @ shapes, axis=0)
+        fits = [_least_squares(np.vstack([responses[k], lagged[k], shapes]), one) for k, one in enumerate(sums)]
+        self.values, variances, rest = (np.stack(part) for part in zip(*fits, strict=True))
+        # Lag is one number; the patterns of widest stripes show it best.
+        best = np.argsort(variances[:, 1])[: len(sums) // 4]
+        lags = self.values[best, 1]
+        lag = float(np.median(lags))
+        self.lag = lag * (abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(len(best)))
+        self.values[:, 0] -= self.lag * own_before
         order, few = np.argsort(self.times), max(4, len(sums) // 16)
-        self.ends = np.stack([np.median(self.values[part, 2:4], axis=0) for part in (order[:few], order[-few:])])
+        self.ends = np.stack([np.median(self.values[part, 3:5], axis=0) for part in (order[:few], order[-few:])])
         self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
         squared = np.square(rest).mean(axis=1)
         area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
@@ -531,30 +417,25 @@ class _Check:
         noise = max(noise, 1e-13 * float(np.square(usual).mean()))
         self.variances, spent = variances * noise * bright, variances.shape[1]
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        excess, alone = [], []
         for own in self.sides:
-            expected = noise / self.squares[own.axis] * len(own.vectors) * (1 - spent / self.shape[own.axis])
-            expected *= 1 + np.pi / 2 / len(sums)  # the usual sum is a median
-            deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
-            energy = self._energy_along(own, rest)
-            excess.append((energy - expected) * ((energy - expected).sum() > _SURE * deviation))
-            alone.append(energy / max(expected, 1e-300))
-        self.excess = np.concatenate(excess)
+            frames, common = self._of(own, rest).reshape(-1, *shape), along[1 - own.axis]
+            vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
+            if self.centre:
+                vectors = vectors - vectors.mean(axis=1, keepdims=True)
+            rows = shape[own.axis]
+            own.excess = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
+            # The usual sum is a median.
+            own.expected = (
+                noise / (common @ common) * len(own.vectors) * (1 - spent / rows) * (1 + np.pi / 2 / len(sums))
+            )
         bad = np.abs(self.values[:, 0]) > _ALONE  # one frame is black, so that power cannot be divided out
         bad[[numbers[half] for half in self.taken.wrong]] = True
-        for measure in (squared / noise, np.concatenate(alone)):
+        excess = np.concatenate([own.excess / max(own.expected, 1e-300) for own in self.sides])
+        for measure in (squared / noise, excess):
             middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
+            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure))
         self.good = ~bad
         return np.asarray(bad)
-
-    def _energy_along(self, own: _Side, rest: FloatArray) -> FloatArray:
-        """Return (N,) squared length of the vectors that the residuals ``rest`` of a side have along the common one."""
-        frames, common = self._of(own, rest).reshape(-1, *self.shape), self.along[1 - own.axis]
-        vectors = (frames @ common if own.axis == 0 else common @ frames) / self.squares[own.axis]
-        if self.centre:
-            vectors = vectors - vectors.mean(axis=1, keepdims=True)
-        return np.asarray(np.square(vectors).sum(axis=1) * len(own.vectors) / self.shape[own.axis])
 
     def _uniform(self) -> FloatArray:
         """Return the uniform response whose vectors are those that the other patterns share, and whose size is that of
@@ -576,24 +457,17 @@ class _Check:
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
         for own in self.sides:
-            own.add("sums", float(self._of(own, self.excess * self.good).sum()))
+            good = self._of(own, self.good)
+            beyond = (own.excess - own.expected)[good]
+            sure = beyond.sum() > _SURE * own.expected * np.sqrt(2 * self.count / 32)
+            own.add("sums", float(beyond.sum() * sure))
             if not self.centre:
                 self._subtract_ambient(own)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            # Differences of neighbours: those of every second pixel do not see the finest detail.
-            steep = self._of(own, self.good) * np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
-            moves = self.values[:, 2 + own.axis]
-            away = np.square(moves - np.median(moves[self.good])) / self.variances[:, 2 + own.axis]
-            if np.mean(away[self.good]) > 1 + _SURE * np.sqrt(2 / self.good.sum()):
-                ends = self.ends[:, own.axis]
-                own.add("motion", max(float(np.square(self._of(own, moves) - end) @ steep) for end in ends))
-        self.doubts |= {
-            "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
-            "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
-            "motion": f"camera or mask move by {self.moved:.2g} pixels; fasten them",
-            "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
-        }
+            moves, variances = self.values[:, 3 + own.axis], self.variances[:, 3 + own.axis]
+            if _scatter(moves[self.good], variances[self.good]):
+                own.add_motion(self._of(own, moves) * good, self.ends[:, own.axis])
         if not self.taken.unsteady:
             self._divide()
 
@@ -612,28 +486,26 @@ class _Check:
 
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
-        power, ratio = self.values[:, 1], self.values[:, 0] - self.lag * self.own_before
+        ratio, power, usable = self.values[:, 0], self.values[:, 2], self.good
         first = np.arange(2) * self.count
         unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
-        usable = self.good
         sure = usable & (np.square(ratio) > _SURE**2 * self.variances[:, 0])
-        both = (1 + power * unit) / (1 - np.where(sure, np.square(ratio), 0.0))
-        degree, kept = min(3, max(len(np.unique(self.times)) // 4, 0)), usable
+        powers = (1 + power * unit) / (1 - np.where(sure, np.square(ratio), 0.0))
+        kept, degree = usable, min(3, len(np.unique(self.times)) // 4)
         for _ in range(4):
-            trend = np.polynomial.Polynomial.fit(self.times[kept], both[kept], degree)(self.times)
-            away = np.abs(both - trend)
-            kept = usable & (away <= _DEVIATIONS * max(robust_scatter(away[usable]), 1e-12))
-        both, trend = both / float(np.mean(trend)), trend / float(np.mean(trend))
-        variances = self.variances[:, 1] * unit**2
-        drifts = np.var(trend) > _SURE**2 * np.median(variances) * (degree + 1) / usable.sum()
-        trend = trend if drifts else np.ones(len(both))
-        own_power, left, shaken = _shrunk(both - trend, variances, usable)
-        patterned = self.variances[:, 0] > 0
+            trend = np.polynomial.Polynomial.fit(self.times[kept], powers[kept], degree)(self.times)
+            kept = usable & (
+                np.abs(powers - trend) <= _DEVIATIONS * max(robust_scatter((powers - trend)[usable]), 1e-12)
+            )
+        powers, trend = powers / float(np.mean(trend)), trend / float(np.mean(trend))
+        variances = self.variances[:, 2] * unit**2
+        if np.var(trend) <= _SURE**2 * np.median(variances) * (degree + 1) / usable.sum():
+            trend = np.ones(len(trend))
+        own_power, left, shaken = _shrunk(powers - trend, variances, usable)
         # A single frame of other power changes both alike.
-        ratio_variances, alike = np.where(patterned, self.variances[:, 0], 1.0), np.square(own_power)
-        ratio, left_ratio, uneven = _shrunk(ratio, ratio_variances, usable & patterned, alike)
-        own_power, ratio = np.where(usable, own_power, 0.0), np.where(usable & patterned, ratio, 0.0)
-        powers, flicker = trend + own_power, float(np.sqrt(shaken + uneven))
+        ratio, left_ratio, uneven = _shrunk(ratio, self.variances[:, 0], usable, np.square(own_power))
+        left_ratio[first] = 0.0
+        powers, ratio, flicker = trend + own_power * usable, ratio * usable, float(np.sqrt(shaken + uneven))
         mean = float(np.sqrt(np.mean(powers[first])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
         bent = own_power[first] / trend[first]
@@ -645,7 +517,7 @@ class _Check:
             costs += [np.square(slow - 1) @ energies / size, (np.square(c - slow) @ energies + d @ d * whole) / size]
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
             noise = own.noise * float((1 / np.square(c) - 1)[keep].clip(0).sum())
-            lost = self._of(own, left) * energies + self._of(own, left_ratio * patterned) * whole
+            lost = self._of(own, left) * energies + self._of(own, left_ratio) * whole
             # The factors are those of the mean power; a capture may have any that the session had.
             range_ = float(np.abs(trend - 1).max()) / 2
             own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
@@ -655,56 +527,85 @@ class _Check:
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
-                repair = "its response is divided by that"
-                self.faults.append(SessionFault(own.side, int(index), 1 - 2 * int(half), "power", detail, repair))
-        drift, flickers = (float(cost) if cost > _MATTERS * self._noise() else 0.0 for cost in np.sqrt(costs))
+                self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
+        drift, flickers = (float(cost) * (cost > _MATTERS * self.noise) for cost in np.sqrt(costs))
+        if not drift and not flickers:
+            return
         change = float(trend[np.argmax(self.times)] - trend[np.argmin(self.times)])
-        remaining = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
-        corrected = bool(drift or flickers)
-        self.lamp = Lamp(change * bool(drift), flicker * bool(flickers), drift, flickers, remaining, corrected)
+        left_over = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
+        self.found.lamp = {
+            "drift": change * bool(drift),
+            "flicker": flicker * bool(flickers),
+            "drift_cost": drift,
+            "flicker_cost": flickers,
+            "remaining": left_over,
+            "corrected": True,
+        }
+        for words, cost, remedy in (
+            (f"drifts by {change:+.1%} over the session", drift, "let it warm up"),
+            (f"flickers by {flicker:.2%} between frames", flickers, "use a steadier one, or expose for whole periods"),
+        ):
+            if cost:
+                self.found.doubts.append(
+                    f"lamp: its power {words}, a factor error of {cost:.1e} if nothing is done; frames are divided by "
+                    f"its power, and {left_over:.1e} is left: {remedy}"
+                )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
     def _use_one_frame(self, own: _Side, index: int) -> None:
-        """Replace a response by twice one of its frames less the usual sum; refused unless the moving shadow agrees."""
+        """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = "the two do not add up to what others do"
-        reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
+        if known:
+            reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}"
         own.misfits[index] = np.median(own.misfits)
         if index == 0:
             own.vectors[:, 0] = own.uniform
-            repair = "those of the other side replace them"
-            self.faults.append(SessionFault(own.side, 0, None, "replaced", reason, repair))
+            self._mend(own, 0, None, "replaced", reason, "those of the other side replace them")
             return
-        times = self._of(own, self.times)
         right = np.flatnonzero(self._of(own, self.good))
+        times = self._of(own, self.times)
         near = right[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
         away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
-        tried, scores = {}, dict[int, float]()
+        scores = dict[int, float]()
         for wrong in known or (1, -1):
-            own.vectors[:, index] = tried[wrong] = own.sums.vectors[:, index] - wrong * away
-            shadow = own.shadow(self.signs)
+            own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
+            shadow = MovingShadow(own.vectors, self.signs)
             fits = shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE
             if len(known) < 2 and fits and (known or shadow.predicts):
                 scores[wrong] = float(shadow.deviations[index])
         if not scores:
-            self._refuse([(own, index)], reason)
+            self._refuse(own, index, reason)
+            return
         sign = min(scores, key=lambda wrong: scores[wrong])
-        own.vectors[:, index] = tried[sign]
+        own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
         error = 1.5 * own.noise
         if len(scores) > 1 and scores[sign] > scores[-sign] / 2:  # the shadow does not decide between the frames
             error += float(np.square(away).sum())
         own.add("replaced", error)
         repair, cost = "the other frame of its pair replaces it", float(np.sqrt(error / own.size))
-        self.faults.append(SessionFault(own.side, index, sign, "replaced", reason, repair, cost=cost))
+        self._mend(own, index, sign, "replaced", reason, repair, cost)
+
+    def _compare_sides(self) -> None:
+        """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
+        for half, reason in self.taken.wrong.items():
+            self.refused.append((half, reason))
+        found = []
+        for own in self.sides:
+            shapes = np.stack([own.uniform, np.gradient(own.uniform)])
+            found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
+            moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
+            if moved**2 > (_SURE * 2) ** 2 * noise:
+                own.add("motion", moved**2 * float(np.square(np.diff(own.vectors, axis=0)).sum()))
+        apart = abs(abs(found[0][0]) - abs(found[1][0]))
+        for own in self.sides:
+            own.add("power", (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
-        """Turn the signs of patterns whose two frames are exchanged; refuse patterns and lines that are foreign."""
-        sums, turned, foreign = own.sums, set[int](), list[int]()
-        odd = odd_responses(own.misfits, sums.energies, len(own.vectors) * len(sums.common))
-        if len(odd):
-            self._refuse([(own, int(index)) for index in odd], f"they show no {own.side} stripes")
+        """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
+        turned, foreign = set[int](), list[int]()
 
         def turn(indices: Sequence[int]) -> None:
             own.vectors[:, indices] *= -1
@@ -713,15 +614,12 @@ class _Check:
         if np.dot(own.vectors[:, 0], own.uniform) < 0:
             turn([0])
         for _ in range(int(MOST_FAULTS * self.count) + 3):
-            shadow = own.shadow(self.signs, foreign)
+            shadow = MovingShadow(own.vectors, self.signs, foreign)
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
-            known = (shadow.unlike < _KNOWN[0]) | (shadow.deviations > _KNOWN[1])
-            known &= shadow.deviations > _FOREIGN[2]
-            doubtful |= known & (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
-            far = np.where(doubtful, shadow.deviations, 0.0)
-            gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
+            far = shadow.deviations * (doubtful | (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1]))
+            gains = shadow.by_turning * (shadow.by_turning > _TURNED * shadow.deviations)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
             if gains[best] > max(_LEAST, _TURNED * far.max()):
@@ -732,68 +630,74 @@ class _Check:
                 break
         else:
             raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
-        if foreign and (doubts := self._report()):
-            raise MitsimError(f"all frames: {doubts[0]}, and most patterns disagree; take the session again")
-        if foreign:
-            wrong = [(own, index) for index in sorted(foreign)]
-            self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
-        if not shadow.predicts and 0 < len(turned) < self.count:
-            self._refuse([(own, index) for index in turned], "they are in each other's place")
+        for index in foreign:
+            self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
         all_pairs = len(turned) == self.count
         for index in [0] if all_pairs else sorted(turned):
-            detail = (
-                f"in each other's place, as in all pairs of {own.side} stripes"
-                if all_pairs
-                else "in each other's place"
-            )
-            repair = "they count in their right order"
+            if not shadow.predicts and not all_pairs:
+                self._refuse(own, index, "they are in each other's place")
+            detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * all_pairs
             sign = None if self.paired else 1
-            self.faults.append(SessionFault(own.side, index, sign, "exchanged", detail, repair))
-        # The lines at the ends are predicted from one side only, and few lines hardly predict each other.
-        inner = shadow.lines[1:-1]
-        if shadow.predicts and len(inner) > _FEW_LINES and inner.max() > _LINE:
-            raise MitsimError(
-                f"all frames: line {1 + int(np.argmax(inner))} of the {own.side} stripes is not as bright as its "
-                "neighbours predict; check the projector, uniform and dark frames, and take the session again"
-            )
-        if shadow.predicts and not self.paired:
+            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
+        light = np.square(own.vectors).sum(axis=1)
+        around = np.pad(light, 1, constant_values=np.inf)
+        around = np.minimum(around[:-2], around[2:])
+        own.add("dead", around[(light < _DARK[self.centre] * around) & (around > _LIT * np.median(light))].sum())
+        if not shadow.predicts:
+            return
+        # The lines at the ends are predicted from one side only.
+        line = float(shadow.lines[1:-1].max(initial=0.0))
+        own.add("line", line / len(shadow.lines) * own.size * (line > _LINE))
+        if not self.paired:
+            moves, variances = shadow.moves()
+            if _scatter(moves[1:], variances[1:]):
+                few = max(2, self.count // 8)
+                own.add_motion(moves, np.array([np.median(moves[:few]), np.median(moves[-few:])]))
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
             own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
 
-    def _report(self) -> list[str]:
-        """Return sentences on the errors that matter, the largest first; MitsimError for more than a tenth."""
-        reasons = {reason for own in self.sides for reason in own.extras}
-        energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
-        order, total = sorted(reasons, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
-        if total > LARGEST_ERROR:
-            reason = self.doubts.get(order[0], "power or ambient light change too much")
+    # ---- the result --------------------------------------------------------------------------------------------------
+
+    def _judge(self) -> None:
+        """Report the errors that matter, the largest first; refuse the session for more than a tenth, and for frames
+        that are wrong."""
+        causes = {
+            "power": "frames are of different power; use a steadier lamp, or pairs",
+            "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
+            "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
+            "motion": f"camera or mask move by {self.moved:.2g} pixels; fasten them",
+            "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
+            "dead": "a sensor row or column shows no light; check the sensor",
+            "line": "a line of the stripes is not as bright as its neighbours predict; check the projector",
+            "lamp": "the lamp's power changes too much; use a steadier one",
+            "ambient": "ambient light changes too much; darken the room",
+        }
+        found, sides = self.found, self.sides
+        energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for each in causes}
+        order, total = sorted(causes, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
+        doubts = [
+            f"{causes[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
+            for each in order
+            if each not in ("lamp", "ambient") and energies[each] > (_MATTERS * self.noise) ** 2
+        ]
+        if total > LARGEST_ERROR or (self.refused and doubts):
             raise MitsimError(
-                f"all frames: {reason}: an error of {total:.0%} is left in the factors, allowed are "
+                f"all frames: {causes[order[0]]}: an error of {total:.0%} is left in the factors, allowed are "
                 f"{LARGEST_ERROR:.0%}; take the session again"
             )
-        most = (_MATTERS * self._noise()) ** 2
-        return [
-            f"{self.doubts[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
-            for each in order
-            if each in self.doubts and energies[each] > most
-        ]
-
-    def _judge(self, uniform: FloatArray | None) -> CheckedSession:
-        """Report the errors that matter."""
-        doubts, noise = [f"session: {words}" for words in self._report()], self._noise()
-        if self.ambient_moved > (_MATTERS * noise) ** 2:
-            doubts.append(
-                f"session: ambient light changes between the two frames of pairs, a factor error of "
+        if self.refused:
+            reason = self.refused[0][1]
+            names = [self.taken.name(half) for half, why in self.refused if why == reason]
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
+        found.doubts += [f"session: {words}" for words in doubts]
+        if self.ambient_moved > (_MATTERS * self.noise) ** 2:
+            found.doubts.append(
+                "session: ambient light changes between the two frames of pairs, a factor error of "
                 f"{np.sqrt(self.ambient_moved):.1e} if nothing is done; it is subtracted: darken the room"
             )
-        first, second = self.sides
-        return CheckedSession(
-            (first.result(), second.result()),
-            sorted(self.faults, key=lambda fault: (SIDES.index(fault.side), fault.index)),
-            self.lamp,
-            doubts,
-            (sum(first.extras.values()), sum(second.extras.values())),
-            uniform,
-        )
+        found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
+        found.sums = sides[0].result(), sides[1].result()
+        found.extra = sum(sides[0].extras.values()), sum(sides[1].extras.values())
