@@ -241,8 +241,8 @@ def _shrunk(
     usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
     for _ in range(4):
         weights = usual / np.square(variances + pooled)
-        pooled = max(float(weights @ beyond / weights.sum()), 0.0)
-    deviation = float(np.sqrt(2 * np.square(weights) @ np.square(variances)) / weights.sum())
+        pooled = max(float(np.average(beyond, weights=weights)), 0.0)
+    deviation = float(np.sqrt(2 * np.square(weights * variances).sum()) / weights.sum())
     sure = pooled * (pooled > _SURE * deviation)
     prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / (prior + variances)
@@ -252,18 +252,7 @@ def _shrunk(
 def _scatter(values: FloatArray, variances: FloatArray) -> bool:
     """Return True if ``values`` differ by more than their ``variances``."""
     away = np.square(values - np.median(values)) / variances
-    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / len(away)))
-
-
-def _least_squares(shapes: npt.NDArray[np.float32], values: npt.NDArray[np.float32]) -> tuple[FloatArray, ...]:
-    """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (huge
-    for a shape that is zero), and the residual."""
-    products = (shapes @ shapes.T).astype(np.float64)
-    sizes = np.sqrt(np.diag(products))
-    scale = np.where(sizes > 0, sizes, np.inf)
-    inverse = np.linalg.pinv(products / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
-    found = inverse @ (shapes @ values)
-    return found, np.where(sizes > 0, np.diag(inverse), _UNKNOWN), values - found.astype(np.float32) @ shapes
+    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / away.size))
 
 
 # ---- The check -------------------------------------------------------------------------------------------------------
@@ -300,14 +289,9 @@ class _Side:
         steep = np.square(np.diff(self.vectors, axis=0)).sum(axis=0)
         self.add("motion", max(float(np.square(moves - end) @ steep) for end in ends))
 
-    def result(self) -> StripeSums:
-        if np.array_equal(self.vectors, self.sums.vectors):
-            return self.sums
-        return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))
-
 
 class _Check:
-    """A session while it is checked. Pairs of both sides are numbered one after the other."""
+    """A session while it is checked. Numbers of pairs are arrays (2, N) of both sides."""
 
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
         self.signs, self.taken, self.count = signs, taken, signs.shape[1]
@@ -320,10 +304,6 @@ class _Check:
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
         return [(own.side, index, sign) for sign in ((1, -1) if self.paired else (1,))]
-
-    def _of(self, own: _Side, values: FloatArray) -> FloatArray:
-        """Return those of the ``values`` (2 N, ...) that belong to a side."""
-        return values[own.axis * self.count : (own.axis + 1) * self.count]
 
     def _refuse(self, own: _Side, index: int, reason: str) -> None:
         self.refused += [(half, reason) for half in self._halves(own, index)]
@@ -347,7 +327,7 @@ class _Check:
                     f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
                     "that numbers are in proportion to light"
                 )
-            if bad[:: self.count].all():
+            if bad[:, 0].all():
                 raise MitsimError("all frames: the uniform frames of both sides do not add up to what others do")
             uniform = self._uniform()
             away = np.linalg.norm(uniform - np.outer(*(own.uniform for own in self.sides))) / np.linalg.norm(uniform)
@@ -356,7 +336,7 @@ class _Check:
                 return found
             self._correct()
             for own in self.sides:
-                for index in np.flatnonzero(self._of(own, bad)):
+                for index in np.flatnonzero(bad[own.axis]):
                     self._use_one_frame(own, int(index))
         else:
             self._compare_sides()
@@ -368,18 +348,22 @@ class _Check:
     # ---- sums of pairs -----------------------------------------------------------------------------------------------
 
     def _fit_sums(self) -> npt.NDArray[np.bool_]:
-        """Fit the sums of all pairs; return (2 N,) whether pairs do not fit."""
-        halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
-        numbers = {half: number for number, each in enumerate(halves) for half in each}
-        places = {half: place for place, half in enumerate(self.taken.order)}
-        self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
-        sums = np.concatenate([own.pairs.blocks for own in self.sides])
-        lit = sums.mean(axis=0)  # noise of light is larger where there is more
+        """Fit the sums of all pairs; return (2, N) whether pairs do not fit."""
+        numbers = {
+            half: (own.axis, k) for own in self.sides for k in range(self.count) for half in self._halves(own, k)
+        }
+        self.times, before = np.zeros((2, 2, self.count))
+        for place, (half, last) in enumerate(zip(self.taken.order, [None, *self.taken.order], strict=False)):
+            self.times[numbers[half]] += place / 2 / len(numbers)
+            if last and numbers[last] == numbers[half]:
+                before[numbers[half]] = last[2] / 2
+        sums = np.stack([own.pairs.blocks for own in self.sides])
+        lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
         bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
         if self.centre:
+            sums -= sums.mean(axis=3, keepdims=True)
             sums -= sums.mean(axis=2, keepdims=True)
-            sums -= sums.mean(axis=1, keepdims=True)
-        shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
+        shape = sums.shape[2:]
         along = [block_means(own.uniform) for own in self.sides]
         moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
         fixed = [np.outer(*along), np.outer(moved[0], along[1]), np.outer(along[0], moved[1])]
@@ -387,51 +371,56 @@ class _Check:
             (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
         shown = [block_means(own.sums.vectors) for own in self.sides]
-        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
-        responses = np.concatenate([left, right]).reshape(len(sums), -1).astype(np.float32)
-        lagged, own_before = np.zeros_like(sums), np.zeros(len(sums))
-        for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
-            if numbers[last] == numbers[half]:
-                own_before[numbers[half]] += last[2] / 2
-            elif last[1]:  # the uniform pattern's light looks like the lamp's power
-                lagged[numbers[half]] += np.float32(last[2] / 2) * responses[numbers[last]]
-        responses[:: self.count] = 0.0  # the uniform pattern has one lit frame
-        shapes = np.stack(fixed).reshape(len(fixed), -1).astype(np.float32)
-        usual = np.median(sums, axis=0)
-        sums -= usual
-        sums -= np.median(sums - sums @ np.linalg.pinv(shapes) @ shapes, axis=0)
-        fits = [_least_squares(np.vstack([responses[k], lagged[k], shapes]), one) for k, one in enumerate(sums)]
-        self.values, variances, rest = (np.stack(part) for part in zip(*fits, strict=True))
-        # Lag is one number; the patterns of widest stripes show it best.
-        best = np.argsort(variances[:, 1])[: len(sums) // 4]
-        lags = self.values[best, 1]
-        lag = float(np.median(lags))
-        self.lag = lag * (abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(len(best)))
-        self.values[:, 0] -= self.lag * own_before
-        order, few = np.argsort(self.times), max(4, len(sums) // 16)
-        self.ends = np.stack([np.median(self.values[part, 3:5], axis=0) for part in (order[:few], order[-few:])])
-        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
-        squared = np.square(rest).mean(axis=1)
-        area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
+        shown[0][:, 0] = shown[1][:, 0] = 0.0  # the uniform pattern has one lit frame
+        responses = np.stack(
+            [np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])]
+        ).astype(np.float32)
+        # Least squares: all is projected on the shapes first, and the rest on the responses.
+        usual = np.median(sums, axis=(0, 1)).ravel()
+        sums, responses = sums.reshape(2, self.count, -1) - usual, responses.reshape(2, self.count, -1)
+        shapes = np.stack(fixed).reshape(len(fixed), -1)
+        inverse, shapes = np.linalg.pinv(shapes), shapes.astype(np.float32)
+        single = inverse.astype(np.float32)
+        sums -= np.median(sums - sums @ single @ shapes, axis=(0, 1))
+        values, parts = sums @ single, responses @ single
+        rest = sums - values @ shapes
+        responses -= parts @ shapes
+        sizes = np.maximum(np.square(responses).sum(axis=2, dtype=np.float64), 1 / _UNKNOWN)
+        self.ratios = (rest * responses).sum(axis=2) / sizes
+        rest -= self.ratios[..., None].astype(np.float32) * responses
+        self.values = values - self.ratios[..., None] * parts
+        area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
+        squared = np.square(rest).mean(axis=2)
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-13 * float(np.square(usual).mean()))
-        self.variances, spent = variances * noise * bright, variances.shape[1]
+        self.ratio_variances = noise * bright / sizes
+        self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
+        # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
+        best = (sizes > np.quantile(sizes, 0.75)) & (before != 0)
+        lags = (self.ratios / np.where(before, before, 1.0))[best] if best.any() else np.zeros(1)
+        self.lag = float(np.median(lags))
+        self.lag *= abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
+        self.ratios -= self.lag * before
+        late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
+        moves = self.values[..., 1:3].reshape(-1, 2)
+        self.ends = np.stack([np.median(moves[part], axis=0) for part in (late[:few], late[-few:])])
+        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
+        self.excess, relative = np.zeros((2, 2, self.count))
         for own in self.sides:
-            frames, common = self._of(own, rest).reshape(-1, *shape), along[1 - own.axis]
+            frames, common, rows = rest[own.axis].reshape(-1, *shape), along[1 - own.axis], shape[own.axis]
             vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
             if self.centre:
                 vectors = vectors - vectors.mean(axis=1, keepdims=True)
-            rows = shape[own.axis]
-            own.excess = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
-            # The usual sum is a median.
-            own.expected = (
-                noise / (common @ common) * len(own.vectors) * (1 - spent / rows) * (1 + np.pi / 2 / len(sums))
-            )
-        bad = np.abs(self.values[:, 0]) > _ALONE  # one frame is black, so that power cannot be divided out
-        bad[[numbers[half] for half in self.taken.wrong]] = True
-        excess = np.concatenate([own.excess / max(own.expected, 1e-300) for own in self.sides])
-        for measure in (squared / noise, excess):
+            energies = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
+            expected = noise / (common @ common) * len(own.vectors) * (1 - (len(fixed) + 1) / rows)
+            expected = max(expected * (1 + np.pi / 4 / self.count), 1e-300)  # the usual sum is a median
+            beyond, deviation = energies - expected, expected * np.sqrt(2 * self.count / rows)
+            self.excess[own.axis], relative[own.axis] = beyond * (beyond.sum() > _SURE * deviation), energies / expected
+        bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
+        for half in self.taken.wrong:
+            bad[numbers[half]] = True
+        for measure in (squared / noise, relative):
             middle = max(float(np.median(measure)), 1.0)
             bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure))
         self.good = ~bad
@@ -442,7 +431,7 @@ class _Check:
         the uniform frames that fit."""
         right, left = (
             own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum()
-            for own, used in ((own, self._of(own, self.good)) for own in self.sides)
+            for own, used in zip(self.sides, self.good, strict=True)
         )
         sizes = []
         for own, vector, common in zip(self.sides, (left, right), (right, left), strict=True):
@@ -450,30 +439,27 @@ class _Check:
             parts = np.column_stack([vector, np.vander(np.linspace(-1, 1, len(vector)), 2)])
             share = float(np.dot(common, own.sums.common)) / own.square
             sizes.append(abs(float(np.linalg.lstsq(parts, own.sums.vectors[:, 0], rcond=None)[0][0])) / share)
-        return np.asarray(np.outer(left, right) * np.mean(np.array(sizes)[self.good[:: self.count]]))
+        return np.asarray(np.outer(left, right) * np.mean(np.array(sizes)[self.good[:, 0]]))
 
     # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        for own in self.sides:
-            good = self._of(own, self.good)
-            beyond = (own.excess - own.expected)[good]
-            sure = beyond.sum() > _SURE * own.expected * np.sqrt(2 * self.count / 32)
-            own.add("sums", float(beyond.sum() * sure))
+        for own, good in zip(self.sides, self.good, strict=True):
+            own.add("sums", float(self.excess[own.axis][good].sum()))
             if not self.centre:
-                self._subtract_ambient(own)
+                self._subtract_ambient(own, good)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            moves, variances = self.values[:, 3 + own.axis], self.variances[:, 3 + own.axis]
+            moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
             if _scatter(moves[self.good], variances[self.good]):
-                own.add_motion(self._of(own, moves) * good, self.ends[:, own.axis])
+                own.add_motion(moves[own.axis] * good, self.ends[:, own.axis])
         if not self.taken.unsteady:
             self._divide()
 
-    def _subtract_ambient(self, own: _Side) -> None:
+    def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        good, light = self._of(own, self.good), own.ambient
+        light = own.ambient
         for found, effect, scale in zip(own.pairs.ambient.T, light.effects, light.variances, strict=True):
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
@@ -486,70 +472,62 @@ class _Check:
 
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
-        ratio, power, usable = self.values[:, 0], self.values[:, 2], self.good
-        first = np.arange(2) * self.count
-        unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
-        sure = usable & (np.square(ratio) > _SURE**2 * self.variances[:, 0])
-        powers = (1 + power * unit) / (1 - np.where(sure, np.square(ratio), 0.0))
-        kept, degree = usable, min(3, len(np.unique(self.times)) // 4)
+        usable = self.good
+        unit = 1 / max(1 - float(np.mean(self.values[:, 0, 0])), 0.1)
+        sure = usable & (np.square(self.ratios) > _SURE**2 * self.ratio_variances)
+        powers = (1 + self.values[..., 0] * unit) / (1 - np.where(sure, np.square(self.ratios), 0.0))
+        kept, degree = usable, min(3, self.count // 2)
         for _ in range(4):
             trend = np.polynomial.Polynomial.fit(self.times[kept], powers[kept], degree)(self.times)
-            kept = usable & (
-                np.abs(powers - trend) <= _DEVIATIONS * max(robust_scatter((powers - trend)[usable]), 1e-12)
-            )
-        powers, trend = powers / float(np.mean(trend)), trend / float(np.mean(trend))
-        variances = self.variances[:, 2] * unit**2
+            away = powers - trend
+            kept = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
+        powers, trend = powers / np.mean(trend), trend / np.mean(trend)
+        variances = self.variances[..., 0] * unit**2
         if np.var(trend) <= _SURE**2 * np.median(variances) * (degree + 1) / usable.sum():
-            trend = np.ones(len(trend))
+            trend = np.ones_like(trend)
         own_power, left, shaken = _shrunk(powers - trend, variances, usable)
         # A single frame of other power changes both alike.
-        ratio, left_ratio, uneven = _shrunk(ratio, self.variances[:, 0], usable, np.square(own_power))
-        left_ratio[first] = 0.0
-        powers, ratio, flicker = trend + own_power * usable, ratio * usable, float(np.sqrt(shaken + uneven))
-        mean = float(np.sqrt(np.mean(powers[first])))
+        ratios, left_ratio, uneven = _shrunk(self.ratios, self.ratio_variances, usable, np.square(own_power))
+        left_ratio[:, 0] = 0.0
+        powers, ratios, flicker = trend + own_power * usable, ratios * usable, float(np.sqrt(shaken + uneven))
+        mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
-        bent = own_power[first] / trend[first]
-        bent = float(np.abs(bent).min()) if bent[0] * bent[1] > 0 else 0.0
-        costs = np.zeros(2)
-        for own in self.sides:
+        bent = own_power[:, 0] / trend[:, 0]
+        bent = np.abs(bent).min() * (bent[0] * bent[1] > 0)
+        bent *= bent > max(_SLIGHT / 2, 3 * flicker)
+        drift_cost = flicker_cost = 0.0
+        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, trend, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
-            c, d, slow, keep = (self._of(own, each) for each in (powers, powers * ratio, trend, usable))
-            costs += [np.square(slow - 1) @ energies / size, (np.square(c - slow) @ energies + d @ d * whole) / size]
+            d = c * ratio
+            drift_cost += np.square(slow - 1) @ energies / size
+            flicker_cost += (np.square(c - slow) @ energies + d @ d * whole) / size
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
-            noise = own.noise * float((1 / np.square(c) - 1)[keep].clip(0).sum())
-            lost = self._of(own, left) * energies + self._of(own, left_ratio) * whole
+            lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
-            range_ = float(np.abs(trend - 1).max()) / 2
-            own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
-            own.add("bend", bent**2 / 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
-            parts = np.stack([(1 + sign * self._of(own, ratio)) * c / slow - 1 for sign in (1, -1)])
+            own.add("lamp", float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
+            own.add("bend", bent**2 / 2 * own.size)
+            parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
-        drift, flickers = (float(cost) * (cost > _MATTERS * self.noise) for cost in np.sqrt(costs))
-        if not drift and not flickers:
-            return
-        change = float(trend[np.argmax(self.times)] - trend[np.argmin(self.times)])
-        left_over = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
-        self.found.lamp = {
-            "drift": change * bool(drift),
-            "flicker": flicker * bool(flickers),
-            "drift_cost": drift,
-            "flicker_cost": flickers,
-            "remaining": left_over,
-            "corrected": True,
-        }
-        for words, cost, remedy in (
-            (f"drifts by {change:+.1%} over the session", drift, "let it warm up"),
-            (f"flickers by {flicker:.2%} between frames", flickers, "use a steadier one, or expose for whole periods"),
-        ):
-            if cost:
-                self.found.doubts.append(
-                    f"lamp: its power {words}, a factor error of {cost:.1e} if nothing is done; frames are divided by "
-                    f"its power, and {left_over:.1e} is left: {remedy}"
-                )
+        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
+            lamp = {
+                "drift": float(trend.flat[np.argmax(self.times)] - trend.flat[np.argmin(self.times)]),
+                "flicker": flicker,
+                "drift_cost": float(np.sqrt(drift_cost)),
+                "flicker_cost": float(np.sqrt(flicker_cost)),
+                "remaining": float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides))),
+                "corrected": True,
+            }
+            self.found.lamp = lamp
+            self.found.doubts.append(
+                f"lamp: its power drifts by {lamp['drift']:+.1%} over the session and flickers by {flicker:.2%} between "
+                f"frames, factor errors of {lamp['drift_cost']:.1e} and {lamp['flicker_cost']:.1e} if nothing is done; "
+                f"frames are divided by its power, and {lamp['remaining']:.1e} is left: let it warm up, use a steadier "
+                "one, or expose for whole periods"
+            )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
@@ -564,8 +542,8 @@ class _Check:
             own.vectors[:, 0] = own.uniform
             self._mend(own, 0, None, "replaced", reason, "those of the other side replace them")
             return
-        right = np.flatnonzero(self._of(own, self.good))
-        times = self._of(own, self.times)
+        right = np.flatnonzero(self.good[own.axis])
+        times = self.times[own.axis]
         near = right[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
         away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
         scores = dict[int, float]()
@@ -699,5 +677,5 @@ class _Check:
                 f"{np.sqrt(self.ambient_moved):.1e} if nothing is done; it is subtracted: darken the room"
             )
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
-        found.sums = sides[0].result(), sides[1].result()
-        found.extra = sum(sides[0].extras.values()), sum(sides[1].extras.values())
+        left, right = (replace(own.sums, vectors=own.vectors, misfit=float(own.misfits.sum())) for own in sides)
+        found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))
