@@ -341,7 +341,7 @@ def _check_session(session: Session, sums: tuple[StripeSums, StripeSums], taken:
     """Return the checked session; one that real frames would be refused for is flagged, because the frames are
     simulated as the bench asks for them, and the exact factors show what they cost."""
     try:
-        return check_session(sums, session.signs, taken, uniform_given=True)
+        return check_session(sums, session.signs, taken)
     except MitsimError as error:
         return CheckedSession(sums, doubts=[*session.mask_warnings[:1], str(error)])
 

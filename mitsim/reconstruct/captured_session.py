@@ -510,25 +510,19 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
         wrong=readings.wrong(),
     )
     found = check_session(sums, signs, taken)
-    if found.uniform is not None:
-        sums, variances = _sums(readings, signs.shape[1], job, found.uniform)
-        found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found
 
 
-def _sums(
-    readings: _Readings, count: int, job: Job, uniform: FloatArray | None = None
-) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Return sums over all responses, and the noise variance of each; ``uniform`` (rows, columns) is the uniform
-    response, None: the mean of both sides' first one."""
+def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
+    """Return sums over all responses, and the noise variance of each."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
     _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
     lights = [light for *_, light in first]
-    sums = stripe_sums(left, right, count, readings.session.listed.centre, uniform, lights)
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, lights=lights)
     variances = [variance for _, variance, _ in first]
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):

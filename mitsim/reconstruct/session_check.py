@@ -34,7 +34,6 @@ from mitsim.reconstruct.estimate_factors import (
     StripeSums,
     block_means,
     factors_of_sums,
-    without_plane,
 )
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.picture_check import robust_scatter
@@ -169,9 +168,6 @@ class CheckedSession:
         sentences on the lamp, and on errors that are not mended and count in the stated error.
     extra
         squared error of each side's vectors beyond their noise.
-    uniform
-        (rows, columns) uniform response that all patterns share, where that of the uniform frames is wrong: the session
-        must then be read again with this one, and nothing else is judged. None where it is right.
     """
 
     sums: tuple[StripeSums, StripeSums]
@@ -179,7 +175,6 @@ class CheckedSession:
     lamp: dict[str, float] | None = None
     doubts: list[str] = field(default_factory=list)
     extra: tuple[float, float] = (0.0, 0.0)
-    uniform: FloatArray | None = None
 
     def estimate(self, signs: FloatArray, noise: float | None) -> Estimate:
         """Return the factors.
@@ -199,9 +194,7 @@ class CheckedSession:
         return (*map(str, self.faults), *self.doubts)
 
 
-def check_session(
-    sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions, uniform_given: bool = False
-) -> CheckedSession:
+def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
     """Check a session, mend what can be mended with a check afterwards, and add what is left to the stated error.
 
     Parameters
@@ -212,16 +205,13 @@ def check_session(
         (n, N) H.
     taken
         how the session was taken.
-    uniform_given
-        whether the sums are judged even if the uniform frames are wrong, because they were made with the ``uniform``
-        response of an earlier check, or cannot be made again.
 
     Raises
     ------
     MitsimError
         for faults that cannot be mended, with the frames that do not fit, or "all frames".
     """
-    return _Check(sums, signs, taken).result(uniform_given)
+    return _Check(sums, signs, taken).result()
 
 
 # ---- Statistics ------------------------------------------------------------------------------------------------------
@@ -315,7 +305,7 @@ class _Check:
         names = [self.taken.name(half) for half in halves]
         self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
 
-    def result(self, uniform_given: bool) -> CheckedSession:
+    def result(self) -> CheckedSession:
         found = self.found
         if self.paired:
             bad = self._fit_sums()
@@ -327,13 +317,6 @@ class _Check:
                     f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
                     "that numbers are in proportion to light"
                 )
-            if bad[:, 0].all():
-                raise MitsimError("all frames: the uniform frames of both sides do not add up to what others do")
-            uniform = self._uniform()
-            away = np.linalg.norm(uniform - np.outer(*(own.uniform for own in self.sides))) / np.linalg.norm(uniform)
-            if not uniform_given and away > max(_MATTERS * self.noise, _SLIGHT / 4):
-                found.uniform = uniform
-                return found
             self._correct()
             for own in self.sides:
                 for index in np.flatnonzero(bad[own.axis]):
@@ -357,7 +340,7 @@ class _Check:
             self.times[numbers[half]] += place / 2 / len(numbers)
             if last and numbers[last] == numbers[half]:
                 before[numbers[half]] = last[2] / 2
-        sums = np.stack([own.pairs.blocks for own in self.sides])
+        sums = np.stack([own.pairs.blocks.astype(np.float64) for own in self.sides])
         lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
         bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
         if self.centre:
@@ -372,22 +355,19 @@ class _Check:
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
         shown = [block_means(own.sums.vectors) for own in self.sides]
         shown[0][:, 0] = shown[1][:, 0] = 0.0  # the uniform pattern has one lit frame
-        responses = np.stack(
-            [np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])]
-        ).astype(np.float32)
+        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
         # Least squares: all is projected on the shapes first, and the rest on the responses.
         usual = np.median(sums, axis=(0, 1)).ravel()
-        sums, responses = sums.reshape(2, self.count, -1) - usual, responses.reshape(2, self.count, -1)
+        sums, responses = (each.reshape(2, self.count, -1) for each in (sums, np.stack([left, right])))
         shapes = np.stack(fixed).reshape(len(fixed), -1)
-        inverse, shapes = np.linalg.pinv(shapes), shapes.astype(np.float32)
-        single = inverse.astype(np.float32)
-        sums -= np.median(sums - sums @ single @ shapes, axis=(0, 1))
-        values, parts = sums @ single, responses @ single
-        rest = sums - values @ shapes
-        responses -= parts @ shapes
-        sizes = np.maximum(np.square(responses).sum(axis=2, dtype=np.float64), 1 / _UNKNOWN)
+        inverse = np.linalg.pinv(shapes)
+        sums = sums - usual
+        sums -= np.median(sums - sums @ inverse @ shapes, axis=(0, 1))
+        values, parts = sums @ inverse, responses @ inverse
+        rest, responses = sums - values @ shapes, responses - parts @ shapes
+        sizes = np.maximum(np.square(responses).sum(axis=2), 1 / _UNKNOWN)
         self.ratios = (rest * responses).sum(axis=2) / sizes
-        rest -= self.ratios[..., None].astype(np.float32) * responses
+        rest -= self.ratios[..., None] * responses
         self.values = values - self.ratios[..., None] * parts
         area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
         squared = np.square(rest).mean(axis=2)
@@ -426,21 +406,6 @@ class _Check:
         self.good = ~bad
         return np.asarray(bad)
 
-    def _uniform(self) -> FloatArray:
-        """Return the uniform response whose vectors are those that the other patterns share, and whose size is that of
-        the uniform frames that fit."""
-        right, left = (
-            own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum()
-            for own, used in zip(self.sides, self.good, strict=True)
-        )
-        sizes = []
-        for own, vector, common in zip(self.sides, (left, right), (right, left), strict=True):
-            # D_0 = g vector common^T and ambient light, projected on the common vector of the sums.
-            parts = np.column_stack([vector, np.vander(np.linspace(-1, 1, len(vector)), 2)])
-            share = float(np.dot(common, own.sums.common)) / own.square
-            sizes.append(abs(float(np.linalg.lstsq(parts, own.sums.vectors[:, 0], rcond=None)[0][0])) / share)
-        return np.asarray(np.outer(left, right) * np.mean(np.array(sizes)[self.good[:, 0]]))
-
     # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
 
     def _correct(self) -> None:
@@ -463,9 +428,11 @@ class _Check:
         for found, effect, scale in zip(own.pairs.ambient.T, light.effects, light.variances, strict=True):
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
-            size = float(np.square(effect).sum())
-            own.add("ambient", float(left.sum()) * size)
-            self.ambient_moved += float(np.square(kept)[good].sum()) * size / own.size
+            size, changed = float(np.square(effect).sum()), np.square(kept)[good]
+            # Uniform frames hold as much of it as others; there it changes the vector that all responses share.
+            common = 2 * float(np.median(changed) / np.square(own.uniform).sum()) * own.size
+            own.add("ambient", (float(left.sum()) + common) * size)
+            self.ambient_moved += float(changed.sum()) * size / own.size
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -513,7 +480,7 @@ class _Check:
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
         if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
-            lamp = {
+            self.found.lamp = lamp = {
                 "drift": float(trend.flat[np.argmax(self.times)] - trend.flat[np.argmin(self.times)]),
                 "flicker": flicker,
                 "drift_cost": float(np.sqrt(drift_cost)),
@@ -521,12 +488,10 @@ class _Check:
                 "remaining": float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides))),
                 "corrected": True,
             }
-            self.found.lamp = lamp
             self.found.doubts.append(
-                f"lamp: its power drifts by {lamp['drift']:+.1%} over the session and flickers by {flicker:.2%} between "
-                f"frames, factor errors of {lamp['drift_cost']:.1e} and {lamp['flicker_cost']:.1e} if nothing is done; "
-                f"frames are divided by its power, and {lamp['remaining']:.1e} is left: let it warm up, use a steadier "
-                "one, or expose for whole periods"
+                f"lamp: its power drifts by {lamp['drift']:+.1%} over the session and flickers by {flicker:.2%} "
+                f"between frames, a factor error of {np.sqrt(drift_cost + flicker_cost):.1e} if nothing is done; "
+                f"frames are divided by its power, and {lamp['remaining']:.1e} is left: use a steadier lamp"
             )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
@@ -539,8 +504,7 @@ class _Check:
             reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}"
         own.misfits[index] = np.median(own.misfits)
         if index == 0:
-            own.vectors[:, 0] = own.uniform
-            self._mend(own, 0, None, "replaced", reason, "those of the other side replace them")
+            self._refuse(own, 0, reason)
             return
         right = np.flatnonzero(self.good[own.axis])
         times = self.times[own.axis]
@@ -550,21 +514,17 @@ class _Check:
         for wrong in known or (1, -1):
             own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
             shadow = MovingShadow(own.vectors, self.signs)
-            fits = shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE
-            if len(known) < 2 and fits and (known or shadow.predicts):
-                scores[wrong] = float(shadow.deviations[index])
-        if not scores:
+            if shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE:
+                scores[wrong] = float(shadow.deviations[index]) if shadow.predicts else 0.0
+        sign = min(scores, key=lambda wrong: scores[wrong], default=0)
+        if len(known) == 2 or not scores or (len(scores) == 2 and 2 * scores[sign] >= scores[-sign]):
             self._refuse(own, index, reason)
             return
-        sign = min(scores, key=lambda wrong: scores[wrong])
         own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-        error = 1.5 * own.noise
-        if len(scores) > 1 and scores[sign] > scores[-sign] / 2:  # the shadow does not decide between the frames
-            error += float(np.square(away).sum())
-        own.add("replaced", error)
-        repair, cost = "the other frame of its pair replaces it", float(np.sqrt(error / own.size))
-        self._mend(own, index, sign, "replaced", reason, repair, cost)
+        own.add("replaced", 1.5 * own.noise)
+        cost = float(np.sqrt(1.5 * own.noise / own.size))
+        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost)
 
     def _compare_sides(self) -> None:
         """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
