@@ -125,25 +125,19 @@ class PairLight:
     ambient
         (3,) light of the response that the mask does not cast, measured across the common vector: even, and tilted
         along the response's vector and along the common one, whose places are -1 to 1.
-    across
-        (k,) the response projected on its own vector less the parts that even and tilted light have in it: the common
-        vector times that one's squared length.
     """
 
     light: FloatArray
     blocks: npt.NDArray[np.float32]
     ambient: FloatArray
-    across: FloatArray
 
     @classmethod
     def together(cls, pairs: Sequence[PairLight]) -> PairLight:
-        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns), ambient (N, 3), across
-        (N, k)."""
+        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns), ambient (N, 3)."""
         return cls(
             np.stack([pair.light for pair in pairs], axis=1),
             np.stack([pair.blocks for pair in pairs]),
             np.stack([pair.ambient for pair in pairs]),
-            np.stack([pair.across for pair in pairs]),
         )
 
 
@@ -208,16 +202,15 @@ class StripeSums:
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
         return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_light(self, response: FloatArray, light: FloatArray, own: FloatArray) -> PairLight:
-        """Return the light of a pair with this ``response``, whose vector is its ``own``."""
+    def _pair_light(self, response: FloatArray, light: FloatArray) -> PairLight:
+        """Return the light of a pair with this ``response``."""
         blocks = block_means(block_means(light).T).T.astype(np.float32)
         if self.side != "horizontal":
             response, light = response.T, light.T
         vector = light @ (self.common / np.dot(self.common, self.common))
-        projected = without_plane(own) @ response
         if self.centre:  # both factors' means are zero, so that light of no mask is not in their vectors
-            return PairLight(vector - vector.mean(), blocks, np.zeros(3), projected - projected.mean())
-        return PairLight(vector, blocks, AmbientLight(self.common, len(vector)).measure(response), projected)
+            return PairLight(vector - vector.mean(), blocks, np.zeros(3))
+        return PairLight(vector, blocks, AmbientLight(self.common, len(vector)).measure(response))
 
     def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
@@ -233,7 +226,7 @@ class StripeSums:
             energy += sum_of_squares(block)
         if light is None:
             return ResponseFit(vector, misfit, energy)
-        return ResponseFit(vector, misfit, energy, self._pair_light(given, light, vector))
+        return ResponseFit(vector, misfit, energy, self._pair_light(given, light))
 
     def put(self, seen: ResponseFit) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -465,12 +458,6 @@ class AmbientLight:
     def energies(self, sizes: FloatArray) -> FloatArray:
         """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
-
-
-def without_plane(vectors: FloatArray) -> FloatArray:
-    """Return ``vectors`` (m,) or (m, N) less their parts along even and linearly tilted light."""
-    plane = np.linalg.qr(np.vander(np.linspace(-1, 1, len(vectors)), 2))[0]
-    return np.asarray(vectors - plane @ (plane.T @ vectors))
 
 
 def block_means(values: FloatArray) -> FloatArray:

@@ -46,8 +46,6 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
-_LIKELY = 2.0
-"""The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
@@ -236,7 +234,7 @@ def _shrunk(
     sure = pooled * (pooled > _SURE * deviation)
     prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / (prior + variances)
-    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
+    return weight * values, np.where(prior > 0, weight * variances, pooled), sure
 
 
 def _scatter(values: FloatArray, variances: FloatArray) -> bool:
@@ -273,11 +271,11 @@ class _Side:
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
-    def add_motion(self, moves: FloatArray, ends: FloatArray) -> None:
-        """Count ``moves`` (N,) [pixels] against either end of the session."""
+    def add_motion(self, moves: FloatArray, variances: FloatArray, ends: FloatArray) -> None:
+        """Count ``moves`` (N,) [pixels] of these ``variances`` against either end of the session."""
+        beyond = [np.average(np.square(moves - end) - variances, weights=1 / variances) for end in ends]
         # Differences of neighbours: those of every second pixel do not see the finest detail.
-        steep = np.square(np.diff(self.vectors, axis=0)).sum(axis=0)
-        self.add("motion", max(float(np.square(moves - end) @ steep) for end in ends))
+        self.add("motion", float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
 
 
 class _Check:
@@ -289,7 +287,7 @@ class _Check:
         self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
         self.found = CheckedSession(sums)
         self.refused: list[tuple[Half, str]] = []
-        self.lag = self.moved = self.ambient_moved = 0.0
+        self.lag = self.moved = 0.0
         self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -298,10 +296,9 @@ class _Check:
     def _refuse(self, own: _Side, index: int, reason: str) -> None:
         self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _mend(
-        self, own: _Side, index: int, sign: int | None, kind: str, detail: str, repair: str, cost: float = 0
-    ) -> None:
+    def _mend(self, own: _Side, index: int, sign: int | None, *words: str, cost: float = 0.0) -> None:
         halves = [half for half in self._halves(own, index) if sign in (None, half[2])]
+        kind, detail, repair = words
         names = [self.taken.name(half) for half in halves]
         self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
 
@@ -332,14 +329,12 @@ class _Check:
 
     def _fit_sums(self) -> npt.NDArray[np.bool_]:
         """Fit the sums of all pairs; return (2, N) whether pairs do not fit."""
-        numbers = {
-            half: (own.axis, k) for own in self.sides for k in range(self.count) for half in self._halves(own, k)
-        }
+        order = self.taken.order
         self.times, before = np.zeros((2, 2, self.count))
-        for place, (half, last) in enumerate(zip(self.taken.order, [None, *self.taken.order], strict=False)):
-            self.times[numbers[half]] += place / 2 / len(numbers)
-            if last and numbers[last] == numbers[half]:
-                before[numbers[half]] = last[2] / 2
+        for place, ((side, index, _), last) in enumerate(zip(order, [None, *order], strict=False)):
+            self.times[SIDES.index(side), index] += place / 2 / len(order)
+            if last and last[:2] == (side, index):
+                before[SIDES.index(side), index] = last[2]
         sums = np.stack([own.pairs.blocks.astype(np.float64) for own in self.sides])
         lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
         bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
@@ -370,17 +365,15 @@ class _Check:
         rest -= self.ratios[..., None] * responses
         self.values = values - self.ratios[..., None] * parts
         area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
-        squared = np.square(rest).mean(axis=2)
-        noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
+        noise = min(float(np.median(np.square(rest).mean(axis=2))), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-13 * float(np.square(usual).mean()))
         self.ratio_variances = noise * bright / sizes
         self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
         # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
-        best = (sizes > np.quantile(sizes, 0.75)) & (before != 0)
-        lags = (self.ratios / np.where(before, before, 1.0))[best] if best.any() else np.zeros(1)
+        lags = (2 * before * self.ratios)[sizes > np.quantile(sizes, 0.75)]
         self.lag = float(np.median(lags))
         self.lag *= abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
-        self.ratios -= self.lag * before
+        self.ratios -= self.lag * before / 2
         late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
         moves = self.values[..., 1:3].reshape(-1, 2)
         self.ends = np.stack([np.median(moves[part], axis=0) for part in (late[:few], late[-few:])])
@@ -390,19 +383,16 @@ class _Check:
         for own in self.sides:
             frames, common, rows = rest[own.axis].reshape(-1, *shape), along[1 - own.axis], shape[own.axis]
             vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
-            if self.centre:
-                vectors = vectors - vectors.mean(axis=1, keepdims=True)
             energies = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
             expected = noise / (common @ common) * len(own.vectors) * (1 - (len(fixed) + 1) / rows)
             expected = max(expected * (1 + np.pi / 4 / self.count), 1e-300)  # the usual sum is a median
             beyond, deviation = energies - expected, expected * np.sqrt(2 * self.count / rows)
             self.excess[own.axis], relative[own.axis] = beyond * (beyond.sum() > _SURE * deviation), energies / expected
         bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
-        for half in self.taken.wrong:
-            bad[numbers[half]] = True
-        for measure in (squared / noise, relative):
-            middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure))
+        for side, index, _ in self.taken.wrong:
+            bad[SIDES.index(side), index] = True
+        middle = max(float(np.median(relative)), 1.0)
+        bad |= relative > max(2 * middle, middle + _DEVIATIONS * robust_scatter(relative))
         self.good = ~bad
         return np.asarray(bad)
 
@@ -418,7 +408,7 @@ class _Check:
             own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
             moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
             if _scatter(moves[self.good], variances[self.good]):
-                own.add_motion(moves[own.axis] * good, self.ends[:, own.axis])
+                own.add_motion(moves[own.axis][good], variances[own.axis][good], self.ends[:, own.axis])
         if not self.taken.unsteady:
             self._divide()
 
@@ -432,7 +422,6 @@ class _Check:
             # Uniform frames hold as much of it as others; there it changes the vector that all responses share.
             common = 2 * float(np.median(changed) / np.square(own.uniform).sum()) * own.size
             own.add("ambient", (float(left.sum()) + common) * size)
-            self.ambient_moved += float(changed.sum()) * size / own.size
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -500,8 +489,7 @@ class _Check:
         """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = "the two do not add up to what others do"
-        if known:
-            reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}"
+        reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
         own.misfits[index] = np.median(own.misfits)
         if index == 0:
             self._refuse(own, 0, reason)
@@ -524,7 +512,7 @@ class _Check:
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
         own.add("replaced", 1.5 * own.noise)
         cost = float(np.sqrt(1.5 * own.noise / own.size))
-        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost)
+        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
 
     def _compare_sides(self) -> None:
         """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
@@ -590,10 +578,10 @@ class _Check:
             moves, variances = shadow.moves()
             if _scatter(moves[1:], variances[1:]):
                 few = max(2, self.count // 8)
-                own.add_motion(moves, np.array([np.median(moves[:few]), np.median(moves[-few:])]))
+                own.add_motion(moves[1:], variances[1:], np.array([np.median(moves[:few]), np.median(moves[-few:])]))
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
-            counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
+            counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
             own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
 
     # ---- the result --------------------------------------------------------------------------------------------------
@@ -610,7 +598,7 @@ class _Check:
             "dead": "a sensor row or column shows no light; check the sensor",
             "line": "a line of the stripes is not as bright as its neighbours predict; check the projector",
             "lamp": "the lamp's power changes too much; use a steadier one",
-            "ambient": "ambient light changes too much; darken the room",
+            "ambient": "ambient light changes between the frames of pairs; darken the room",
         }
         found, sides = self.found, self.sides
         energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for each in causes}
@@ -618,7 +606,7 @@ class _Check:
         doubts = [
             f"{causes[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
             for each in order
-            if each not in ("lamp", "ambient") and energies[each] > (_MATTERS * self.noise) ** 2
+            if each != "lamp" and energies[each] > (_MATTERS * self.noise) ** 2
         ]
         if total > LARGEST_ERROR or (self.refused and doubts):
             raise MitsimError(
@@ -631,11 +619,6 @@ class _Check:
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
             raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
         found.doubts += [f"session: {words}" for words in doubts]
-        if self.ambient_moved > (_MATTERS * self.noise) ** 2:
-            found.doubts.append(
-                "session: ambient light changes between the two frames of pairs, a factor error of "
-                f"{np.sqrt(self.ambient_moved):.1e} if nothing is done; it is subtracted: darken the room"
-            )
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
         left, right = (replace(own.sums, vectors=own.vectors, misfit=float(own.misfits.sum())) for own in sides)
         found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))
