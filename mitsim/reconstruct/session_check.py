@@ -365,7 +365,8 @@ class _Check:
         rest -= self.ratios[..., None] * responses
         self.values = values - self.ratios[..., None] * parts
         area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
-        noise = min(float(np.median(np.square(rest).mean(axis=2))), min(own.variance for own in self.sides) / area)
+        squared = np.square(rest).mean(axis=2)
+        noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-13 * float(np.square(usual).mean()))
         self.ratio_variances = noise * bright / sizes
         self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
@@ -391,8 +392,9 @@ class _Check:
         bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
         for side, index, _ in self.taken.wrong:
             bad[SIDES.index(side), index] = True
-        middle = max(float(np.median(relative)), 1.0)
-        bad |= relative > max(2 * middle, middle + _DEVIATIONS * robust_scatter(relative))
+        for measure in (squared / noise, relative):
+            middle = max(float(np.median(measure)), 1.0)
+            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure))
         self.good = ~bad
         return np.asarray(bad)
 
@@ -432,15 +434,12 @@ class _Check:
         unit = 1 / max(1 - float(np.mean(self.values[:, 0, 0])), 0.1)
         sure = usable & (np.square(self.ratios) > _SURE**2 * self.ratio_variances)
         powers = (1 + self.values[..., 0] * unit) / (1 - np.where(sure, np.square(self.ratios), 0.0))
-        kept, degree = usable, min(3, self.count // 2)
-        for _ in range(4):
-            trend = np.polynomial.Polynomial.fit(self.times[kept], powers[kept], degree)(self.times)
-            away = powers - trend
-            kept = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
+        variances, degree = self.variances[..., 0] * unit**2, min(3, self.count // 2)
+        away = np.abs(powers - np.median(powers[usable]))
+        usual = usable & (away <= _DEVIATIONS * robust_scatter(powers[usable]) + 1e-12)
+        trend = np.polynomial.Polynomial.fit(self.times[usual], powers[usual], degree)(self.times)
         powers, trend = powers / np.mean(trend), trend / np.mean(trend)
-        variances = self.variances[..., 0] * unit**2
-        if np.var(trend) <= _SURE**2 * np.median(variances) * (degree + 1) / usable.sum():
-            trend = np.ones_like(trend)
+        trend = 1 + _shrunk(trend - 1, variances * (degree + 1) / usual.sum(), usual)[0]
         own_power, left, shaken = _shrunk(powers - trend, variances, usable)
         # A single frame of other power changes both alike.
         ratios, left_ratio, uneven = _shrunk(self.ratios, self.ratio_variances, usable, np.square(own_power))
@@ -491,21 +490,17 @@ class _Check:
         reason = "the two do not add up to what others do"
         reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
         own.misfits[index] = np.median(own.misfits)
-        if index == 0:
-            self._refuse(own, 0, reason)
-            return
-        right = np.flatnonzero(self.good[own.axis])
-        times = self.times[own.axis]
-        near = right[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
+        distances = np.abs(self.times[own.axis] - self.times[own.axis, index])
+        near = np.argsort(np.where(self.good[own.axis], distances, np.inf))[:_NEAR]
         away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
-        scores = dict[int, float]()
+        misfits = dict[int, float]()
         for wrong in known or (1, -1):
             own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
             shadow = MovingShadow(own.vectors, self.signs)
-            if shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE:
-                scores[wrong] = float(shadow.deviations[index]) if shadow.predicts else 0.0
-        sign = min(scores, key=lambda wrong: scores[wrong], default=0)
-        if len(known) == 2 or not scores or (len(scores) == 2 and 2 * scores[sign] >= scores[-sign]):
+            misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
+        sign = min(misfits, key=lambda wrong: misfits[wrong])
+        decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
+        if index == 0 or len(known) == 2 or not decided or misfits[sign] > 1:
             self._refuse(own, index, reason)
             return
         own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
@@ -531,14 +526,9 @@ class _Check:
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
-        turned, foreign = set[int](), list[int]()
-
-        def turn(indices: Sequence[int]) -> None:
-            own.vectors[:, indices] *= -1
-            turned.symmetric_difference_update(indices)
-
-        if np.dot(own.vectors[:, 0], own.uniform) < 0:
-            turn([0])
+        foreign = list[int]()
+        turned = (np.arange(self.count) == 0) & (np.dot(own.vectors[:, 0], own.uniform) < 0)
+        own.vectors[:, turned] *= -1
         for _ in range(int(MOST_FAULTS * self.count) + 3):
             shadow = MovingShadow(own.vectors, self.signs, foreign)
             if not shadow.predicts:
@@ -549,7 +539,9 @@ class _Check:
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
             if gains[best] > max(_LEAST, _TURNED * far.max()):
-                turn([best] if best else range(1, self.count))  # the light decides on the sign of pattern 0
+                which = [best] if best else slice(1, None)  # the light decides on the sign of pattern 0
+                own.vectors[:, which] *= -1
+                turned[which] ^= True
             elif far.any():
                 foreign.append(int(np.argmax(far)))
             else:
@@ -558,13 +550,12 @@ class _Check:
             raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
         for index in foreign:
             self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
-        all_pairs = len(turned) == self.count
-        for index in [0] if all_pairs else sorted(turned):
-            if not shadow.predicts and not all_pairs:
+        for index in [0] if turned.all() else np.flatnonzero(turned):
+            if not shadow.predicts and not turned.all():
                 self._refuse(own, index, "they are in each other's place")
-            detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * all_pairs
+            detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
-            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
+            self._mend(own, int(index), sign, "exchanged", detail, "they count in their right order")
         light = np.square(own.vectors).sum(axis=1)
         around = np.pad(light, 1, constant_values=np.inf)
         around = np.minimum(around[:-2], around[2:])
