@@ -58,6 +58,9 @@ from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns n
 _FOREIGN = 0.5, 15.0
 """Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good ones have at most
 0.25 at 6, and swapped patterns about 1 at 23 and more."""
+_UNEXPLAINED = 0.05
+"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
+of its amplitude."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
@@ -70,6 +73,18 @@ _DARK, _LIT = (0.02, 0.3), 0.1
 the sign turned; and theirs over the median row's at least."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
+_UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
+"""Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
+_AMBIENT = "ambient light changes between the frames of pairs; darken the room"
+"""Reason of errors that are left when the change of ambient light is subtracted."""
+_LAMP = "the lamp's power changes; use a steadier one"
+"""Reason of errors that are left when responses are divided by the lamp's power."""
+_BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
+"""Reason of errors by an exponent or by clipping."""
+_POWER = "frames are of different power; use a steadier lamp, or pairs"
+"""Reason of errors by a lamp that no sums show."""
+_REPLACED = "a frame of a pair is wrong; take it again"
+"""Reason of the noise that is larger where one frame replaces a pair."""
 _UNKNOWN = 1e30
 """Variance of a number that nothing shows."""
 
@@ -275,7 +290,8 @@ class _Side:
         """Count ``moves`` (N,) [pixels] of these ``variances`` against either end of the session."""
         beyond = [np.average(np.square(moves - end) - variances, weights=1 / variances) for end in ends]
         # Differences of neighbours: those of every second pixel do not see the finest detail.
-        self.add("motion", float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
+        words = f"camera or mask move by {abs(ends[1] - ends[0]):.2g} pixels; fasten them"
+        self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
 
 
 class _Check:
@@ -311,9 +327,14 @@ class _Check:
                     return found
                 raise MitsimError(
                     f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
-                    f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
-                    "that numbers are in proportion to light"
+                    f"others do; check their order, that nothing moves ({self.moved:.1g} pixels), that no frame holds "
+                    f"light of the one before ({self.lag:.1%}), and that numbers are in proportion to light"
                 )
+            for own in self.sides:
+                if bad[own.axis, 0]:  # all others hang on it
+                    self._refuse(own, 0, "the two do not add up to what others do")
+            if self.refused:
+                self._judge()
             self._correct()
             for own in self.sides:
                 for index in np.flatnonzero(bad[own.axis]):
@@ -403,11 +424,12 @@ class _Check:
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
         for own, good in zip(self.sides, self.good, strict=True):
-            own.add("sums", float(self.excess[own.axis][good].sum()))
+            own.add(_UNKNOWN_LIGHT, float(self.excess[own.axis][good].sum()))
             if not self.centre:
                 self._subtract_ambient(own, good)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
-            own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
+            words = f"each frame holds {self.lag:.1%} of the one before; wait longer between frames"
+            own.add(words, self.lag**2 * (0.75**2 + 0.5**2) * own.size)
             moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
             if _scatter(moves[self.good], variances[self.good]):
                 own.add_motion(moves[own.axis][good], variances[own.axis][good], self.ends[:, own.axis])
@@ -421,9 +443,9 @@ class _Check:
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
-            # Uniform frames hold as much of it as others; there it changes the vector that all responses share.
-            common = 2 * float(np.median(changed) / np.square(own.uniform).sum()) * own.size
-            own.add("ambient", (float(left.sum()) + common) * size)
+            # In the uniform frames it changes the vector that all responses share.
+            common = 2 * max(np.median(changed), good[0] * kept[0] ** 2) / np.square(own.uniform).sum() * own.size
+            own.add(_AMBIENT, float(left.sum() + common) * size)
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -459,8 +481,8 @@ class _Check:
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
             lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
-            own.add("lamp", float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
-            own.add("bend", bent**2 / 2 * own.size)
+            own.add(_LAMP, float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
+            own.add(_BENT, bent**2 / 2 * own.size)
             parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
@@ -473,7 +495,7 @@ class _Check:
                 "flicker": flicker,
                 "drift_cost": float(np.sqrt(drift_cost)),
                 "flicker_cost": float(np.sqrt(flicker_cost)),
-                "remaining": float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides))),
+                "remaining": float(np.sqrt(sum(own.extras[_LAMP] / own.size for own in self.sides))),
                 "corrected": True,
             }
             self.found.doubts.append(
@@ -500,12 +522,12 @@ class _Check:
             misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
         sign = min(misfits, key=lambda wrong: misfits[wrong])
         decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
-        if index == 0 or len(known) == 2 or not decided or misfits[sign] > 1:
+        if len(known) == 2 or not decided or misfits[sign] > 1:
             self._refuse(own, index, reason)
             return
         own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-        own.add("replaced", 1.5 * own.noise)
+        own.add(_REPLACED, 1.5 * own.noise)
         cost = float(np.sqrt(1.5 * own.noise / own.size))
         self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
 
@@ -519,10 +541,10 @@ class _Check:
             found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
             moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
             if moved**2 > (_SURE * 2) ** 2 * noise:
-                own.add("motion", moved**2 * float(np.square(np.diff(own.vectors, axis=0)).sum()))
+                own.add_motion(np.full(1, moved), np.full(1, noise), np.array([0.0, moved]))
         apart = abs(abs(found[0][0]) - abs(found[1][0]))
         for own in self.sides:
-            own.add("power", (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
+            own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
@@ -556,15 +578,29 @@ class _Check:
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
             self._mend(own, int(index), sign, "exchanged", detail, "they count in their right order")
+        least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
+        odd = own.misfits - np.median(own.misfits) > np.maximum(least, _DEVIATIONS * robust_scatter(own.misfits))
+        if odd.sum() > max(2, MOST_FAULTS * self.count):
+            raise MitsimError(
+                f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
+                "ambient light, lamp and sensor, and take the session again"
+            )
+        for index in np.flatnonzero(odd):
+            self._refuse(own, int(index), f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         around = np.pad(light, 1, constant_values=np.inf)
         around = np.minimum(around[:-2], around[2:])
-        own.add("dead", around[(light < _DARK[self.centre] * around) & (around > _LIT * np.median(light))].sum())
-        if not shadow.predicts:
+        rows = np.flatnonzero((light < _DARK[self.centre] * around) & (around > _LIT * np.median(light)))
+        for row in rows[:1]:
+            word = "row" if own.axis == 0 else "column"
+            own.add(f"sensor {word} {row} shows no light; check the sensor", float(around[rows].sum()))
+        if foreign or len(rows) or not shadow.predicts:
             return
         # The lines at the ends are predicted from one side only.
-        line = float(shadow.lines[1:-1].max(initial=0.0))
-        own.add("line", line / len(shadow.lines) * own.size * (line > _LINE))
+        line = 1 + int(np.argmax(shadow.lines[1:-1]))
+        words = f"line {line} of the {own.side} stripes is not as bright as its neighbours predict; check the projector"
+        share = shadow.lines[line] / len(shadow.lines)
+        own.add(words, share * own.size * (shadow.lines[line] > _LINE))
         if not self.paired:
             moves, variances = shadow.moves()
             if _scatter(moves[1:], variances[1:]):
@@ -573,36 +609,27 @@ class _Check:
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
-            own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
+            own.add(_POWER, float(((squares - variances) * counted)[1:] @ shown[1:]))
 
     # ---- the result --------------------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
         """Report the errors that matter, the largest first; refuse the session for more than a tenth, and for frames
         that are wrong."""
-        causes = {
-            "power": "frames are of different power; use a steadier lamp, or pairs",
-            "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
-            "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
-            "motion": f"camera or mask move by {self.moved:.2g} pixels; fasten them",
-            "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
-            "dead": "a sensor row or column shows no light; check the sensor",
-            "line": "a line of the stripes is not as bright as its neighbours predict; check the projector",
-            "lamp": "the lamp's power changes too much; use a steadier one",
-            "ambient": "ambient light changes between the frames of pairs; darken the room",
-        }
         found, sides = self.found, self.sides
-        energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for each in causes}
-        order, total = sorted(causes, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
+        energies = {
+            each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for own in sides for each in own.extras
+        }
+        order, total = sorted(energies, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
         doubts = [
-            f"{causes[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
+            f"{each}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
             for each in order
-            if each != "lamp" and energies[each] > (_MATTERS * self.noise) ** 2
+            if each not in (_LAMP, _REPLACED) and energies[each] > (_MATTERS * self.noise) ** 2
         ]
         if total > LARGEST_ERROR or (self.refused and doubts):
             raise MitsimError(
-                f"all frames: {causes[order[0]]}: an error of {total:.0%} is left in the factors, allowed are "
-                f"{LARGEST_ERROR:.0%}; take the session again"
+                f"all frames: {order[0]}: an error of {total:.0%} or more is left in the factors; take the "
+                "session again"
             )
         if self.refused:
             reason = self.refused[0][1]
