@@ -226,7 +226,7 @@ def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
     sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
     sums.misfits, sums.energies = own["misfits"], own["energies"]
     if "light" in own:
-        parts = (own["light"].T, own["blocks"], own["ambient"], own["across"])
+        parts = (own["light"].T, own["blocks"], own["ambient"])
         sums.pairs = [PairLight(*pair) for pair in zip(*parts, strict=True)]
     return sums
 

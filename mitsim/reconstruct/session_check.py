@@ -572,12 +572,12 @@ class _Check:
             raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
         for index in foreign:
             self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
-        for index in [0] if turned.all() else np.flatnonzero(turned):
+        for index in [0] if turned.all() else np.flatnonzero(turned).tolist():
             if not shadow.predicts and not turned.all():
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
-            self._mend(own, int(index), sign, "exchanged", detail, "they count in their right order")
+            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
         least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
         odd = own.misfits - np.median(own.misfits) > np.maximum(least, _DEVIATIONS * robust_scatter(own.misfits))
         if odd.sum() > max(2, MOST_FAULTS * self.count):
@@ -585,8 +585,8 @@ class _Check:
                 f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
                 "ambient light, lamp and sensor, and take the session again"
             )
-        for index in np.flatnonzero(odd):
-            self._refuse(own, int(index), f"they show light that no {own.side} stripes cast")
+        for index in np.flatnonzero(odd).tolist():
+            self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         around = np.pad(light, 1, constant_values=np.inf)
         around = np.minimum(around[:-2], around[2:])

@@ -229,7 +229,7 @@ def test_swapped_patterns_and_stripes_of_the_other_side_are_refused_and_named() 
     with pytest.raises(MitsimError) as refusal:
         checked({**shown, **swapped})
     assert shown_frames(str(refusal.value)) == {("vertical", 9), ("vertical", 21)}
-    with pytest.raises(MitsimError, match="(light that no vertical stripes cast|other vertical stripes)") as refusal:
+    with pytest.raises(MitsimError, match=r"(light that no vertical stripes cast|other vertical stripes)") as refusal:
         checked({**shown, **{("vertical", 7, sign): shown["horizontal", 7, sign] for sign in (1, -1)}})
     assert shown_frames(str(refusal.value)) == {("vertical", 7)}
 
