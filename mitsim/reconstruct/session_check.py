@@ -273,9 +273,8 @@ class _Side:
         self.square = float(np.dot(sums.common, sums.common))
         if sums.pairs:
             self.pairs = PairLight.together(sums.pairs)
-            if not sums.centre:  # ambient light that changes within pairs is no noise
-                self.ambient = AmbientLight(sums.common, len(self.vectors))
-                self.misfits -= self.ambient.energies(self.pairs.ambient)
+        self.light = AmbientLight(sums.common, len(self.vectors))
+        self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
 
@@ -425,8 +424,7 @@ class _Check:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
         for own, good in zip(self.sides, self.good, strict=True):
             own.add(_UNKNOWN_LIGHT, float(self.excess[own.axis][good].sum()))
-            if not self.centre:
-                self._subtract_ambient(own, good)
+            self._subtract_ambient(own, good)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {self.lag:.1%} of the one before; wait longer between frames"
             own.add(words, self.lag**2 * (0.75**2 + 0.5**2) * own.size)
@@ -438,8 +436,8 @@ class _Check:
 
     def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        light = own.ambient
-        for found, effect, scale in zip(own.pairs.ambient.T, light.effects, light.variances, strict=True):
+        light = own.light
+        for found, effect, scale in zip(own.sums.ambient.T, light.effects, light.variances, strict=True):
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
@@ -537,6 +535,7 @@ class _Check:
             self.refused.append((half, reason))
         found = []
         for own in self.sides:
+            self._subtract_ambient(own, np.ones(self.count, dtype=bool))
             shapes = np.stack([own.uniform, np.gradient(own.uniform)])
             found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
             moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
