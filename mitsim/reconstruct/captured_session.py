@@ -236,7 +236,7 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
     if listed.parallax is None:
         yield "parallax: `reconstruct --focus` has no other depth than the board's"
     if not session.pairs:
-        yield "motion, ambient light: without pairs their change during the session is hardly seen; take pairs"
+        yield "motion, ambient light, proportion to light: without pairs their change is hardly seen; take pairs"
     if session.dark and session.pairs:
         yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
 

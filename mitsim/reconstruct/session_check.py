@@ -46,6 +46,8 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
+_LIKELY = 2.0
+"""The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
@@ -75,7 +77,7 @@ _NAMED = 12
 """Frames that a message names; the others are counted."""
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 """Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
-_AMBIENT = "ambient light changes between the frames of pairs; darken the room"
+_AMBIENT = "ambient light changes between frames; darken the room"
 """Reason of errors that are left when the change of ambient light is subtracted."""
 _LAMP = "the lamp's power changes; use a steadier one"
 """Reason of errors that are left when responses are divided by the lamp's power."""
@@ -249,7 +251,7 @@ def _shrunk(
     sure = pooled * (pooled > _SURE * deviation)
     prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / (prior + variances)
-    return weight * values, np.where(prior > 0, weight * variances, pooled), sure
+    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
 
 
 def _scatter(values: FloatArray, variances: FloatArray) -> bool:
@@ -393,7 +395,7 @@ class _Check:
         # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
         lags = (2 * before * self.ratios)[sizes > np.quantile(sizes, 0.75)]
         self.lag = float(np.median(lags))
-        self.lag *= abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
+        self.lag *= self.count >= 16 and abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
         self.ratios -= self.lag * before / 2
         late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
         moves = self.values[..., 1:3].reshape(-1, 2)
