@@ -111,7 +111,7 @@ class SessionConditions:
     name
         of a frame.
     saturated
-        whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
+        whether frames have saturated pixels, which make pairs add up to less; those sessions are flagged for it,
         and not refused.
     unsteady
         whether it is stated that the lamp is, so that its power is neither divided out nor reported.
@@ -323,9 +323,9 @@ class _Check:
         found = self.found
         if self.paired:
             bad = self._fit_sums()
+            if self.taken.saturated and bad.any():
+                return found
             if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
-                if self.taken.saturated:
-                    return found
                 raise MitsimError(
                     f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
                     f"others do; check their order, that nothing moves ({self.moved:.1g} pixels), that no frame holds "
@@ -416,7 +416,7 @@ class _Check:
             bad[SIDES.index(side), index] = True
         for measure in (squared / noise, relative):
             middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure))
+            bad |= measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / min(shape)))
         self.good = ~bad
         return np.asarray(bad)
 
