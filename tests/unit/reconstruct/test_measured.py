@@ -124,7 +124,8 @@ def test_saturated_frames_flag_the_result(tmp_path: Path) -> None:
     assert not factors.ok and factors.manifest.result["saturated_frames"] == 1
     assert "saturation: 1 of 16 frames" in factors.warnings[-1] and "f_0.png" in factors.warnings[-1]
     write_list(folder, digital={**DIGITAL, "saturation_dn": None})
-    assert calibrate_frames(folder).manifest.result["saturated_frames"] == 0
+    with pytest.raises(MitsimError, match=r"f_0\.png .*f_1\.png .*: the two do not add up"):  # no longer saturated
+        calibrate_frames(folder)
     full[3, 5] = 65535
     write_image(folder / "f_0.png", full)
     assert calibrate_frames(folder).manifest.result["saturated_frames"] == 1
