@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -46,7 +46,7 @@ from mitsim.optics.terms import Lacking, lacking
 from mitsim.reconstruct.colour import behind
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.factors import Factors, load_calibration
-from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session, frame_words
+from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
 """Kinds of responses that factors are estimated from."""
@@ -243,7 +243,7 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         lit.kept.finish(digital)
     lacks = _lacking(lit, clean)
     warnings = lit.light.warnings + session.warnings + (() if noisy.ok else (str(noisy.status),))
-    warnings += faults.warnings(frame_words)
+    warnings += faults.warnings
     if saturated:
         warnings += (
             f"saturation: {saturated} of {session.shots} frames have pixels at the full well or the ADC's end, "
@@ -257,8 +257,8 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
         "unexplained_residual": noisy.unexplained,
         "noise_free_residual": clean.separability_residual,
         "phi_error": _factor_error(noisy, clean),
-        "faults": faults.faults_for_manifest(frame_words),
-        "lamp": faults.lamp.for_manifest(),
+        "faults": [asdict(fault) for fault in faults.faults],
+        "lamp": faults.lamp,
         "shadow_residual": lacks and lacks.residual,
         "condition": noisy.condition,
         "exposure_s": lit.exposure_s,

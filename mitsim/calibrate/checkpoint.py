@@ -224,10 +224,9 @@ def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
     own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
     single = float(own["misfit"]), float(own["energy"]), int(own["done"])
     sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
-    sums.misfits, sums.energies = own["misfits"], own["energies"]
+    sums.misfits, sums.energies, sums.ambient = own["misfits"], own["energies"], own["ambient"]
     if "light" in own:
-        parts = (own["light"].T, own["blocks"], own["ambient"], own["across"])
-        sums.pairs = [PairLight(*pair) for pair in zip(*parts, strict=True)]
+        sums.pairs = [PairLight(*pair) for pair in zip(own["light"].T, own["blocks"], strict=True)]
     return sums
 
 

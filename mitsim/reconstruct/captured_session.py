@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -172,7 +172,7 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
     readings = _Readings(session)
     estimate, noise, found = _estimate(readings, job)
     warnings: tuple[str, ...] = doubts if estimate.ok else (*doubts, str(estimate.status))
-    warnings += (*found.warnings(session.frame_name), *readings.odd.values())
+    warnings += (*found.warnings, *readings.odd.values())
     if readings.saturated:
         warnings += (
             f"saturation: {len(readings.saturated)} of {len(session.files)} frames have pixels at the full well or the "
@@ -188,8 +188,8 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
         "phi_error": None,
         "predicted_phi_error": error,
         "response_noise": noise,
-        "faults": found.faults_for_manifest(session.frame_name),
-        "lamp": found.lamp.for_manifest(),
+        "faults": [asdict(fault) for fault in found.faults],
+        "lamp": found.lamp,
         "condition": estimate.condition,
         "exposure_s": listed.digital.exposure_s,
         "saturated_frames": len(readings.saturated),
@@ -235,6 +235,8 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
         yield "board_reflectance: 1 in an image is this board, whatever it reflects"
     if listed.parallax is None:
         yield "parallax: `reconstruct --focus` has no other depth than the board's"
+    if not session.pairs:
+        yield "motion, ambient light, proportion to light: without pairs their change is hardly seen; take pairs"
     if session.dark and session.pairs:
         yield "dark: the difference of a pair's halves has no dark signal, and dark frames are not used"
 
@@ -510,25 +512,19 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
         wrong=readings.wrong(),
     )
     found = check_session(sums, signs, taken)
-    if found.uniform is not None:
-        sums, variances = _sums(readings, signs.shape[1], job, found.uniform)
-        found = check_session(sums, signs, taken, uniform_given=True)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):
         return found.estimate(signs, noise), noise, found
 
 
-def _sums(
-    readings: _Readings, count: int, job: Job, uniform: FloatArray | None = None
-) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Return sums over all responses, and the noise variance of each; ``uniform`` (rows, columns) is the uniform
-    response, None: the mean of both sides' first one."""
+def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
+    """Return sums over all responses, and the noise variance of each."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
     _check_levels(readings.session, max((left, right), key=lambda response: float(response.mean())))
     lights = [light for *_, light in first]
-    sums = stripe_sums(left, right, count, readings.session.listed.centre, uniform, lights)
+    sums = stripe_sums(left, right, count, readings.session.listed.centre, lights=lights)
     variances = [variance for _, variance, _ in first]
     step = 4 * workers()
     for side, own in zip(SIDES, sums, strict=True):

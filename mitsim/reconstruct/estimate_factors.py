@@ -102,6 +102,9 @@ class ResponseFit:
         (m,) u_i, or w_i: least squares in Y_i = u_i common^T.
     misfit, energy
         ||Y_i - u_i common^T||^2 and ||Y_i||^2.
+    ambient
+        (3,) light that the mask does not cast, measured across the common vector: even, and tilted along the response's
+        vector and along the common one, whose places are -1 to 1. Zeros where responses are centred.
     pair
         of its two frames, where their sum is known.
     """
@@ -109,6 +112,7 @@ class ResponseFit:
     vector: FloatArray
     misfit: float
     energy: float
+    ambient: FloatArray
     pair: PairLight | None = None
 
 
@@ -122,28 +126,17 @@ class PairLight:
         (m,) their sum, projected as the response is.
     blocks
         (rows, columns) mean of their sum over blocks of pixels, single precision.
-    ambient
-        (3,) light of the response that the mask does not cast, measured across the common vector: even, and tilted
-        along the response's vector and along the common one, whose places are -1 to 1.
-    across
-        (k,) the response projected on its own vector less the parts that even and tilted light have in it: the common
-        vector times that one's squared length.
     """
 
     light: FloatArray
     blocks: npt.NDArray[np.float32]
-    ambient: FloatArray
-    across: FloatArray
 
     @classmethod
     def together(cls, pairs: Sequence[PairLight]) -> PairLight:
-        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns), ambient (N, 3), across
-        (N, k)."""
+        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns)."""
         return cls(
             np.stack([pair.light for pair in pairs], axis=1),
             np.stack([pair.blocks for pair in pairs]),
-            np.stack([pair.ambient for pair in pairs]),
-            np.stack([pair.across for pair in pairs]),
         )
 
 
@@ -165,8 +158,8 @@ class StripeSums:
         sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
     done
         responses that are in.
-    misfits, energies
-        (N,) what each response added.
+    misfits, energies, ambient
+        (N,), (N,) and (N, 3) of each response.
     pairs
         of the two frames of each; none where responses are not the differences of two, or their sums are not known.
     """
@@ -180,10 +173,12 @@ class StripeSums:
     done: int = 0
     misfits: FloatArray = field(init=False)
     energies: FloatArray = field(init=False)
+    ambient: FloatArray = field(init=False)
     pairs: list[PairLight] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.misfits, self.energies = np.zeros((2, self.vectors.shape[1]))
+        self.ambient = np.zeros((self.vectors.shape[1], 3))
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
@@ -208,16 +203,11 @@ class StripeSums:
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
         return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_light(self, response: FloatArray, light: FloatArray, own: FloatArray) -> PairLight:
-        """Return the light of a pair with this ``response``, whose vector is its ``own``."""
+    def _pair_light(self, light: FloatArray) -> PairLight:
+        """Return the ``light`` of a pair."""
         blocks = block_means(block_means(light).T).T.astype(np.float32)
-        if self.side != "horizontal":
-            response, light = response.T, light.T
-        vector = light @ (self.common / np.dot(self.common, self.common))
-        projected = without_plane(own) @ response
-        if self.centre:  # both factors' means are zero, so that light of no mask is not in their vectors
-            return PairLight(vector - vector.mean(), blocks, np.zeros(3), projected - projected.mean())
-        return PairLight(vector, blocks, AmbientLight(self.common, len(vector)).measure(response), projected)
+        vector = (light if self.side == "horizontal" else light.T) @ (self.common / np.dot(self.common, self.common))
+        return PairLight(vector - vector.mean() if self.centre else vector, blocks)
 
     def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
@@ -231,9 +221,10 @@ class StripeSums:
             explained = np.multiply.outer(rows[start : start + step], columns)
             misfit += sum_of_squares(np.subtract(block, explained, out=explained))
             energy += sum_of_squares(block)
-        if light is None:
-            return ResponseFit(vector, misfit, energy)
-        return ResponseFit(vector, misfit, energy, self._pair_light(given, light, vector))
+        # Both factors' means are zero if centred, so that light of no mask is not in their vectors.
+        shown = AmbientLight(self.common, len(vector)).measure(given if across else given.T)
+        pair = None if light is None else self._pair_light(light)
+        return ResponseFit(vector, misfit, energy, shown * (not self.centre), pair)
 
     def put(self, seen: ResponseFit) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -241,6 +232,7 @@ class StripeSums:
         self.misfit += seen.misfit
         self.energy += seen.energy
         self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
+        self.ambient[self.done] = seen.ambient
         if seen.pair is not None:
             self.pairs.append(seen.pair)
         self.done += 1
@@ -465,12 +457,6 @@ class AmbientLight:
     def energies(self, sizes: FloatArray) -> FloatArray:
         """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
-
-
-def without_plane(vectors: FloatArray) -> FloatArray:
-    """Return ``vectors`` (m,) or (m, N) less their parts along even and linearly tilted light."""
-    plane = np.linalg.qr(np.vander(np.linspace(-1, 1, len(vectors)), 2))[0]
-    return np.asarray(vectors - plane @ (plane.T @ vectors))
 
 
 def block_means(values: FloatArray) -> FloatArray:

@@ -20,19 +20,13 @@ from mitsim.core.arrays import FloatArray
 _MOVES = (0, -1), (1, -1), (-1, -1), (2, -1)
 """Turns and sign of the frequencies that pixels show as k in [0, pi]: itself, 2 pi - k, whose phase is mirrored,
 2 pi + k and 4 pi - k. Without them the finest stripes, of masks of two pixels a feature, seem to move the other way."""
-_FINE = 0.4
-"""Pixels a line from which the lines resolve no 4 pi - k, of 1.5 periods a pixel or more. Without it, good cameras of
-0.25 pixels a line had a deviation of 152 in their finest stripes; with it 18 at most. Of 32 lines it would leave too
-few to predict with."""
 _DEGREE = 3
-"""Of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and smooth."""
+"""Degree of the polynomial, where there are lines enough: falloff and obliquity of 120 mm at 400 mm are even and
+smooth."""
 _LINES = 8
-"""Scene lines for each of a polynomial's numbers, at least: three of them leave most lines to predict with."""
+"""Scene lines for each number of a polynomial, at least: three polynomials leave most lines to predict with."""
 _FREQUENCIES = 64
-"""Spatial frequencies that are looked at, of all that there are, evenly: more show the same, and cost time."""
-_TAPER = 0.15
-"""Part of the sensor that fades out at each end, where a moving shadow leaves and another comes in; chosen: 0.08 does
-as well, without it 2 of 600 planted exchanges were missed."""
+"""Spatial frequencies that are compared, evenly chosen: more show the same, and cost time."""
 _FARTHEST = 0.6
 """Part of the sensor that the shadow moves by at most, from the first scene line to the last: more leaves little that
 both show."""
@@ -45,7 +39,6 @@ _KNOWN = 0.1
 """Part of a column beyond the modes from which the others predict it: at the ends of few lines it is less."""
 _ROUNDING = 1e-12
 """Squared deviation, as a part of the vectors' mean square, that vectors without noise have."""
-
 _FITS = 3
 """Times that unknown patterns are fitted one after the other: they hardly depend on each other."""
 
@@ -70,11 +63,11 @@ class MovingShadow:
         (N,) mean squared deviation of a vector from the predicted one, in units of the median pattern's.
     unlike
         (N,) the same squared deviation as a part of the vector's own square.
-    shares
-        (N,) part s of its vector by which each pattern disagrees: 0 if it is right, 2 if its sign is wrong, 1 if it has
-        nothing in common with the predicted vector.
-    sure
-        (N,) the same in standard errors of it.
+    shares, sure
+        (N,) part of its vector by which each pattern disagrees, and the same in standard errors: 0 if it is right, 2 if
+        its sign is wrong, 1 if it has nothing in common with the predicted vector.
+    by_turning
+        (N,) decrease of all patterns' squared deviations if the sign of one is turned, in the same units.
     predicts
         whether patterns are predicted: few lines, whose shadows have little in common, predict nothing.
     lines
@@ -84,65 +77,67 @@ class MovingShadow:
 
     def __init__(self, vectors: FloatArray, signs: FloatArray, unknown: Sequence[int] = ()) -> None:
         n, count = signs.shape
-        taper = _taper(len(vectors))
-        spectra, angles = _spectra(vectors, taper)
-        columns = spectra @ signs.T / count
-        modes = _modes(angles, _step(columns, angles, len(vectors)), n)
+        signs = signs / np.sqrt(count)
+        spectra, self._angles = _spectra(vectors)
+        columns = spectra @ signs.T
+        modes = _modes(self._angles, _step(columns, self._angles, len(vectors)), n)
         turned = modes.conj().transpose(0, 2, 1)
-
-        def remainder(columns: ComplexArray) -> ComplexArray:
-            return np.asarray(columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0])
-
-        rest = remainder(columns)
-        left = rest @ signs / count
         # Squared length of each pattern's stripes beyond the modes.
         parts = np.concatenate([turned.real, turned.imag], axis=1)
-        shown = (parts.reshape(-1, n) @ (signs / count)).reshape(*parts.shape[:2], count)
-        own = np.maximum(n / count**2 - np.square(shown).sum(axis=1), 1e-9 * n / count**2)
-        for index in [*unknown] * _FITS:
+        shown = (parts.reshape(-1, n) @ signs).reshape(*parts.shape[:2], count)
+        own = np.maximum(n / count - np.square(shown).sum(axis=1), 1e-9)
+        left = np.zeros_like(spectra)
+        for index in [0, *[*unknown] * _FITS]:
             spectra[:, index] -= left[:, index] / own[:, index]
-            rest = remainder(spectra @ signs.T / count)
-            left = rest @ signs / count
+            columns = spectra @ signs.T
+            rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
+            left = rest @ signs
+        self._spectra, self._left, self._own = spectra, left, own
+        tiny = np.finfo(np.float64).tiny
         squares = np.square(np.abs(spectra))
         deviations = (np.square(np.abs(left)) / own).sum(axis=0)
-        rounding = _ROUNDING * float(squares.sum(axis=0).mean()) / count
-        self._unit = (float(np.median(deviations)) + rounding) or 1.0
+        self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.sum(axis=0).mean())) or 1.0
         self.deviations = deviations / self._unit
-        tiny = np.finfo(np.float64).tiny
         self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
-        self.predicts = (
-            len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
-        )
-        sizes = np.maximum((squares * own).sum(axis=0), tiny)
-        self.shares = np.real(spectra.conj() * left).sum(axis=0) / sizes
-        # The deviation at each frequency is complex: half of its noise is along the pattern's own spectrum.
-        self.sure = self.shares * np.sqrt(2 * sizes * len(own) / self._unit)
-        # Squared deviations that turning a pattern's sign removes from all patterns.
-        self.by_turning = 4 * (np.real(spectra.conj() * left) - squares * own).sum(axis=0) / self._unit
+        self.shares, variances = self.along(spectra)
+        self.sure = self.shares / np.sqrt(variances)
+        self.by_turning = 2 * (self.shares - 1) / (variances * len(own))
+        enough = len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0]
+        self.predicts = enough and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
-        seen = (kept * (np.square(np.abs(columns)).sum(axis=1) / n)[:, None]).sum(axis=0)
+        seen = (kept * np.square(np.abs(columns)).mean(axis=1, keepdims=True)).sum(axis=0)
         known = kept.mean(axis=0) > _KNOWN
         self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, tiny), 0.0)
-        self._spectra, self._left, self._own = spectra, left, own
+
+    def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Return (N,) the sizes of the ``shapes`` (frequencies, N) in the deviations, and their variances."""
+        size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
+        # The deviation at each frequency is complex: half of its noise is along the shape.
+        return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
 
     def powers(self) -> tuple[FloatArray, FloatArray]:
         """Return (N,) 1 - 1 / p and its variance, p being the power of each frame that is shown against the uniform
         one: its vector is p (u_i + u_0) - u_0."""
-        shown = self._spectra + self._spectra[:, :1]
-        size = np.maximum((np.square(np.abs(shown)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
-        return np.real(shown.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
+        return self.along(self._spectra + self._spectra[:, :1])
+
+    def moves(self) -> tuple[FloatArray, FloatArray]:
+        """Return (N,) the pixels that each pattern's shadow has moved by against the others, and their variances."""
+        return self.along(-1j * self._angles[:, None] * self._spectra)
 
 
 def shadow_step(factor: FloatArray) -> float:
     """Return the sensor pixels that the shadow in a ``factor`` (m, n) moves by from one column to the next."""
-    spectra, angles = _spectra(factor, _taper(len(factor)))
-    return _step(spectra, angles, len(factor))
+    return _step(*_spectra(factor), len(factor))
 
 
-def _spectra(columns: FloatArray, taper: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Return (frequencies, n) spectra of tapered ``columns`` (m, n), and the frequencies' angles a pixel."""
-    # A frame's mean light is no part of the shadow's shape, and centred frames have none.
-    spectra = np.fft.rfft(columns * taper[:, None], axis=0)[1:]
+def _spectra(columns: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Return (frequencies, n) spectra of ``columns`` (m, n), and the frequencies' angles a pixel.
+
+    Columns fade out at the ends, where a moving shadow leaves and another comes in, and have no mean light, which does
+    not move. Without both, the deviations of good cameras are up to 400 times those by noise; with both, up to 5 times.
+    """
+    taper = np.square(np.sin(np.pi * (np.arange(len(columns)) + 0.5) / len(columns)))
+    spectra = np.fft.rfft((columns - taper @ columns / taper.sum()) * taper[:, None], axis=0)[1:]
     stride = -(-len(spectra) // _FREQUENCIES)
     return spectra[::stride], 2 * np.pi * np.arange(1, len(spectra) + 1)[::stride] / len(columns)
 
@@ -151,17 +146,9 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
     """Return (frequencies, n, modes) orthonormal modes of the columns' spectra at frequencies of so many ``angles``."""
     degree = max(min(_DEGREE, n // _LINES - 1), 0)
     slow = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), degree)
-    fine = abs(step) < _FINE and n >= _LINES // 2 * len(_MOVES) * (degree + 1)
-    moves = _MOVES if fine else _MOVES[:-1]
+    moves = _MOVES[: max(1, 3 * n // _LINES // (degree + 1))]
     phases = [np.exp(1j * step * np.outer(2 * np.pi * turns + sign * angles, np.arange(n))) for turns, sign in moves]
     return np.asarray(np.linalg.qr(np.concatenate([phase[..., None] * slow for phase in phases], axis=2))[0])
-
-
-def _taper(pixels: int) -> FloatArray:
-    length = max(int(_TAPER * pixels), 1)
-    taper = np.ones(pixels)
-    taper[:length] = np.square(np.sin(np.pi / 2 * (np.arange(length) + 0.5) / length))
-    return taper * taper[::-1]
 
 
 def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:

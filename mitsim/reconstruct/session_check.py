@@ -17,9 +17,8 @@ if the moving shadow, estimated afterwards, agrees. Every other fault is refused
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,11 +34,10 @@ from mitsim.reconstruct.estimate_factors import (
     StripeSums,
     block_means,
     factors_of_sums,
-    without_plane,
 )
 from mitsim.reconstruct.moving_shadow import MovingShadow
+from mitsim.reconstruct.picture_check import robust_scatter
 
-Single = npt.NDArray[np.float32]
 MOST_FAULTS = 0.1
 """Part of the patterns that may be wrong before the session is refused: with more, the usual sum is in doubt."""
 _MATTERS = 0.5
@@ -56,116 +54,47 @@ _SLIGHT = 0.02
 """Change of a single frame's power that is not reported by itself: a lamp's flicker makes as much."""
 _NEAR = 5
 """Pairs next in time that give the sum which a wrong pair should have had."""
-_UNEXPLAINED = 0.05
-"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
-of its amplitude."""
-_NOISY = 4.0
-"""Robust scatter of misfits, over that by noise, up to which they are noise: of 60 good sides none has 1.5."""
 _WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.5, 15.0, 15.0
-"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too, in noisy
-sessions: good ones have 0.93 at 30 and a deviation of 10 (128 patterns), 0.1 at 18 and 17 (64 patterns); swapped
-patterns have about 1 at 17 and more, and a deviation of 20."""
-_KNOWN = 5.0, 25.0
-"""Squared deviation, as a part of its own square, of a pattern that the others determine: 4 if its sign is wrong, and
-thousands if they do not; and the deviation from which that does not matter."""
+_FOREIGN = 0.5, 15.0
+"""Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good ones have at most
+0.25 at 6, and swapped patterns about 1 at 23 and more."""
+_UNEXPLAINED = 0.05
+"""Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
+of its amplitude."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
 _LEAST = 3.0
 """The same in deviations of the median pattern."""
-_FEW_LINES, _LINE = 30, 0.15
-"""Lines beside those at the ends that predict each other, and the squared deviation of one from the prediction, over
-the mean square, from which it is wrong: good cameras of 24 lines reach 0.43."""
+_LINE = 0.15
+"""Squared deviation of a line of the stripes from what its neighbours predict, over the mean square, from which it
+counts: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
 """Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
 the sign turned; and theirs over the median row's at least."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
-
-
-# ---- Helper functions ------------------------------------------------------------------------------------------------
-
-
-def robust_scatter(values: FloatArray, middle: float = 0.0) -> float:
-    """Return the standard deviation of normal ``values`` about their ``middle`` by the median, which outliers do not
-    move."""
-    return 1.4826 * float(np.median(np.abs(values - middle)))
-
-
-def odd_responses(misfits: FloatArray, energies: FloatArray, numbers: int) -> npt.NDArray[np.intp]:
-    """Return the responses that no separable camera explains, where it explains the others.
-
-    Parameters
-    ----------
-    misfits, energies
-        (N,) of all responses of a side, with their noise: squares that no common shape explains, and all.
-    numbers
-        of a response.
-    """
-    middle = float(np.median(misfits))
-    scatter = robust_scatter(misfits, middle)
-    excess = misfits - middle - max(_UNEXPLAINED * float(np.median(energies)), _DEVIATIONS * scatter)
-    # Where no separable camera explains any, one that is no worse than others says nothing.
-    least = 4 * middle if scatter > _NOISY * middle * float(np.sqrt(2 / numbers)) else 0.0
-    return np.flatnonzero((excess > _UNEXPLAINED * energies) & (misfits >= least))
-
-
-def too_many(patterns: int, count: int) -> bool:
-    """Return True if so many wrong ``patterns`` leave a session of ``count`` a side in doubt."""
-    return patterns > max(2, MOST_FAULTS * 2 * count)
+_UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
+"""Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
+_AMBIENT = "ambient light changes between frames; darken the room"
+"""Reason of errors that are left when the change of ambient light is subtracted."""
+_LAMP = "the lamp's power changes; use a steadier one"
+"""Reason of errors that are left when responses are divided by the lamp's power."""
+_BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
+"""Reason of errors by an exponent or by clipping."""
+_POWER = "frames are of different power; use a steadier lamp, or pairs"
+"""Reason of errors by a lamp that no sums show."""
+_REPLACED = "a frame of a pair is wrong; take it again"
+"""Reason of the noise that is larger where one frame replaces a pair."""
+_UNKNOWN = 1e30
+"""Variance of a number that nothing shows."""
 
 
 def frame_words(half: Half) -> str:
     """Return which frame of a session a ``half`` is, in words."""
     side, index, sign = half
     return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
-
-
-def _shrunk(
-    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
-    variance that they share, 0 where it cannot be told from 0.
-
-    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
-    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
-    """
-    beyond, pooled, tiny = np.square(values) - variances, 0.0, np.finfo(np.float64).tiny
-    middle = max(float(np.median((beyond / variances)[good])), 0.0)
-    usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
-    for _ in range(4):
-        weights = np.where(usual, 1 / np.square(variances + pooled), 0.0)
-        total = max(float(weights.sum()), tiny)
-        pooled = max(float(np.dot(weights, beyond)) / total, 0.0)
-    deviation = float(np.sqrt(2 * np.dot(np.square(weights), np.square(variances)))) / total
-    pooled, sure = pooled * (pooled > _LIKELY * deviation), pooled > _SURE * deviation
-    prior = np.maximum(np.maximum(least, pooled if sure else 0.0), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
-    weight = prior / np.maximum(prior + variances, tiny)
-    return weight * values, np.where(prior > 0, weight * variances, pooled), pooled if sure else 0.0
-
-
-def _pooled_mean(values: FloatArray, variances: FloatArray) -> float:
-    """Return the mean of all pairs' ``values``, 0 where it cannot be told from 0."""
-    usable = variances > 0
-    middle = float(np.median(values[usable]))
-    usable &= np.abs(values - middle) <= _DEVIATIONS * max(robust_scatter(values[usable], middle), 1e-300)
-    weights = 1 / variances[usable]
-    mean = float(np.average(values[usable], weights=weights))
-    scatter = float(np.average(np.square(values[usable] - mean), weights=weights))
-    return mean if abs(mean) > _SURE * np.sqrt(scatter / usable.sum()) else 0.0
-
-
-def _least_squares(shapes: Single, values: Single) -> tuple[FloatArray, FloatArray, Single]:
-    """Return the coefficients of ``shapes`` (f, P) in ``values`` (P,), their variances for noise of variance 1 (0 for a
-    shape that is zero), and the residual."""
-    products = (shapes @ shapes.T).astype(np.float64)
-    sizes = np.sqrt(np.diag(products))
-    scale = np.where(sizes > 0, sizes, np.inf)
-    inverse = np.linalg.pinv(products / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
-    found = inverse @ (shapes @ values)
-    return found, np.diag(inverse), values - found.astype(np.float32) @ shapes
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -182,7 +111,7 @@ class SessionConditions:
     name
         of a frame.
     saturated
-        whether frames have saturated pixels, which make many pairs add up to less; those sessions are flagged for it,
+        whether frames have saturated pixels, which make pairs add up to less; those sessions are flagged for it,
         and not refused.
     unsteady
         whether it is stated that the lamp is, so that its power is neither divided out nor reported.
@@ -199,10 +128,12 @@ class SessionConditions:
 
 @dataclass(frozen=True)
 class SessionFault:
-    """One pattern, or one of its frames, that was wrong and is mended.
+    """One pattern, or one of its frames, that was wrong and is mended; a manifest has it with these keys.
 
     Attributes
     ----------
+    frames
+        names of its frames.
     side, index
         of the pattern.
     sign
@@ -213,78 +144,25 @@ class SessionFault:
         the same in words, after the frame's name.
     repair
         what is done about it, in words.
-    other
-        always None; older manifests have a frame here.
     cost
         relative error of its factor that this leaves beyond the noise.
+    other
+        always None; older manifests have a frame here.
     """
 
+    frames: list[str]
     side: Side
     index: int
     sign: int | None
     kind: str
     detail: str
     repair: str
-    other: Half | None = None
     cost: float = 0.0
+    other: None = None
 
-    def _names(self, name: Callable[[Half], str]) -> list[str]:
-        return [name((self.side, self.index, sign)) for sign in ((1, -1) if self.sign is None else (self.sign,))]
-
-    def words(self, name: Callable[[Half], str]) -> str:
-        """Return a sentence; ``name`` gives the name of a frame."""
+    def __str__(self) -> str:
         cost = f", at a factor error of {self.cost:.1e}" if self.cost else ""
-        return f"frames: {' and '.join(self._names(name))}: {self.detail}; {self.repair}{cost}"
-
-    def for_manifest(self, name: Callable[[Half], str]) -> dict[str, Any]:
-        """Return the fault for a manifest; ``name`` gives the name of a frame."""
-        return {"frames": self._names(name), **asdict(self)}
-
-
-@dataclass(frozen=True)
-class Lamp:
-    """Power of the projector over the session.
-
-    Attributes
-    ----------
-    drift
-        change from the session's begin to its end, as a part of its mean.
-    flicker
-        from frame to frame, rms, as a part of it.
-    drift_cost, flicker_cost
-        relative error of both factors that each would leave, or leaves, in them.
-    remaining
-        the error that is left after correction.
-    corrected
-        whether factors are corrected for it.
-    """
-
-    drift: float = 0.0
-    flicker: float = 0.0
-    drift_cost: float = 0.0
-    flicker_cost: float = 0.0
-    remaining: float = 0.0
-    corrected: bool = False
-
-    def for_manifest(self) -> dict[str, float] | None:
-        """Return the lamp for a manifest; None if it is steady."""
-        return asdict(self) if self.drift or self.flicker else None
-
-    def warnings(self) -> Iterator[str]:
-        """Yield a sentence on drift and on flicker, where there is any."""
-        drift, flicker = (
-            f"drifts by {self.drift:+.1%} over the session",
-            f"flickers by {self.flicker:.2%} between frames",
-        )
-        for size, words, cost, remedy in (
-            (self.drift, drift, self.drift_cost, "let it warm up"),
-            (self.flicker, flicker, self.flicker_cost, "use a steadier one, or expose for whole periods"),
-        ):
-            if size:
-                yield (
-                    f"lamp: its power {words}, a factor error of {cost:.1e} if nothing is done; frames are divided by "
-                    f"its power, and {self.remaining:.1e} is left: {remedy}"
-                )
+        return f"frames: {' and '.join(self.frames)}: {self.detail}; {self.repair}{cost}"
 
 
 @dataclass
@@ -298,22 +176,20 @@ class CheckedSession:
     faults
         in the order of the sides and patterns.
     lamp
-        how steady it is.
+        None if the projector is steady. ``drift`` from the session's begin to its end, ``flicker`` from frame to frame,
+        rms, both as a part of its power; ``drift_cost``, ``flicker_cost``: relative error of both factors of each
+        without correction; ``remaining``: with it; ``corrected``.
     doubts
-        sentences on errors that are not mended and count in the stated error.
+        sentences on the lamp, and on errors that are not mended and count in the stated error.
     extra
         squared error of each side's vectors beyond their noise.
-    uniform
-        (rows, columns) uniform response that all patterns share, where that of the uniform frames is wrong: the session
-        must then be read again with this one. None where it is right.
     """
 
     sums: tuple[StripeSums, StripeSums]
     faults: list[SessionFault] = field(default_factory=list)
-    lamp: Lamp = field(default_factory=Lamp)
+    lamp: dict[str, float] | None = None
     doubts: list[str] = field(default_factory=list)
     extra: tuple[float, float] = (0.0, 0.0)
-    uniform: FloatArray | None = None
 
     def estimate(self, signs: FloatArray, noise: float | None) -> Estimate:
         """Return the factors.
@@ -327,18 +203,13 @@ class CheckedSession:
         """
         return factors_of_sums(*self.sums, signs, noise, self.extra)
 
-    def warnings(self, name: Callable[[Half], str]) -> tuple[str, ...]:
-        """Return a sentence for each fault and doubt; ``name`` gives the name of a frame."""
-        return (*(fault.words(name) for fault in self.faults), *self.lamp.warnings(), *self.doubts)
-
-    def faults_for_manifest(self, name: Callable[[Half], str]) -> list[dict[str, Any]]:
-        """Return the faults for a manifest; ``name`` gives the name of a frame."""
-        return [fault.for_manifest(name) for fault in self.faults]
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence for each fault and doubt."""
+        return (*map(str, self.faults), *self.doubts)
 
 
-def check_session(
-    sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions, uniform_given: bool = False
-) -> CheckedSession:
+def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> CheckedSession:
     """Check a session, mend what can be mended with a check afterwards, and add what is left to the stated error.
 
     Parameters
@@ -349,16 +220,44 @@ def check_session(
         (n, N) H.
     taken
         how the session was taken.
-    uniform_given
-        whether the sums were made with the ``uniform`` response of an earlier check. If not, and the uniform frames of
-        one side are wrong, nothing else is judged.
 
     Raises
     ------
     MitsimError
         for faults that cannot be mended, with the frames that do not fit, or "all frames".
     """
-    return _Check(sums, signs, taken).result(uniform_given)
+    return _Check(sums, signs, taken).result()
+
+
+# ---- Statistics ------------------------------------------------------------------------------------------------------
+
+
+def _shrunk(
+    values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
+    variance that they share, 0 where it cannot be told from 0.
+
+    The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
+    no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
+    """
+    beyond, pooled = np.square(values) - variances, 0.0
+    middle = max(float(np.median((beyond / variances)[good])), 0.0)
+    usual = good & (beyond < _DEVIATIONS**2 * (1 + middle) * variances)
+    for _ in range(4):
+        weights = usual / np.square(variances + pooled)
+        pooled = max(float(np.average(beyond, weights=weights)), 0.0)
+    deviation = float(np.sqrt(2 * np.square(weights * variances).sum()) / weights.sum())
+    sure = pooled * (pooled > _SURE * deviation)
+    prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
+    weight = prior / (prior + variances)
+    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
+
+
+def _scatter(values: FloatArray, variances: FloatArray) -> bool:
+    """Return True if ``values`` differ by more than their ``variances``."""
+    away = np.square(values - np.median(values)) / variances
+    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / away.size))
 
 
 # ---- The check -------------------------------------------------------------------------------------------------------
@@ -376,424 +275,369 @@ class _Side:
         self.square = float(np.dot(sums.common, sums.common))
         if sums.pairs:
             self.pairs = PairLight.together(sums.pairs)
-            if not sums.centre:  # ambient light that changes within pairs is no noise
-                self.ambient = AmbientLight(sums.common, len(self.vectors))
-                self.misfits -= self.ambient.energies(self.pairs.ambient)
+        self.light = AmbientLight(sums.common, len(self.vectors))
+        self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
         self.noise = self.variance * len(self.vectors) / self.square
-        light = np.square(self.vectors).sum(axis=1)
-        around = np.pad(light, 1, constant_values=np.inf)
-        around = np.minimum(around[:-2], around[2:])
-        self.dead = np.flatnonzero((light < _DARK[sums.centre] * around) & (around > _LIT * np.median(light)))
-        self.lost = float(around[self.dead].sum())
 
     @property
     def size(self) -> float:
         return max(float(np.square(self.vectors).sum()), 1e-300)
 
-    def shadow(self, signs: FloatArray, unknown: Sequence[int] = ()) -> MovingShadow:
-        vectors = self.vectors.copy()
-        last = len(vectors) - 1
-        vectors[self.dead] = (vectors[(self.dead - 1).clip(0)] + vectors[(self.dead + 1).clip(max=last)]) / 2
-        return MovingShadow(vectors, signs, unknown)
-
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
-    def result(self) -> StripeSums:
-        if np.array_equal(self.vectors, self.sums.vectors):
-            return self.sums
-        return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))
+    def add_motion(self, moves: FloatArray, variances: FloatArray, ends: FloatArray) -> None:
+        """Count ``moves`` (N,) [pixels] of these ``variances`` against either end of the session."""
+        beyond = [np.average(np.square(moves - end) - variances, weights=1 / variances) for end in ends]
+        # Differences of neighbours: those of every second pixel do not see the finest detail.
+        words = f"camera or mask move by {abs(ends[1] - ends[0]):.2g} pixels; fasten them"
+        self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
 
 
 class _Check:
-    """A session while it is checked. Pairs of both sides are numbered one after the other."""
+    """A session while it is checked. Numbers of pairs are arrays (2, N) of both sides."""
 
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
-        self.sums, self.signs, self.taken, self.count = sums, signs, taken, signs.shape[1]
+        self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
         self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
-        self.faults: list[SessionFault] = []
-        self.doubts = {"power": "frames are of different power; use a steadier lamp, or pairs"}
-        self.lamp, self.ambient_moved = Lamp(), 0.0
+        self.found = CheckedSession(sums)
+        self.refused: list[tuple[Half, str]] = []
+        self.lag = self.moved = 0.0
+        self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
         return [(own.side, index, sign) for sign in ((1, -1) if self.paired else (1,))]
 
-    def _of(self, own: _Side, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return those of the ``values`` (2 N, ...) that belong to a side."""
-        return values[own.axis * self.count : (own.axis + 1) * self.count]
+    def _refuse(self, own: _Side, index: int, reason: str) -> None:
+        self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _noise(self) -> float:
-        return float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
+    def _mend(self, own: _Side, index: int, sign: int | None, *words: str, cost: float = 0.0) -> None:
+        halves = [half for half in self._halves(own, index) if sign in (None, half[2])]
+        kind, detail, repair = words
+        names = [self.taken.name(half) for half in halves]
+        self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
 
-    def _refuse(self, wrong: Sequence[tuple[_Side, int]], reason: str) -> NoReturn:
-        """Raise MitsimError that names the frames of ``wrong`` patterns."""
-        names = [self.taken.name(half) for own, index in wrong for half in self._halves(own, index)]
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
-
-    def result(self, uniform_given: bool) -> CheckedSession:
-        uniform = None
+    def result(self) -> CheckedSession:
+        found = self.found
         if self.paired:
             bad = self._fit_sums()
-            if self.taken.saturated and too_many(int(bad.sum()), self.count):
-                return CheckedSession(self.sums)
-            wrong = [(own, int(index)) for own in self.sides for index in np.flatnonzero(self._of(own, bad))]
-            if too_many(len(wrong), self.count):
+            if self.taken.saturated and bad.any():
+                return found
+            if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
                 raise MitsimError(
-                    f"all frames: the two frames of {len(wrong)} of {2 * self.count} patterns do not add up to what "
-                    f"others do; check their order, that nothing moves (by {self.moved:.1g} pixels, as it seems), and "
-                    "that numbers are in proportion to light"
+                    f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
+                    f"others do; check their order, that nothing moves ({self.moved:.1g} pixels), that no frame holds "
+                    f"light of the one before ({self.lag:.1%}), and that numbers are in proportion to light"
                 )
-            uniforms = [(own, 0) for own, index in wrong if index == 0]
-            if len(uniforms) == 2:
-                self._refuse(uniforms, "the uniform frames of both sides do not add up to what others do")
-            if uniforms and not uniform_given:
-                doubt = f"frames: the uniform frames of {uniforms[0][0].side} stripes are wrong; take them again"
-                return CheckedSession(self.sums, doubts=[doubt], uniform=self._uniform())
+            for own in self.sides:
+                if bad[own.axis, 0]:  # all others hang on it
+                    self._refuse(own, 0, "the two do not add up to what others do")
+            if self.refused:
+                self._judge()
             self._correct()
-            powers, deviations = self.values[[0, self.count], 1], np.sqrt(self.variances[[0, self.count], 1])
-            # Ambient light or power that differ in the uniform frames are in the vectors that all responses share.
-            if not uniform_given and (
-                abs(powers[0] - powers[1]) > max(_SLIGHT, _DEVIATIONS * deviations.max())
-                or self.ambient_moved > (_MATTERS * self._noise()) ** 2
-            ):
-                uniform = self._uniform()
-            self._report()
-            for own, index in wrong:
-                self._use_one_frame(own, index)
-        elif self.taken.wrong:
-            known = sorted({(SIDES.index(side), index) for side, index, _ in self.taken.wrong})
-            self._refuse([(self.sides[axis], index) for axis, index in known], next(iter(self.taken.wrong.values())))
-        parts = [
-            abs(float(np.dot(own.vectors[:, 0], own.uniform) / np.dot(own.uniform, own.uniform))) for own in self.sides
-        ]
-        apart = abs(parts[0] - parts[1])  # both sides' uniform responses are one
+            for own in self.sides:
+                for index in np.flatnonzero(bad[own.axis]):
+                    self._use_one_frame(own, int(index))
+        else:
+            self._compare_sides()
         for own in self.sides:
-            if not self.paired and apart > _SLIGHT:
-                own.add("power", (apart / 2) ** 2 * own.size)
-            if len(own.dead):
-                own.add("dead", own.lost)
-                word = "row" if own.axis == 0 else "column"
-                self.doubts["dead"] = f"sensor {word} {own.dead[0]} shows no light; check the sensor"
             self._check_shadow(own)
-        return self._judge(uniform)
+        self._judge()
+        return found
 
     # ---- sums of pairs -----------------------------------------------------------------------------------------------
 
     def _fit_sums(self) -> npt.NDArray[np.bool_]:
-        """Fit the sums of all pairs; return (2 N,) whether pairs do not fit."""
-        places = {half: place for place, half in enumerate(self.taken.order)}
-        halves = [self._halves(own, index) for own in self.sides for index in range(self.count)]
-        self.times = np.array([np.mean([places[half] for half in each]) for each in halves]) / len(places)
-        sums = np.concatenate([own.pairs.blocks for own in self.sides])
-        lit = sums.mean(axis=0)  # noise of light is larger where there is more
+        """Fit the sums of all pairs; return (2, N) whether pairs do not fit."""
+        order = self.taken.order
+        self.times, before = np.zeros((2, 2, self.count))
+        for place, ((side, index, _), last) in enumerate(zip(order, [None, *order], strict=False)):
+            self.times[SIDES.index(side), index] += place / 2 / len(order)
+            if last and last[:2] == (side, index):
+                before[SIDES.index(side), index] = last[2]
+        sums = np.stack([own.pairs.blocks.astype(np.float64) for own in self.sides])
+        lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
         bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
         if self.centre:
+            sums -= sums.mean(axis=3, keepdims=True)
             sums -= sums.mean(axis=2, keepdims=True)
-            sums -= sums.mean(axis=1, keepdims=True)
-        self.shape, sums = sums.shape[1:], sums.reshape(len(sums), -1)
-        self.along = [block_means(own.uniform) for own in self.sides]
-        self.squares = [max(float(np.square(each).sum()), 1e-300) for each in self.along[::-1]]
+        shape = sums.shape[2:]
+        along = [block_means(own.uniform) for own in self.sides]
         moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
-        fixed = [np.outer(*self.along), np.outer(moved[0], self.along[1]), np.outer(self.along[0], moved[1])]
+        fixed = [np.outer(*along), np.outer(moved[0], along[1]), np.outer(along[0], moved[1])]
         if not self.centre:
-            (y, x), (one, same) = ([make(k) for k in self.shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
+            (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
         shown = [block_means(own.sums.vectors) for own in self.sides]
-        left, right = np.einsum("ik,j->kij", shown[0], self.along[1]), np.einsum("i,jk->kij", self.along[0], shown[1])
-        responses = np.concatenate([left, right]).reshape(len(sums), -1).astype(np.float32)
-        first = np.arange(2) * self.count
-        lagged, self.own_before = np.zeros_like(sums), np.zeros(len(sums))
-        numbers = {half: number for number, each in enumerate(halves) for half in each}
-        for last, half in zip(self.taken.order, self.taken.order[1:], strict=False):
-            if numbers[last] == numbers[half]:
-                self.own_before[numbers[half]] += last[2] / 2
-            elif last[1]:  # the uniform pattern's light looks like the lamp's power
-                lagged[numbers[half]] += np.float32(last[2] / 2) * responses[numbers[last]]
-        responses[first] = 0.0  # the uniform pattern has one lit frame
-        usual, shapes = np.median(sums, axis=0), np.stack(fixed).reshape(len(fixed), -1).astype(np.float32)
-        found = [
-            _least_squares(np.vstack([responses[k], shapes, lagged[k]]), one - usual) for k, one in enumerate(sums)
-        ]
-        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
-        self.lag = _pooled_mean(self.values[:, -1], variances[:, -1])
-        sums -= usual + np.median(rest, axis=0) + np.float32(self.lag) * lagged
-        found = [_least_squares(np.vstack([responses[k], shapes]), one) for k, one in enumerate(sums)]
-        self.values, variances, rest = (np.stack(part) for part in zip(*found, strict=True))
-        order, few = np.argsort(self.times), max(4, len(sums) // 16)
-        self.ends = np.stack([np.median(self.values[part, 2:4], axis=0) for part in (order[:few], order[-few:])])
-        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
-        squared = np.square(rest).mean(axis=1)
-        area = np.prod([len(own.vectors) for own in self.sides]) / rest.shape[1]
+        shown[0][:, 0] = shown[1][:, 0] = 0.0  # the uniform pattern has one lit frame
+        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
+        # Least squares: all is projected on the shapes first, and the rest on the responses.
+        usual = np.median(sums, axis=(0, 1)).ravel()
+        sums, responses = (each.reshape(2, self.count, -1) for each in (sums, np.stack([left, right])))
+        shapes = np.stack(fixed).reshape(len(fixed), -1)
+        inverse = np.linalg.pinv(shapes)
+        sums = sums - usual
+        sums -= np.median(sums - sums @ inverse @ shapes, axis=(0, 1))
+        values, parts = sums @ inverse, responses @ inverse
+        rest, responses = sums - values @ shapes, responses - parts @ shapes
+        sizes = np.maximum(np.square(responses).sum(axis=2), 1 / _UNKNOWN)
+        self.ratios = (rest * responses).sum(axis=2) / sizes
+        rest -= self.ratios[..., None] * responses
+        self.values = values - self.ratios[..., None] * parts
+        area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
+        squared = np.square(rest).mean(axis=2)
         noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
         noise = max(noise, 1e-13 * float(np.square(usual).mean()))
-        self.variances, spent = variances * noise * bright, variances.shape[1]
+        self.ratio_variances = noise * bright / sizes
+        self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
+        # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
+        lags = (2 * before * self.ratios)[sizes > np.quantile(sizes, 0.75)]
+        self.lag = float(np.median(lags))
+        self.lag *= self.count >= 16 and abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
+        self.ratios -= self.lag * before / 2
+        late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
+        moves = self.values[..., 1:3].reshape(-1, 2)
+        self.ends = np.stack([np.median(moves[part], axis=0) for part in (late[:few], late[-few:])])
+        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        excess, alone = [], []
+        self.excess, relative = np.zeros((2, 2, self.count))
         for own in self.sides:
-            expected = noise / self.squares[own.axis] * len(own.vectors) * (1 - spent / self.shape[own.axis])
-            expected *= 1 + np.pi / 2 / len(sums)  # the usual sum is a median
-            deviation = expected * np.sqrt(2 * self.count / self.shape[own.axis])
-            energy = self._energy_along(own, rest)
-            excess.append((energy - expected) * ((energy - expected).sum() > _SURE * deviation))
-            alone.append(energy / max(expected, 1e-300))
-        self.excess = np.concatenate(excess)
-        bad = np.abs(self.values[:, 0]) > _ALONE  # one frame is black, so that power cannot be divided out
-        bad[[numbers[half] for half in self.taken.wrong]] = True
-        for measure in (squared / noise, np.concatenate(alone)):
+            frames, common, rows = rest[own.axis].reshape(-1, *shape), along[1 - own.axis], shape[own.axis]
+            vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
+            energies = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
+            expected = noise / (common @ common) * len(own.vectors) * (1 - (len(fixed) + 1) / rows)
+            expected = max(expected * (1 + np.pi / 4 / self.count), 1e-300)  # the usual sum is a median
+            beyond, deviation = energies - expected, expected * np.sqrt(2 * self.count / rows)
+            self.excess[own.axis], relative[own.axis] = beyond * (beyond.sum() > _SURE * deviation), energies / expected
+        bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
+        for side, index, _ in self.taken.wrong:
+            bad[SIDES.index(side), index] = True
+        for measure in (squared / noise, relative):
             middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > max(2 * middle, middle + _DEVIATIONS * robust_scatter(measure, middle))
+            bad |= measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / min(shape)))
         self.good = ~bad
         return np.asarray(bad)
-
-    def _energy_along(self, own: _Side, rest: FloatArray) -> FloatArray:
-        """Return (N,) squared length of the vectors that the residuals ``rest`` of a side have along the common one."""
-        frames, common = self._of(own, rest).reshape(-1, *self.shape), self.along[1 - own.axis]
-        vectors = (frames @ common if own.axis == 0 else common @ frames) / self.squares[own.axis]
-        if self.centre:
-            vectors = vectors - vectors.mean(axis=1, keepdims=True)
-        return np.asarray(np.square(vectors).sum(axis=1) * len(own.vectors) / self.shape[own.axis])
-
-    def _uniform(self) -> FloatArray:
-        """Return the uniform response whose vectors are those that the other patterns share, and whose size is that of
-        the uniform frames that fit."""
-        right, left = (
-            own.pairs.across[used].sum(axis=0) / np.square(without_plane(own.sums.vectors[:, used])).sum()
-            for own, used in ((own, self._of(own, self.good)) for own in self.sides)
-        )
-        sizes = []
-        for own, vector, common in zip(self.sides, (left, right), (right, left), strict=True):
-            # D_0 = g vector common^T and ambient light, projected on the common vector of the sums.
-            parts = np.column_stack([vector, np.vander(np.linspace(-1, 1, len(vector)), 2)])
-            share = float(np.dot(common, own.sums.common)) / own.square
-            sizes.append(abs(float(np.linalg.lstsq(parts, own.sums.vectors[:, 0], rcond=None)[0][0])) / share)
-        return np.asarray(np.outer(left, right) * np.mean(np.array(sizes)[self.good[:: self.count]]))
 
     # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        for own in self.sides:
-            own.add("sums", float(self._of(own, self.excess * self.good).sum()))
-            if not self.centre:
-                self._subtract_ambient(own)
+        for own, good in zip(self.sides, self.good, strict=True):
+            own.add(_UNKNOWN_LIGHT, float(self.excess[own.axis][good].sum()))
+            self._subtract_ambient(own, good)
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
-            own.add("lag", self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            # Differences of neighbours: those of every second pixel do not see the finest detail.
-            steep = self._of(own, self.good) * np.square(np.diff(own.vectors, axis=0)).sum(axis=0)
-            moves = self.values[:, 2 + own.axis]
-            away = np.square(moves - np.median(moves[self.good])) / self.variances[:, 2 + own.axis]
-            if np.mean(away[self.good]) > 1 + _SURE * np.sqrt(2 / self.good.sum()):
-                ends = self.ends[:, own.axis]
-                own.add("motion", max(float(np.square(self._of(own, moves) - end) @ steep) for end in ends))
-        self.doubts |= {
-            "lag": f"each frame holds {self.lag:.1%} of the one before; wait longer between frames",
-            "bend": "numbers are not in proportion to light; switch gamma and other processing off, expose for less",
-            "motion": f"camera or mask move by {self.moved:.2g} pixels; fasten them",
-            "sums": "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor",
-        }
+            words = f"each frame holds {self.lag:.1%} of the one before; wait longer between frames"
+            own.add(words, self.lag**2 * (0.75**2 + 0.5**2) * own.size)
+            moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
+            if _scatter(moves[self.good], variances[self.good]):
+                own.add_motion(moves[own.axis][good], variances[own.axis][good], self.ends[:, own.axis])
         if not self.taken.unsteady:
             self._divide()
 
-    def _subtract_ambient(self, own: _Side) -> None:
+    def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        good, light = self._of(own, self.good), own.ambient
-        for found, effect, scale in zip(own.pairs.ambient.T, light.effects, light.variances, strict=True):
+        light = own.light
+        for found, effect, scale in zip(own.sums.ambient.T, light.effects, light.variances, strict=True):
             kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
             own.vectors -= np.outer(effect, kept)
-            size = float(np.square(effect).sum())
-            own.add("ambient", float(left.sum()) * size)
-            self.ambient_moved += float(np.square(kept)[good].sum()) * size / own.size
+            size, changed = float(np.square(effect).sum()), np.square(kept)[good]
+            # In the uniform frames it changes the vector that all responses share.
+            common = 2 * max(np.median(changed), good[0] * kept[0] ** 2) / np.square(own.uniform).sum() * own.size
+            own.add(_AMBIENT, float(left.sum() + common) * size)
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
 
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
-        power, ratio = self.values[:, 1], self.values[:, 0] - self.lag * self.own_before
-        first = np.arange(2) * self.count
-        unit = 1 / max(1 - float(np.mean(power[first])), 0.1)
         usable = self.good
-        sure = usable & (np.square(ratio) > _SURE**2 * self.variances[:, 0])
-        both = (1 + power * unit) / (1 - np.where(sure, np.square(ratio), 0.0))
-        degree, kept = min(3, max(len(np.unique(self.times)) // 4, 0)), usable
-        for _ in range(4):
-            trend = np.polynomial.Polynomial.fit(self.times[kept], both[kept], degree)(self.times)
-            away = np.abs(both - trend)
-            kept = usable & (away <= _DEVIATIONS * max(robust_scatter(away[usable]), 1e-12))
-        both, trend = both / float(np.mean(trend)), trend / float(np.mean(trend))
-        variances = self.variances[:, 1] * unit**2
-        drifts = np.var(trend) > _SURE**2 * np.median(variances) * (degree + 1) / usable.sum()
-        trend = trend if drifts else np.ones(len(both))
-        own_power, left, shaken = _shrunk(both - trend, variances, usable)
-        patterned = self.variances[:, 0] > 0
+        unit = 1 / max(1 - float(np.mean(self.values[:, 0, 0])), 0.1)
+        sure = usable & (np.square(self.ratios) > _SURE**2 * self.ratio_variances)
+        powers = (1 + self.values[..., 0] * unit) / (1 - np.where(sure, np.square(self.ratios), 0.0))
+        variances, degree = self.variances[..., 0] * unit**2, min(3, self.count // 2)
+        away = np.abs(powers - np.median(powers[usable]))
+        usual = usable & (away <= _DEVIATIONS * robust_scatter(powers[usable]) + 1e-12)
+        trend = np.polynomial.Polynomial.fit(self.times[usual], powers[usual], degree)(self.times)
+        powers, trend = powers / np.mean(trend), trend / np.mean(trend)
+        trend = 1 + _shrunk(trend - 1, variances * (degree + 1) / usual.sum(), usual)[0]
+        own_power, left, shaken = _shrunk(powers - trend, variances, usable)
         # A single frame of other power changes both alike.
-        ratio_variances, alike = np.where(patterned, self.variances[:, 0], 1.0), np.square(own_power)
-        ratio, left_ratio, uneven = _shrunk(ratio, ratio_variances, usable & patterned, alike)
-        own_power, ratio = np.where(usable, own_power, 0.0), np.where(usable & patterned, ratio, 0.0)
-        powers, flicker = trend + own_power, float(np.sqrt(shaken + uneven))
-        mean = float(np.sqrt(np.mean(powers[first])))
+        ratios, left_ratio, uneven = _shrunk(self.ratios, self.ratio_variances, usable, np.square(own_power))
+        left_ratio[:, 0] = 0.0
+        powers, ratios, flicker = trend + own_power * usable, ratios * usable, float(np.sqrt(shaken + uneven))
+        mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
-        bent = own_power[first] / trend[first]
-        bent = float(np.abs(bent).min()) if bent[0] * bent[1] > 0 else 0.0
-        costs = np.zeros(2)
-        for own in self.sides:
+        bent = own_power[:, 0] / trend[:, 0]
+        bent = np.abs(bent).min() * (bent[0] * bent[1] > 0)
+        bent *= bent > max(_SLIGHT / 2, 3 * flicker)
+        drift_cost = flicker_cost = 0.0
+        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, trend, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
-            c, d, slow, keep = (self._of(own, each) for each in (powers, powers * ratio, trend, usable))
-            costs += [np.square(slow - 1) @ energies / size, (np.square(c - slow) @ energies + d @ d * whole) / size]
+            d = c * ratio
+            drift_cost += np.square(slow - 1) @ energies / size
+            flicker_cost += (np.square(c - slow) @ energies + d @ d * whole) / size
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
-            noise = own.noise * float((1 / np.square(c) - 1)[keep].clip(0).sum())
-            lost = self._of(own, left) * energies + self._of(own, left_ratio * patterned) * whole
+            lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
-            range_ = float(np.abs(trend - 1).max()) / 2
-            own.add("lamp", noise + float(lost[keep].sum()) + range_**2 * own.size)
-            own.add("bend", bent**2 / 2 * own.size * (bent > max(_SLIGHT / 2, 3 * flicker)))
-            parts = np.stack([(1 + sign * self._of(own, ratio)) * c / slow - 1 for sign in (1, -1)])
+            own.add(_LAMP, float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
+            own.add(_BENT, bent**2 / 2 * own.size)
+            parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
-                repair = "its response is divided by that"
-                self.faults.append(SessionFault(own.side, int(index), 1 - 2 * int(half), "power", detail, repair))
-        drift, flickers = (float(cost) if cost > _MATTERS * self._noise() else 0.0 for cost in np.sqrt(costs))
-        change = float(trend[np.argmax(self.times)] - trend[np.argmin(self.times)])
-        remaining = float(np.sqrt(sum(own.extras["lamp"] / own.size for own in self.sides)))
-        corrected = bool(drift or flickers)
-        self.lamp = Lamp(change * bool(drift), flicker * bool(flickers), drift, flickers, remaining, corrected)
+                self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
+        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
+            self.found.lamp = lamp = {
+                "drift": float(trend.flat[np.argmax(self.times)] - trend.flat[np.argmin(self.times)]),
+                "flicker": flicker,
+                "drift_cost": float(np.sqrt(drift_cost)),
+                "flicker_cost": float(np.sqrt(flicker_cost)),
+                "remaining": float(np.sqrt(sum(own.extras[_LAMP] / own.size for own in self.sides))),
+                "corrected": True,
+            }
+            self.found.doubts.append(
+                f"lamp: its power drifts by {lamp['drift']:+.1%} over the session and flickers by {flicker:.2%} "
+                f"between frames, a factor error of {np.sqrt(drift_cost + flicker_cost):.1e} if nothing is done; "
+                f"frames are divided by its power, and {lamp['remaining']:.1e} is left: use a steadier lamp"
+            )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
     def _use_one_frame(self, own: _Side, index: int) -> None:
-        """Replace a response by twice one of its frames less the usual sum; refused unless the moving shadow agrees."""
+        """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = "the two do not add up to what others do"
         reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
         own.misfits[index] = np.median(own.misfits)
-        if index == 0:
-            own.vectors[:, 0] = own.uniform
-            repair = "those of the other side replace them"
-            self.faults.append(SessionFault(own.side, 0, None, "replaced", reason, repair))
-            return
-        times = self._of(own, self.times)
-        right = np.flatnonzero(self._of(own, self.good))
-        near = right[np.argsort(np.abs(times[right] - times[index]))[:_NEAR]]
+        distances = np.abs(self.times[own.axis] - self.times[own.axis, index])
+        near = np.argsort(np.where(self.good[own.axis], distances, np.inf))[:_NEAR]
         away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
-        tried, scores = {}, dict[int, float]()
+        misfits = dict[int, float]()
         for wrong in known or (1, -1):
-            own.vectors[:, index] = tried[wrong] = own.sums.vectors[:, index] - wrong * away
-            shadow = own.shadow(self.signs)
-            fits = shadow.deviations[index] <= _WRONG or shadow.unlike[index] <= _UNLIKE
-            if len(known) < 2 and fits and (known or shadow.predicts):
-                scores[wrong] = float(shadow.deviations[index])
-        if not scores:
-            self._refuse([(own, index)], reason)
-        sign = min(scores, key=lambda wrong: scores[wrong])
-        own.vectors[:, index] = tried[sign]
+            own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
+            shadow = MovingShadow(own.vectors, self.signs)
+            misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
+        sign = min(misfits, key=lambda wrong: misfits[wrong])
+        decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
+        if len(known) == 2 or not decided or misfits[sign] > 1:
+            self._refuse(own, index, reason)
+            return
+        own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-        error = 1.5 * own.noise
-        if len(scores) > 1 and scores[sign] > scores[-sign] / 2:  # the shadow does not decide between the frames
-            error += float(np.square(away).sum())
-        own.add("replaced", error)
-        repair, cost = "the other frame of its pair replaces it", float(np.sqrt(error / own.size))
-        self.faults.append(SessionFault(own.side, index, sign, "replaced", reason, repair, cost=cost))
+        own.add(_REPLACED, 1.5 * own.noise)
+        cost = float(np.sqrt(1.5 * own.noise / own.size))
+        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
+
+    def _compare_sides(self) -> None:
+        """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
+        for half, reason in self.taken.wrong.items():
+            self.refused.append((half, reason))
+        found = []
+        for own in self.sides:
+            self._subtract_ambient(own, np.ones(self.count, dtype=bool))
+            shapes = np.stack([own.uniform, np.gradient(own.uniform)])
+            found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
+            moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
+            if moved**2 > (_SURE * 2) ** 2 * noise:
+                own.add_motion(np.full(1, moved), np.full(1, noise), np.array([0.0, moved]))
+        apart = abs(abs(found[0][0]) - abs(found[1][0]))
+        for own in self.sides:
+            own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
-        """Turn the signs of patterns whose two frames are exchanged; refuse patterns and lines that are foreign."""
-        sums, turned, foreign = own.sums, set[int](), list[int]()
-        odd = odd_responses(own.misfits, sums.energies, len(own.vectors) * len(sums.common))
-        if len(odd):
-            self._refuse([(own, int(index)) for index in odd], f"they show no {own.side} stripes")
-
-        def turn(indices: Sequence[int]) -> None:
-            own.vectors[:, indices] *= -1
-            turned.symmetric_difference_update(indices)
-
-        if np.dot(own.vectors[:, 0], own.uniform) < 0:
-            turn([0])
+        """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
+        foreign = list[int]()
+        turned = (np.arange(self.count) == 0) & (np.dot(own.vectors[:, 0], own.uniform) < 0)
+        own.vectors[:, turned] *= -1
         for _ in range(int(MOST_FAULTS * self.count) + 3):
-            shadow = own.shadow(self.signs, foreign)
+            shadow = MovingShadow(own.vectors, self.signs, foreign)
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
-            known = (shadow.unlike < _KNOWN[0]) | (shadow.deviations > _KNOWN[1])
-            known &= shadow.deviations > _FOREIGN[2]
-            doubtful |= known & (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1])
-            far = np.where(doubtful, shadow.deviations, 0.0)
-            gains = np.where(shadow.by_turning > _TURNED * shadow.deviations, shadow.by_turning, 0.0)
+            far = shadow.deviations * (doubtful | (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1]))
+            gains = shadow.by_turning * (shadow.by_turning > _TURNED * shadow.deviations)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
             if gains[best] > max(_LEAST, _TURNED * far.max()):
-                turn([best] if best else range(1, self.count))  # the light decides on the sign of pattern 0
+                which = [best] if best else slice(1, None)  # the light decides on the sign of pattern 0
+                own.vectors[:, which] *= -1
+                turned[which] ^= True
             elif far.any():
                 foreign.append(int(np.argmax(far)))
             else:
                 break
         else:
             raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
-        if foreign and (doubts := self._report()):
-            raise MitsimError(f"all frames: {doubts[0]}, and most patterns disagree; take the session again")
-        if foreign:
-            wrong = [(own, index) for index in sorted(foreign)]
-            self._refuse(wrong, f"they show other {own.side} stripes than the other patterns predict")
-        if not shadow.predicts and 0 < len(turned) < self.count:
-            self._refuse([(own, index) for index in turned], "they are in each other's place")
-        all_pairs = len(turned) == self.count
-        for index in [0] if all_pairs else sorted(turned):
-            detail = (
-                f"in each other's place, as in all pairs of {own.side} stripes"
-                if all_pairs
-                else "in each other's place"
-            )
-            repair = "they count in their right order"
+        for index in foreign:
+            self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
+        for index in [0] if turned.all() else np.flatnonzero(turned).tolist():
+            if not shadow.predicts and not turned.all():
+                self._refuse(own, index, "they are in each other's place")
+            detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
-            self.faults.append(SessionFault(own.side, index, sign, "exchanged", detail, repair))
-        # The lines at the ends are predicted from one side only, and few lines hardly predict each other.
-        inner = shadow.lines[1:-1]
-        if shadow.predicts and len(inner) > _FEW_LINES and inner.max() > _LINE:
+            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
+        least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
+        odd = own.misfits - np.median(own.misfits) > np.maximum(least, _DEVIATIONS * robust_scatter(own.misfits))
+        if odd.sum() > max(2, MOST_FAULTS * self.count):
             raise MitsimError(
-                f"all frames: line {1 + int(np.argmax(inner))} of the {own.side} stripes is not as bright as its "
-                "neighbours predict; check the projector, uniform and dark frames, and take the session again"
+                f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
+                "ambient light, lamp and sensor, and take the session again"
             )
-        if shadow.predicts and not self.paired:
+        for index in np.flatnonzero(odd).tolist():
+            self._refuse(own, index, f"they show light that no {own.side} stripes cast")
+        light = np.square(own.vectors).sum(axis=1)
+        around = np.pad(light, 1, constant_values=np.inf)
+        around = np.minimum(around[:-2], around[2:])
+        rows = np.flatnonzero((light < _DARK[self.centre] * around) & (around > _LIT * np.median(light)))
+        for row in rows[:1]:
+            word = "row" if own.axis == 0 else "column"
+            own.add(f"sensor {word} {row} shows no light; check the sensor", float(around[rows].sum()))
+        if foreign or len(rows) or not shadow.predicts:
+            return
+        # The lines at the ends are predicted from one side only.
+        line = 1 + int(np.argmax(shadow.lines[1:-1]))
+        words = f"line {line} of the {own.side} stripes is not as bright as its neighbours predict; check the projector"
+        share = shadow.lines[line] / len(shadow.lines)
+        own.add(words, share * own.size * (shadow.lines[line] > _LINE))
+        if not self.paired:
+            moves, variances = shadow.moves()
+            if _scatter(moves[1:], variances[1:]):
+                few = max(2, self.count // 8)
+                own.add_motion(moves[1:], variances[1:], np.array([np.median(moves[:few]), np.median(moves[-few:])]))
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
-            counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > _LIKELY**2)
-            own.add("power", float(((squares - variances) * counted)[1:] @ shown[1:]))
+            counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
+            own.add(_POWER, float(((squares - variances) * counted)[1:] @ shown[1:]))
 
-    def _report(self) -> list[str]:
-        """Return sentences on the errors that matter, the largest first; MitsimError for more than a tenth."""
-        reasons = {reason for own in self.sides for reason in own.extras}
-        energies = {each: sum(own.extras.get(each, 0.0) / own.size for own in self.sides) for each in reasons}
-        order, total = sorted(reasons, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
-        if total > LARGEST_ERROR:
-            reason = self.doubts.get(order[0], "power or ambient light change too much")
-            raise MitsimError(
-                f"all frames: {reason}: an error of {total:.0%} is left in the factors, allowed are "
-                f"{LARGEST_ERROR:.0%}; take the session again"
-            )
-        most = (_MATTERS * self._noise()) ** 2
-        return [
-            f"{self.doubts[each]}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
+    # ---- the result --------------------------------------------------------------------------------------------------
+
+    def _judge(self) -> None:
+        """Report the errors that matter, the largest first; refuse the session for more than a tenth, and for frames
+        that are wrong."""
+        found, sides = self.found, self.sides
+        energies = {
+            each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for own in sides for each in own.extras
+        }
+        order, total = sorted(energies, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
+        doubts = [
+            f"{each}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
             for each in order
-            if each in self.doubts and energies[each] > most
+            if each not in (_LAMP, _REPLACED) and energies[each] > (_MATTERS * self.noise) ** 2
         ]
-
-    def _judge(self, uniform: FloatArray | None) -> CheckedSession:
-        """Report the errors that matter."""
-        doubts, noise = [f"session: {words}" for words in self._report()], self._noise()
-        if self.ambient_moved > (_MATTERS * noise) ** 2:
-            doubts.append(
-                f"session: ambient light changes between the two frames of pairs, a factor error of "
-                f"{np.sqrt(self.ambient_moved):.1e} if nothing is done; it is subtracted: darken the room"
+        if total > LARGEST_ERROR or (self.refused and doubts):
+            raise MitsimError(
+                f"all frames: {order[0]}: an error of {total:.0%} or more is left in the factors; take the "
+                "session again"
             )
-        first, second = self.sides
-        return CheckedSession(
-            (first.result(), second.result()),
-            sorted(self.faults, key=lambda fault: (SIDES.index(fault.side), fault.index)),
-            self.lamp,
-            doubts,
-            (sum(first.extras.values()), sum(second.extras.values())),
-            uniform,
-        )
+        if self.refused:
+            reason = self.refused[0][1]
+            names = [self.taken.name(half) for half, why in self.refused if why == reason]
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
+        found.doubts += [f"session: {words}" for words in doubts]
+        found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
+        left, right = (replace(own.sums, vectors=own.vectors, misfit=float(own.misfits.sum())) for own in sides)
+        found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))
