@@ -17,7 +17,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation
-from mitsim.reconstruct.picture_check import PictureCheck, check_picture, robust_scatter
+from mitsim.reconstruct.picture_check import PictureCheck, robust_scatter
 from mitsim.reconstruct.residuals import CHANCE, TINY, Residuals
 from mitsim.reconstruct.uncertainty import Propagation
 
@@ -25,6 +25,8 @@ Pattern = tuple[int, int]
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
+_SIDE = 0.3
+"""Correlation of a pair's sum with its difference from which one of its halves is at fault."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 """Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
 does not fit as a whole, and no single frames are named."""
@@ -33,17 +35,14 @@ _FOREIGN, _DISTURBED = 6.5, 7.5
 _FLICKERS, _POWER = 15.0, 0.01
 """Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a
 print of a regular texture imitates smaller ones; all are part of the uncertainty."""
-_COSTS, _FEWEST_PAIRS, _MEDIAN_SQUARE = 0.5, 4, 0.455
-"""Energy of a flicker over that of noise from which it is reported; pairs that are needed; and the median of the square
-of a normal number."""
+_FEWEST_PAIRS, _COSTS = 4, 0.5
+"""Pairs from which a flicker is reported, and its scatter over that which adds twice the energy of the noise."""
 _RESTORED = 0.9
 """Part of the unexplained energy by which the residual must fall without frames that are at fault."""
 _SCATTERS = 4.0
 """Scatters of the power up to which the difference of a single frame is that of a flicker."""
 _OUTLIER, _DIMMED = 6.5, 0.02
 """Robust deviations, and change, from which the power of a single frame is reported."""
-_MOST_NUMBERS = 3e7
-"""Numbers that the joint fit of all powers may keep in memory."""
 
 
 @dataclass(frozen=True)
@@ -86,97 +85,69 @@ class FrameCheck:
         self._shots = data.shots.manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
         self._patterns = [(shot.row, shot.column) for shot in self._shots]
-        self._signed = any(shot.sign for shot in self._shots)
+        self._signed = data.noise.shots == 2
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
-        self._exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
-        self._numbers = [self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*self._variance.shape)]
-        self.picture = self._check_picture(lam) if self._exclusive else None
-        self.power = self._joint_powers() if not (self._signed or self._exclusive) else None
+        exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
+        self.picture = self._check_picture(lam) if exclusive else None
 
     def faults(self) -> tuple[FrameFault, ...]:
         """Return all frames that do not fit the others."""
-        found = [*self._dark(), *self._equal(), *self._check_clipping()]
-        by_others = [*self._unlike_model()]
+        found, by_others = [*self._alone()], [*self._unlike_model()]
         powers = [*self._unlike_picture(), *self._flicker()]
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
-        flicker = max((fault.part for fault in powers if len(fault.numbers) > 1 and fault.kind == "power"), default=0.0)
+        flicker = max((fault.part for fault in powers), default=0.0)
         if by_others and by_others[0].part >= _SCATTERS * flicker:
             found += by_others
         named = {self._patterns[number] for fault in found for number in fault.numbers}
-        known = [
-            fault for fault in powers if fault.kind == "power" and named & {self._patterns[n] for n in fault.numbers}
-        ]
+        known = [each for each in powers if each.kind == "power" and named & {self._patterns[n] for n in each.numbers}]
         return (*found, *(fault for fault in powers if fault not in known), *self._closing())
 
     # ---- Tests of single frames
 
-    def _dark(self) -> Iterator[FrameFault]:
-        """Report a run without light: with several frames, the others predict a dark one."""
-        noise = self._data.noise
+    def _alone(self) -> Iterator[FrameFault]:
+        """Report a run without light, frames that are equal to the last bit, and single frames that are clipped."""
+        noise, count = self._data.noise, len(self._shots)
         least = CHANCE * float(np.sqrt(noise.variance.sum() / self._sums.squares.size))
         if abs(float(noise.means.sum())) < least:
-            words = "holds no light" if len(self._shots) == 1 else "hold no light"
-            yield self._fault("dark", range(len(self._shots)), words)
-
-    def _equal(self) -> Iterator[FrameFault]:
-        if not self._data.noise.variance.any():
-            return
+            yield self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light")
         for digest, shots in self._sums.same.items():
-            if digest and len(shots) > 1:
+            if digest and len(shots) > 1 and noise.variance.any():
                 yield self._fault("repeated", [self._of(*each) for each in shots], "are equal, noise and all")
-
-    def _check_clipping(self) -> Iterator[FrameFault]:
-        if len(self._sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
-            for shot, count in self._sums.clipped.items():
-                yield self._fault("clipped", [self._of(*shot)], f"has {count} readings at its largest number")
+        if len(self._sums.clipped) <= max(1, _MOST_BAD * count):
+            for shot, readings in self._sums.clipped.items():
+                yield self._fault("clipped", [self._of(*shot)], f"has {readings} readings at its largest number")
 
     def _unlike_model(self) -> Iterator[FrameFault]:
-        """Compare each frame with the prediction of the others by the model, and signed pairs by their sums."""
+        """Compare each frame with the prediction of the others by the model."""
         sums, count = self._sums, self._variance.size
         share = self._beside * sums.shots / max(float(sums.shots.sum()), TINY)
-        # Single frames are at fault only if the rest fits without them.
-        tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
-        if self._signed and sums.pairs:
-            data = sums.pairs[0, 0].size
-            rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(sums.left.shape)], sums.left.shape)
-            noise = self._variance + self._variance.mean() / max(count - 1, 1)
-            part_of = data / sums.squares.size
-            tests.append(((rest - noise * data) / part_of - share, 2 * noise * np.sqrt(2 * data) / part_of))
+        beyond, chance = sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free)
+        part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
+        usual = float(np.median(part)) if count > 2 else float(part.max())
+        bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
         expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
-        excess = float(sums.left.sum()) - expected
-        off = np.zeros(sums.left.shape)
-        for beyond, chance in tests:
-            part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
-            usual = float(np.median(part)) if count > 2 else float(part.max())
-            bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
-            if beyond is tests[0][0] and 0 < np.count_nonzero(bad) <= max(1, _MOST_BAD * count):
-                named = [(int(row), int(column)) for row, column in np.argwhere(bad)]
-                noise = (self._variance * sums.free + share)[bad].sum()
-                if sums.without(named) - noise < _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum())):
-                    continue
-            off = np.maximum(off, np.where(bad, part, 0.0))
-        if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
-            for place in np.argsort(-off, axis=None)[: np.count_nonzero(off)]:
-                row, column = (int(index) for index in np.unravel_index(place, off.shape))
-                size, numbers = float(np.sqrt(off[row, column])), self._halves((row, column))
+        excess = float(sums.squares.sum()) - expected
+        # Single frames are at fault only if the rest fits without them.
+        restored = beyond[bad].sum() > _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
+        if 0 < np.count_nonzero(bad) <= max(1, _MOST_BAD * count) and restored:
+            for row, column in sorted(np.argwhere(bad), key=lambda place: -part[tuple(place)]):
+                size, signs = float(np.sqrt(part[row, column])), [0]
+                if self._signed:  # the sums of pairs decide which half
+                    side = self._sums.pairs[row, column].side if self._sums.pairs else 0.0
+                    signs = [1, -1] if abs(side) < _SIDE else [int(np.sign(side))]
+                numbers = [self._number[row, column, sign] for sign in signs]
                 yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
-
-    def _halves(self, pattern: Pattern) -> list[int]:
-        """Return the shots of a pattern that may be wrong: one half of a pair where the sums decide which."""
-        if not self._signed:
-            return [self._number[(*pattern, 0)]]
-        side = self._sums.pairs[pattern].side if pattern in self._sums.pairs else 0.0
-        signs = (1, -1) if abs(side) < 0.3 else (int(np.sign(side)),)
-        return [self._number[(*pattern, sign)] for sign in signs]
 
     # ---- The picture of shifting dots
 
     def _check_picture(self, lam: float) -> PictureCheck | None:
         seen = Propagation(self._data.model, lam)
         rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
-        numbers = np.reshape(self._numbers, self._variance.shape)
+        shape = self._variance.shape
+        numbers = np.reshape([self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*shape)], shape)
         image, noise = self._data.prepared.image(seen.gain * self._sums.weights), float(self._variance.mean())
-        return check_picture(image, numbers[np.ix_(rows, columns)], self._variance.shape, seen.of_white(noise))
+        found = PictureCheck(image, numbers[np.ix_(rows, columns)], shape, seen.of_white(noise))
+        return found if found.decides else None
 
     def _unlike_picture(self) -> Iterator[FrameFault]:
         found = self.picture
@@ -189,7 +160,18 @@ class FrameCheck:
         if len(disturbed) and not len(foreign):
             strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]
             yield self._fault("picture", strongest, "show a part of the scene otherwise than the frames around")
-        yield from self._powers(found.power, found.power_error, range(len(self._shots)), _FLICKERS)
+        limit = max(_POWER, _FLICKERS * float(np.median(found.power_error)))
+        yield from self._powers(found.power, found.power_error, range(len(self._shots)), limit)
+
+    def _flicker(self) -> Iterator[FrameFault]:
+        """Report halves of signed patterns of another power, because the halves of all pairs add up to one light."""
+        pairs = self._sums.pairs
+        if len(pairs) >= _FEWEST_PAIRS and self._data.noise.stated:
+            power, error = np.concatenate([(pair.powers, pair.errors) for pair in pairs.values()], axis=1)
+            numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
+            costly = _COSTS * float(np.median([pair.costly for pair in pairs.values()]))
+            limit = max(CHANCE * float(np.median(error)), costly)
+            yield from self._powers(power, error, numbers, limit)
 
     def _powers(
         self, power: FloatArray, error: FloatArray, numbers: Sequence[int], most: float
@@ -203,71 +185,17 @@ class FrameCheck:
         numbers
             of the shots.
         most
-            scatter over error from which all differ.
+            scatter from which all differ.
         """
-        scatter, usual = robust_scatter(power), float(np.median(error))
-        known = np.isfinite(error)
-        away = np.where(known, np.abs(power - np.median(power[known])) if known.any() else 0.0, 0.0)
-        single = (away > _OUTLIER * np.maximum(error, scatter)) & (away > _DIMMED)
+        scatter, middle = robust_scatter(power), float(np.median(power))
+        single = np.abs(power - middle) > np.maximum(_OUTLIER * np.maximum(error, scatter), _DIMMED)
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
             for index in np.flatnonzero(single):
-                words = f"has {1 + power[index] - np.median(power):.2f} times the light that the others predict"
+                words = f"has {1 + power[index] - middle:.2f} times the light that the others predict"
                 yield self._fault("power", [numbers[int(index)]], words)
-        elif single.any() or scatter > max(_POWER, most * usual):
-            yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power", scatter)
-
-    # ---- The power of frames that overlap
-
-    def _joint_powers(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the relative power of all frames and its standard errors, (K,) in the order of patterns.
-
-        A frame of power 1 + a adds a (I - H) Y to all residuals, so that the powers follow from normal equations with
-        the matrix |Y_k|^2 delta_kl - C_k . C_l, C being the coefficients of frames in the model's range.
-        """
-        prepared, sums = self._data.prepared, self._sums
-        count = self._variance.size
-        if count < 3 or count * sums.weights.size > _MOST_NUMBERS:
-            return None
-        seen, whole = np.zeros((count, *sums.weights.shape)), np.zeros(count)
-        for k, pattern in enumerate(np.ndindex(*self._variance.shape)):
-            left, right = prepared.slabs(pattern)
-            own = sums.weights[left.columns][:, right.columns]
-            found = (left.matrix.T @ left.matrix) @ own @ (right.matrix.T @ right.matrix)
-            seen[k][prepared.places(pattern)] = found
-            whole[k] = float(np.vdot(own, found))
-        flat = seen.reshape(count, -1)
-        normal = np.diag(whole) - flat @ flat.T
-        values, vectors = np.linalg.eigh(normal)
-        variance = float(self._variance.mean())
-        known = values > max(variance, 1e-9 * float(values.max()))
-        if not known.any():
-            return None
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        power = inverse @ sums.fitted.ravel()
-        return power, np.sqrt(variance * np.diag(inverse))
-
-    def _flicker(self) -> Iterator[FrameFault]:
-        """Report a lamp whose power differs from shot to shot by what costs more than part of the noise."""
-        everything = range(len(self._shots))
-        if self.power is not None:
-            yield from self._powers(*self.power, self._numbers, CHANCE)
-        pairs = self._sums.pairs
-        if len(pairs) < _FEWEST_PAIRS or not self._data.noise.stated:
-            return
-        noise = np.array([self._variance[pattern] for pattern in pairs])
-        cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * pairs[0, 0].size, TINY)
-        times = float(np.median(cost)) / _MEDIAN_SQUARE
-        powers = np.array([power for pair in pairs.values() for power in pair.powers])
-        errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(
-            2 * np.repeat(noise, 2)
-        )
-        numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
-        single = [fault for fault in self._powers(powers, errors, numbers, np.inf)]
-        yield from single
-        differ = float(np.std(powers))
-        if times > _COSTS and differ > CHANCE * float(np.median(errors)) and not single:
-            words = f"differ by {differ:.2%} in their power, which costs {times:.2g} times as much as their noise"
-            yield self._fault("power", everything, words, differ)
+        elif single.any() or scatter > most:
+            words = f"differ by {float(np.std(power)):.2%} in their power"
+            yield self._fault("power", range(len(self._shots)), words, scatter)
 
     # ---- A closing frame
 

@@ -17,17 +17,17 @@ that is in one place, and sensors of uneven response raise no alarm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.picture_check import IntArray, robust_scatter
+from mitsim.reconstruct.picture_check import POWER, IntArray, robust_scatter
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
@@ -47,12 +47,7 @@ _CORRELATED = (70 / 36) ** 2
 _PAIR_ROWS = 96
 """Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
 _BRIGHT = 50.0
-"""Energy of a half over that of its noise from which its power is known."""
-_STEPS = 50
-"""Steps of conjugate gradients at most; patterns that share little need a few."""
-_ALIKE = 1e-3
-"""Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as
-black."""
+"""Energy of a half over that of its noise from which it is no black one."""
 _SAMPLE = 20_000
 """Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
@@ -106,62 +101,27 @@ class NoiseTest:
         return white and more and seen
 
 
-@dataclass(frozen=True)
-class Pair:
-    """How the sum of a signed pattern's halves differs from those of all other pairs, which are the same light.
+class Pair(NamedTuple):
+    """Difference of the sum of a signed pattern's halves from those of all other pairs, which are the same light.
 
     Attributes
     ----------
     powers, errors
-        relative power of the first and of the second half beyond that of the other pairs, and their standard errors for
-        noise of variance 1; infinite where a half is as good as black.
-    rest
-        energy that no power of the halves explains.
+        (2,) relative power of the first and of the second half beyond that of the other pairs, and their standard
+        errors.
     side
-        correlation of the rest with the residual of the difference: 1 if the first half is wrong, -1 if the second is.
-    cost, size
-        energy that the powers put into the difference, and number of the data that are compared.
+        its correlation with the residual of the halves' difference: 1 if the first half is wrong, -1 if the second is.
+    costly
+        power whose error of both halves has twice the energy of the noise of their difference.
     """
 
-    powers: tuple[float, float]
-    errors: tuple[float, float]
-    rest: float
+    powers: FloatArray
+    errors: FloatArray
     side: float
-    cost: float
-    size: int
-
-    @classmethod
-    def of(
-        cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray, noise: float
-    ) -> Pair:
-        """Fit a sum of halves to the two halves, (total +- difference) / 2, by least squares.
-
-        Parameters
-        ----------
-        beyond
-            (m, m') difference of the sum of this pair from the mean of the others.
-        total, difference, residual
-            (m, m') sum and difference of its halves, and what the model leaves of the difference.
-        noise
-            energy of a half's noise; a half that is hardly brighter would be fitted to its own noise.
-        """
-        halves = (total + difference) / 2, (total - difference) / 2
-        normal = np.array([[float(np.vdot(one, other)) for other in halves] for one in halves])
-        powers, errors = np.zeros(2), np.full(2, np.inf)
-        known = float(np.diag(normal).min()) > _BRIGHT * noise
-        if known and np.linalg.det(normal) > _ALIKE * float(np.diag(normal).max()) ** 2:
-            inverse = np.linalg.inv(normal)
-            powers = inverse @ [float(np.vdot(beyond, half)) for half in halves]
-            errors = np.sqrt(np.diag(inverse))
-        rest = beyond - powers[0] * halves[0] - powers[1] * halves[1]
-        energies = sum_of_squares(rest), sum_of_squares(residual)
-        side = float(np.vdot(rest, residual)) / max(float(np.sqrt(energies[0] * energies[1])), TINY)
-        cost = sum_of_squares(powers[0] * halves[0] - powers[1] * halves[1])
-        return cls((powers[0], powers[1]), (errors[0], errors[1]), energies[0], side, cost, beyond.size)
+    costly: float
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Part of the sensor or of the session where frames do not fit: its ``words``, and its unexplained ``energy``."""
 
     words: str
@@ -176,22 +136,20 @@ class Residuals:
 
     Attributes
     ----------
-    energy, power
-        (tiles, tiles) sums of the squares of measurements and of shots.
+    energy
+        (tiles, tiles) sum of the squares of measurements.
     pixels
         (tiles, tiles) pixels of each tile.
-    squares
-        (m, m') sum of the squares of residuals of each sensor pixel.
-    left, leave_out
-        (K, K') energy of a pattern's residual, and e^T (I - H_kk)^-1 e, what is left of it when the others predict it.
+    squares, total
+        (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
+    leave_out
+        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e: what is left of it when the others predict it.
     shots
         (K, K') energy of a pattern's shots.
     free
         (K, K') data of a pattern that others predict too.
-    fitted
-        (K, K') product of a pattern's residual and of what the model has of it.
     pairs
-        by signed pattern, what the sum of its halves differs by from the sums of all other pairs.
+        by signed pattern, the difference of the sum of its halves from the sums of all other pairs.
     same, clipped
         patterns and halves by a number that equal frames share, and readings at the largest number of such a frame.
     """
@@ -205,16 +163,17 @@ class Residuals:
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         counts = prepared.left.pattern_count, prepared.right.pattern_count
-        self.left, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
+        self.leave_out, self.shots, self.free = (np.zeros(counts) for _ in range(3))
         self.pairs: dict[tuple[int, int], Pair] = {}
-        self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
-        self.squares, self._early, self._sum = (np.zeros(sizes) for _ in range(3))
+        self.squares, self._early, self.total = (np.zeros(sizes) for _ in range(3))
         # Arrays of one frame, because to make them anew takes longer than to fill them.
         self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
-        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
-        self.weights = data.weights if light is None else data.weights - common_weights(data, light)
+        self.energy = np.zeros(self.pixels.shape)
+        self.weights = data.weights
+        if light is not None:
+            self.weights = self.weights - prepared.left.common.T @ prepared.as_solved(light) @ prepared.right.common
         self._grams = [[_gram(slab.matrix) for slab in side.slabs] for side in (prepared.left, prepared.right)]
         self._rough = [
             [float(np.square(np.diff(slab.matrix, 2, axis=0)).sum()) for slab in side.slabs]
@@ -235,29 +194,20 @@ class Residuals:
         residual = np.matmul(left.matrix @ own, right.matrix.T, out=self._residual)
         np.subtract(frame, residual, out=residual)
         self.squares += np.multiply(residual, residual, out=self._squared)
-        self._sum += residual
-        energy = self._squares(frame)
-        light = energy if frame is measurement.light else self._squares(measurement.light)
-        if measurement.shots == 2:  # as Measurement.power has it
-            light = (light + energy) / 2
-        self.energy += energy
-        self.power += light
+        self.total += residual
+        rows = np.stack([np.einsum("ij,ij->j", frame[strip], frame[strip]) for strip in self._strips])
+        self.energy += (energy := np.add.reduceat(rows, self._starts, axis=1))
         # Behind a mask with a constant term most of the light contributes nothing to the image.
-        self.shots[pattern] = float((energy if prepared.centre else light).sum())
-        flat = residual.ravel()
-        self.left[pattern] = float(np.dot(flat, flat))
+        self.shots[pattern] = float(energy.sum()) if prepared.centre else measurement.power
         (turn, values), (other_turn, other_values) = (self._grams[side][index] for side, index in enumerate(pattern))
         known = np.outer(values, other_values)
         alone = known > 1 - 1e-6
         self.free[pattern] = residual.size - np.count_nonzero(alone)
-        self.leave_out[pattern] = self.left[pattern]
+        self.leave_out[pattern] = sum_of_squares(residual)
         if not alone.all():
             if coefficients is None or self._light is not None:
                 coefficients = left.matrix.T @ frame @ right.matrix
-            explained = (turn * values) @ (turn.T @ own @ other_turn) @ (other_turn * other_values).T
-            self.fitted[pattern] = float(np.vdot(own, coefficients - explained))
-            self._seen[pattern] = coefficients - explained
-            seen = turn.T @ self._seen[pattern] @ other_turn
+            seen = turn.T @ coefficients @ other_turn - known * (turn.T @ own @ other_turn)
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
@@ -268,43 +218,19 @@ class Residuals:
         if measurement.shots == 2 and others:
             some = slice(None, None, max(min(residual.shape) // _PAIR_ROWS, 1))
             total, difference, left_over, every = (
-                each[some, some] for each in (measurement.light, measurement.frame, residual, self.noise.light)
+                each[some, some].ravel() for each in (measurement.light, measurement.frame, residual, self.noise.light)
             )
-            noise = float(self.noise.variance[pattern]) * total.size / 2
-            self.pairs[pattern] = Pair.of((total * (1 + others) - every) / others, total, difference, left_over, noise)
-
-    def without(self, patterns: Sequence[tuple[int, int]]) -> float:
-        """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
-
-        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
-        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
-        Directions that no other pattern sees have no curvature: the steps end there, which scipy's cg would not do.
-        """
-        grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
-
-        def apart(values: FloatArray) -> FloatArray:
-            found = values.copy()
-            for each, (left, right) in grams.items():
-                places = self._prepared.places(each)
-                found[places] -= left @ values[places] @ right
-            return found
-
-        rest = np.zeros_like(self.weights)
-        for each in patterns:
-            if each in self._seen:
-                rest[self._prepared.places(each)] += self._seen[each]
-        found, step, seen = np.zeros_like(rest), rest.copy(), rest.copy()
-        squared = sum_of_squares(rest)
-        for _ in range(_STEPS):
-            moved = apart(step)
-            curvature = float(np.vdot(step, moved))
-            if curvature <= 1e-9 * sum_of_squares(step):
-                break
-            found += squared / curvature * step
-            rest = rest - squared / curvature * moved
-            before, squared = squared, sum_of_squares(rest)
-            step = rest + squared / max(before, TINY) * step
-        return sum(float(self.left[each]) for each in patterns) + float(np.vdot(seen, found))
+            beyond = (total * (1 + others) - every) / others
+            halves = np.stack([total + difference, total - difference]) / 2
+            variance = max(2 * float(self.noise.variance[pattern]), TINY)
+            # A black half would be fitted to its own noise.
+            costly = float(np.sqrt(variance * total.size / max(sum_of_squares(halves), TINY)))
+            halves *= (np.square(halves).sum(axis=1) > _BRIGHT * variance / 4 * halves.shape[1])[:, None]
+            covariance = np.linalg.inv(halves @ halves.T / variance + np.eye(2) / POWER**2)
+            powers = covariance @ (halves @ beyond) / variance
+            size = np.sqrt(sum_of_squares(beyond) * sum_of_squares(left_over))
+            side = float(beyond @ left_over / max(size, TINY))
+            self.pairs[pattern] = Pair(powers, np.asarray(np.sqrt(np.diag(covariance))), side, costly)
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
@@ -349,14 +275,6 @@ class Residuals:
         gain = 2 * ratio / (1 - share + float(np.sqrt((1 - share) ** 2 + 4 * share * ratio)))
         return NoiseTest(ratio, error, gain, error if self.noise.stated else float("inf"))
 
-    @cached_property
-    def variance(self) -> FloatArray:
-        """(tiles, tiles) sum of the stated variance of the noise."""
-        # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
-        count = self.noise.variance.size
-        light = self._tiles(self.noise.light) / self.pixels / count
-        return self.noise.of(light, self.noise.shots) * self.pixels * count
-
     @property
     def residual(self) -> FloatArray:
         """(tiles, tiles) sum of the squares of residuals."""
@@ -372,16 +290,12 @@ class Residuals:
         beside
             energy that the factors' noise adds, evenly.
         """
-        rendering = self.noise.rendering * self.power / max(float(self.power.sum()), TINY)
-        noise = ratio * self.variance * self._prepared.spare
+        rendering = self.noise.rendering * self.energy / max(float(self.energy.sum()), TINY)
+        # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
+        count = self.noise.variance.size
+        variance = self.noise.of(self._tiles(self.noise.light) / self.pixels / count, self.noise.shots)
+        noise = ratio * variance * self.pixels * count * self._prepared.spare
         return np.asarray(noise + rendering + beside * self.pixels / self.pixels.sum())
-
-    @cached_property
-    def _freedom(self) -> FloatArray:
-        """(m, m') degrees of freedom of the residuals of each pixel: K (1 - h)."""
-        sides = (self._prepared.left, self._prepared.right)
-        left, right = (sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides)
-        return np.asarray(np.maximum(self.noise.variance.size - np.outer(left, right), 1e-3))
 
     def places(self, ratio: float) -> list[Place]:
         """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first.
@@ -389,31 +303,27 @@ class Residuals:
         ``ratio`` is that of measured to stated noise.
         """
         count = self.noise.variance.size
-        variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
-        expected = variance * self._freedom
-        least = _PLACE_ENERGY * float(expected.sum())
-        whole = self.squares, expected, self._freedom
+        sides = (self._prepared.left, self._prepared.right)
+        taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides]
+        freedom = np.maximum(count - np.outer(*taken), 1e-3)
+        variance = np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
+        whole = self.squares, ratio * variance * freedom, freedom
         tiles = [self._tiles(each) for each in whole]
         lines = ([each.sum(axis=axis) for each in whole] for axis in (1, 0))
         beyond = {}
-        for name, (squares, own, freedom) in zip(
-            ("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True
-        ):
+        for name, (squares, own, free) in zip(("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True):
             # The cube root of a chi-square is nearly normal (Wilson and Hilferty 1931).
-            spread = 2 / (9 * np.maximum(freedom, 0.5))
+            spread = 2 / (9 * np.maximum(free, 0.5))
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
             beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
         change = tiles[0] - 2 * self._tiles(self._early)
         far = np.abs(_deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))) > _PLACE
         beyond["half"] = np.where(far, np.abs(change), 0.0)
-        far = np.abs(_deviations(self._sum / np.sqrt(expected))) > _PLACE
-        beyond["mean"] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
+        far = np.abs(_deviations(self.total / np.sqrt(whole[1]))) > _PLACE
+        beyond["mean"] = np.where(far, np.maximum(self.squares - whole[1], 0.0), 0.0)
+        least = _PLACE_ENERGY * float(whole[1].sum())
         found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
-
-    def _squares(self, values: FloatArray) -> FloatArray:
-        rows = np.stack([np.einsum("ij,ij->j", values[strip], values[strip]) for strip in self._strips])
-        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
     def _tiles(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
@@ -428,18 +338,6 @@ def noise_chance(noise: FrameNoise, pixels: float) -> float:
     """
     total = max(float(noise.variance.sum()), TINY)
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
-
-
-def common_weights(data: Accumulation, light: FloatArray) -> FloatArray:
-    """Return what one ``light`` (m, m') in every measurement of ``data`` adds to the coefficients W (r, r') of all."""
-    left, right = data.prepared.left.common, data.prepared.right.common
-    return np.asarray(left.T @ data.prepared.as_solved(light) @ right)
-
-
-def common_energy(data: Accumulation, light: FloatArray) -> float:
-    """Return the energy outside the model's range of one ``light`` (m, m') in every measurement of ``data``."""
-    whole = data.noise.variance.size * sum_of_squares(data.prepared.as_solved(light))
-    return max(whole - sum_of_squares(common_weights(data, light)), 0.0)
 
 
 def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
