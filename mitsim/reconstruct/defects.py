@@ -86,10 +86,8 @@ class Defects:
                 left, right = prepared.slabs((row, column))
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
                 predicted = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
-                leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
-                step = (predicted - value) / np.maximum(1 - leverage / gain, 0.5)
-                value += step
-                step /= gain
+                step = (predicted - value) / gain
+                value += gain * step
                 change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}

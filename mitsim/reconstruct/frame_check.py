@@ -201,48 +201,35 @@ class FrameCheck:
 
     def _closing(self) -> Iterator[FrameFault]:
         """Compare the closing frame with the frames before it."""
-        closing = self._data.shots.closing
+        closing, noise, sides = self._data.shots.closing, self._data.noise, self._data.shots.patterns
         if closing is None:
             return
-        predicted, variance = self._prediction(closing.kind)
-        if predicted is None or closing.saturated:
+        first, shot = closing.kind == "first", self._shots[0]
+        half = first and shot.sign != 0
+        # Shares of the patterns that add up to the closing one.
+        shares = [np.eye(side.shape[1])[index] for side, index in zip(sides, (shot.row, shot.column), strict=True)]
+        if not first:
+            shares = [np.linalg.lstsq(side, np.ones(len(side)), rcond=None)[0] for side in sides]
+        even = all(np.abs(side @ share - 1).max() < 1e-6 for side, share in zip(sides, shares, strict=True))
+        if closing.saturated or not (first or even):
             reason = "it is saturated" if closing.saturated else "the patterns do not add up to even light"
             yield FrameFault("closing", (), (), f"the closing frame decides nothing, because {reason}")
             return
-        power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
-        away = closing.light - predicted
-        own = variance + closing.variance
-        beyond = sum_of_squares(away) - float(own.sum())
-        chance = CHANCE * float(np.sqrt(2 * np.square(own).sum()))
-        part = float(np.sqrt(max(beyond, 0.0) / max(sum_of_squares(predicted), TINY)))
-        if beyond > chance and part > OFF:
+        predicted, variance = np.zeros_like(closing.light), closing.variance
+        for each in self._data.measurements_again():
+            if share := float(shares[0][each.row] * shares[1][each.column]):
+                light = (each.light + shot.sign * each.frame) / 2 if half else each.frame
+                own = noise.of(light, 1) if half else noise.of(each.light, each.shots)
+                predicted, variance = predicted + share * light, variance + share**2 * np.maximum(own, 0.0)
+        energy = max(sum_of_squares(predicted), TINY)
+        beyond = sum_of_squares(closing.light - predicted) - float(variance.sum())
+        part = float(np.sqrt(max(beyond, 0.0) / energy))
+        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > OFF:
             words = (
-                f"{part:.1%} of the closing frame differs from the frames before it, and its power is {power:.3f} of "
-                "theirs: lamp, camera or scene changed"
+                f"{part:.1%} of the closing frame differs from the frames before it, and its power is "
+                f"{np.vdot(closing.light, predicted) / energy:.3f} of theirs: lamp, camera or scene changed"
             )
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
-
-    def _prediction(self, kind: str) -> tuple[FloatArray | None, FloatArray]:
-        """Return what the frames predict of the closing frame, and its noise variance (m, m')."""
-        noise, measurements = self._data.noise, self._data.measurements_again()
-        if kind == "first":
-            shot = self._shots[0]
-            for each in measurements:
-                if (each.row, each.column) == (shot.row, shot.column):
-                    light = each.frame if not shot.sign else (each.light + shot.sign * each.frame) / 2
-                    return light, np.maximum(noise.of(light, 1), 0.0)
-        # Shares of the patterns that add up to light of all pixels.
-        shares = [np.linalg.lstsq(side, np.ones(len(side)), rcond=None)[0] for side in self._data.shots.patterns]
-        sums = [side @ share for side, share in zip(self._data.shots.patterns, shares, strict=True)]
-        if any(np.abs(each - 1).max() > 1e-6 for each in sums):
-            return None, np.zeros(())
-        light, variance = np.zeros(self._sums.squares.shape), np.zeros(self._sums.squares.shape)
-        for each in measurements:
-            share = float(shares[0][each.row] * shares[1][each.column])
-            if share:
-                light += share * each.frame
-                variance += share**2 * np.maximum(noise.of(each.light, each.shots), 0.0)
-        return light, variance
 
     # ---- Words
 

@@ -35,8 +35,6 @@ from mitsim.reconstruct.uncertainty import Propagation
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
 and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2 (49)."""
-UNEXPLAINED_TILE = 2e-2
-"""The same part of a single tile, where print is not averaged: above all that fitting scenes left."""
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 """Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated:
 read noise of as many electrons makes 2."""
@@ -389,8 +387,6 @@ def weigh(
     stated = noise.stated and factors_stated
     if stated:
         flagged = unexplained > UNEXPLAINED and chi_square > 1 + noise_chance(noise, float(pixels.sum()))
-        local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + noise_chance(noise, float(pixels.min())))
-        flagged = flagged or bool(local.any())
     else:
         flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
     cause = Cause.MODEL if flagged else None
