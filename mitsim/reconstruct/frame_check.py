@@ -127,10 +127,13 @@ class FrameCheck:
         bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
         expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
         excess = float(sums.squares.sum()) - expected
-        # Single frames are at fault only if the rest fits without them.
-        restored = beyond[bad].sum() > _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
-        if 0 < np.count_nonzero(bad) <= max(1, _MOST_BAD * count) and restored:
-            for row, column in sorted(np.argwhere(bad), key=lambda place: -part[tuple(place)]):
+        named = sorted(((int(i), int(j)) for i, j in np.argwhere(bad)), key=lambda place: -part[place])
+        if 0 < len(named) <= max(1, _MOST_BAD * count):
+            # Single frames are at fault only if the rest fits without them.
+            restored = sums.without(named) - float((self._variance * sums.free + share)[bad].sum())
+            if restored < _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum())):
+                return
+            for row, column in named:
                 size, signs = float(np.sqrt(part[row, column])), [0]
                 if self._signed:  # the sums of pairs decide which half
                     side = self._sums.pairs[row, column].side if self._sums.pairs else 0.0

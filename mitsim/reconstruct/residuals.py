@@ -17,12 +17,14 @@ that is in one place, and sensors of uneven response raise no alarm.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
@@ -48,6 +50,8 @@ _PAIR_ROWS = 96
 """Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
 _BRIGHT = 50.0
 """Energy of a half over that of its noise from which it is no black one."""
+_EXACT, _STEPS = 1e-2, 50
+"""Relative residual at which conjugate gradients end, and steps at most; patterns that share little need a few."""
 _SAMPLE = 20_000
 """Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
@@ -142,8 +146,8 @@ class Residuals:
         (tiles, tiles) pixels of each tile.
     squares, total
         (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
-    leave_out
-        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e: what is left of it when the others predict it.
+    own, leave_out
+        (K, K') energy of a pattern's residual, and e^T (I - H_kk)^-1 e of a pattern's residual e: what is left of it when the others predict it.
     shots
         (K, K') energy of a pattern's shots.
     free
@@ -163,8 +167,9 @@ class Residuals:
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         counts = prepared.left.pattern_count, prepared.right.pattern_count
-        self.leave_out, self.shots, self.free = (np.zeros(counts) for _ in range(3))
+        self.own, self.leave_out, self.shots, self.free = (np.zeros(counts) for _ in range(4))
         self.pairs: dict[tuple[int, int], Pair] = {}
+        self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
         self.squares, self._early, self.total = (np.zeros(sizes) for _ in range(3))
@@ -203,11 +208,12 @@ class Residuals:
         known = np.outer(values, other_values)
         alone = known > 1 - 1e-6
         self.free[pattern] = residual.size - np.count_nonzero(alone)
-        self.leave_out[pattern] = sum_of_squares(residual)
+        self.own[pattern] = self.leave_out[pattern] = sum_of_squares(residual)
         if not alone.all():
             if coefficients is None or self._light is not None:
                 coefficients = left.matrix.T @ frame @ right.matrix
             seen = turn.T @ coefficients @ other_turn - known * (turn.T @ own @ other_turn)
+            self._seen[pattern] = turn @ seen @ other_turn.T
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
@@ -231,6 +237,29 @@ class Residuals:
             size = np.sqrt(sum_of_squares(beyond) * sum_of_squares(left_over))
             side = float(beyond @ left_over / max(size, TINY))
             self.pairs[pattern] = Pair(powers, np.asarray(np.sqrt(np.diag(covariance))), side, costly)
+
+    def without(self, patterns: Sequence[tuple[int, int]]) -> float:
+        """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
+
+        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
+        + <z, x> with z = A^T e and (I - A^T A) x = z.
+        """
+        grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
+        seen = np.zeros_like(self.weights)
+        for each in patterns:
+            seen[self._prepared.places(each)] += self._seen.get(each, 0.0)
+
+        def apart(values: FloatArray) -> FloatArray:
+            found = values.reshape(seen.shape).copy()
+            for each, (left, right) in grams.items():
+                places = self._prepared.places(each)
+                found[places] -= left @ values.reshape(seen.shape)[places] @ right
+            return found.ravel()
+
+        # Directions that no other pattern sees have no curvature: later steps would end there.
+        operator = LinearOperator((seen.size, seen.size), matvec=apart, dtype=np.float64)
+        found, _ = cg(operator, seen.ravel(), rtol=_EXACT, maxiter=_STEPS)
+        return sum(float(self.own[each]) for each in patterns) + float(np.vdot(seen, found))
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
