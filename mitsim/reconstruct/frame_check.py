@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.defects import lit_everywhere
 from mitsim.reconstruct.picture_check import PictureCheck, robust_scatter
 from mitsim.reconstruct.residuals import CHANCE, TINY, Residuals
 from mitsim.reconstruct.uncertainty import Propagation
@@ -25,6 +26,8 @@ Pattern = tuple[int, int]
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
+_CLOSING = 4e-3
+"""Part of a closing frame, rms, by which it may be off: no calibration and no print is between it and other frames."""
 _SIDE = 0.3
 """Correlation of a pair's sum with its difference from which one of its halves is at fault."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
@@ -37,6 +40,16 @@ _FLICKERS, _POWER = 15.0, 0.01
 print of a regular texture imitates smaller ones; all are part of the uncertainty."""
 _FEWEST_PAIRS, _COSTS = 4, 0.5
 """Pairs from which a flicker is reported, and its scatter over that which adds twice the energy of the noise."""
+_DOTS = (
+    "under dots each scene pixel is in one frame, so that only the picture tells a lamp, camera or scene that changed."
+)
+_LEAKING = (
+    "Light of the room cancels. A projector that leaks it, and did not when calibrated, darkens the image as much."
+)
+_REMEDY = "A closing frame (--closing-frame uniform) decides it."
+"""Sentences on what is not decided."""
+_LEAK = 5e-3
+"""Light of a dark pattern, over that of the bright one, from which a leaking projector is spoken of."""
 _RESTORED = 0.9
 """Part of the unexplained energy by which the residual must fall without frames that are at fault."""
 _SCATTERS = 4.0
@@ -64,6 +77,17 @@ class FrameFault:
         return {"fault": self.kind, "frames": list(self.numbers), "files": list(self.files), "words": self.words}
 
 
+class Limit(NamedTuple):
+    """What the frames leave undecided: ``words`` for people, and the ``sizes`` up to which it is not seen, by name."""
+
+    words: str
+    sizes: dict[str, float | None]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the entry of result.json."""
+        return {"words": self.words, **self.sizes}
+
+
 class FrameCheck:
     """Tests the frames of accumulated ``data``.
 
@@ -89,6 +113,7 @@ class FrameCheck:
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
         exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
         self.picture = self._check_picture(lam) if exclusive else None
+        self._exclusive = exclusive
 
     def faults(self) -> tuple[FrameFault, ...]:
         """Return all frames that do not fit the others."""
@@ -227,12 +252,36 @@ class FrameCheck:
         energy = max(sum_of_squares(predicted), TINY)
         beyond = sum_of_squares(closing.light - predicted) - float(variance.sum())
         part = float(np.sqrt(max(beyond, 0.0) / energy))
-        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > OFF:
+        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > _CLOSING:
             words = (
                 f"{part:.1%} of the closing frame differs from the frames before it, and its power is "
                 f"{np.vdot(closing.light, predicted) / energy:.3f} of theirs: lamp, camera or scene changed"
             )
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
+
+    # ---- What no test decides
+
+    def limits(self) -> tuple[Limit, ...]:
+        """Return what the frames of a real camera leave undecided, unless a uniform closing frame decides it."""
+        shots = self._data.shots
+        if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
+            return ()
+        whole, found = lit_everywhere(self._data), self.picture
+        if self._exclusive:
+            sizes: dict[str, float | None] = dict.fromkeys(("pixel", "power", "place"))
+            told = "is too small to decide about single frames"
+            if found:
+                power, place = (float(np.median(each)) for each in (found.power_error, found.place[1]))
+                sizes = {"pixel": found.predicted, "power": power, "place": place}
+                told = (
+                    f"decides pixels to {found.predicted:.2g}, power to {power:.1%}, places to {place:.2g} scene pixels"
+                )
+            words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
+            return (Limit(words, sizes),)
+        pair = self._sums.pairs.get(whole) if whole else None
+        leak = (1 - pair.contrast) / (1 + pair.contrast) if pair else 0.0
+        words = f"the dark half of the even pattern has {leak:.1%} of the light of the bright one. {_LEAKING} {_REMEDY}"
+        return (Limit(words, {"leak": leak}),) if leak > _LEAK else ()
 
     # ---- Words
 

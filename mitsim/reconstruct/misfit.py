@@ -24,7 +24,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.defects import Defects, find_defects
 from mitsim.reconstruct.estimate_factors import decibels
-from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
+from mitsim.reconstruct.frame_check import FrameCheck, FrameFault, Limit
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, noise_chance
@@ -107,6 +107,8 @@ class Misfit:
         what the picture decides of frames under shifting dots; None under other patterns.
     common
         relative change of the image, rms, by light that is the same in all frames.
+    limits
+        what the frames leave undecided.
     """
 
     chi_square: float
@@ -126,6 +128,7 @@ class Misfit:
     detail: float = 0.0
     picture: PictureCheck | None = None
     common: float = 0.0
+    limits: tuple[Limit, ...] = ()
 
     @property
     def gist(self) -> str:
@@ -194,6 +197,7 @@ class Misfit:
             "readings": [reading.summary() for reading in self.readings],
             "places": [place.words for place in self.places],
             "faults": [fault.summary() for fault in self.faults],
+            "limits": [limit.summary() for limit in self.limits],
             "power_error": float(np.median(self.picture.power_error)) if self.picture else None,
             "map": self.tiles.tolist(),
         }
@@ -266,7 +270,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
     faults = check.faults()
     places = sums.places(ratio) if noise.stated and not off else []
-    found = replace(found, faults=faults, places=tuple(places), picture=check.picture)
+    found = replace(found, faults=faults, places=tuple(places), picture=check.picture, limits=check.limits())
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
     turned = noise.shots == 2 and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.

@@ -17,6 +17,7 @@ What the picture leaves undecided is stated as a standard error of the power and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -92,7 +93,7 @@ class PictureCheck:
         self._even = image * (1 - self.power[frame_of])
         left_over = stencil.differences(self._even)
         differences = left_over / stencil.scale(left_over, stencil.pixels)
-        self.predicted = robust_scatter(left_over)
+        self.predicted = float(np.sqrt(np.mean(np.square(left_over))))
         own = frame_of.ravel()[stencil.pixels]
         lit = np.maximum(np.bincount(own, minlength=count), 1)
         roughness = np.log1p(np.square(differences))
@@ -109,19 +110,20 @@ class PictureCheck:
         self.foreign = np.maximum(self.foreign, np.where(black, _DARKER * missing / chance, 0.0))
         self.disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
 
+    @cached_property
     def place(self) -> tuple[FloatArray, FloatArray]:
-        """Return the place (2, K) of each frame along rows and columns [scene pixels], and its standard error."""
+        """The place (2, K) of each frame along rows and columns [scene pixels], and its standard error."""
         # Looked for in the picture without the powers, because in even parts these look like a slope.
         place, error = self._stencil.fit(self._even, [*np.gradient(self._even)], _SHIFT)
         return place.reshape(2, -1), error.reshape(2, -1)
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames:
-        their scatter over the frames, beyond what the picture makes of it, which may be twice the errors."""
-        power, *moves = (
-            np.sqrt(max(robust_scatter(own) ** 2 - float(np.median(2 * error)) ** 2, 0.0))
-            for own, error in ((self.power, self.power_error), *zip(*self.place(), strict=True))
-        )
+        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
+
+        It is made of their scatter over the frames. A regular print makes part of that, which cannot be told from a
+        flicker.
+        """
+        power, *moves = (robust_scatter(own) for own in (self.power, *self.place[0]))
         parts = [image * power, *(slope * move for slope, move in zip(np.gradient(image), moves, strict=True))]
         return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
 

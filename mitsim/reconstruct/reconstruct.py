@@ -115,8 +115,9 @@ class Reconstruction(Solution):
 
     @property
     def trust(self) -> tuple[str, ...]:
-        """A line on the misfit, and one on the uncertainty by source, where these are known."""
-        return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
+        """Lines on the misfit, on the uncertainty by source, and on what the frames leave undecided, where known."""
+        limits = tuple(f"not decided: {limit.words}" for limit in self.misfit.limits) if self.misfit else ()
+        return (*(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known), *limits)
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""

@@ -117,12 +117,15 @@ class Pair(NamedTuple):
         its correlation with the residual of the halves' difference: 1 if the first half is wrong, -1 if the second is.
     costly
         power whose error of both halves has twice the energy of the noise of their difference.
+    contrast
+        difference of the halves' light over their sum.
     """
 
     powers: FloatArray
     errors: FloatArray
     side: float
     costly: float
+    contrast: float
 
 
 class Place(NamedTuple):
@@ -147,7 +150,8 @@ class Residuals:
     squares, total
         (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
     own, leave_out
-        (K, K') energy of a pattern's residual, and e^T (I - H_kk)^-1 e of a pattern's residual e: what is left of it when the others predict it.
+        (K, K') energy of a pattern's residual e, and e^T (I - H_kk)^-1 e: what is left of it when the others predict
+        it.
     shots
         (K, K') energy of a pattern's shots.
     free
@@ -233,10 +237,11 @@ class Residuals:
             costly = float(np.sqrt(variance * total.size / max(sum_of_squares(halves), TINY)))
             halves *= (np.square(halves).sum(axis=1) > _BRIGHT * variance / 4 * halves.shape[1])[:, None]
             covariance = np.linalg.inv(halves @ halves.T / variance + np.eye(2) / POWER**2)
-            powers = covariance @ (halves @ beyond) / variance
+            powers = np.asarray(covariance @ (halves @ beyond) / variance)
             size = np.sqrt(sum_of_squares(beyond) * sum_of_squares(left_over))
             side = float(beyond @ left_over / max(size, TINY))
-            self.pairs[pattern] = Pair(powers, np.asarray(np.sqrt(np.diag(covariance))), side, costly)
+            contrast = float(difference.sum() / max(total.sum(), TINY))
+            self.pairs[pattern] = Pair(powers, np.sqrt(np.diag(covariance)).astype(np.float64), side, costly, contrast)
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
