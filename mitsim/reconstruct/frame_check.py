@@ -144,22 +144,31 @@ class FrameCheck:
 
     def _unlike_model(self) -> Iterator[FrameFault]:
         """Compare each frame with the prediction of the others by the model."""
-        sums, count = self._sums, self._variance.size
+        sums, count, noise = self._sums, self._variance.size, self._variance
         share = self._beside * sums.shots / max(float(sums.shots.sum()), TINY)
-        beyond, chance = sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free)
-        part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
-        usual = float(np.median(part)) if count > 2 else float(part.max())
-        bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
-        expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
-        excess = float(sums.squares.sum()) - expected
-        named = sorted(((int(i), int(j)) for i, j in np.argwhere(bad)), key=lambda place: -part[place])
-        if 0 < len(named) <= max(1, _MOST_BAD * count):
-            # Single frames are at fault only if the rest fits without them.
-            restored = sums.without(named) - float((self._variance * sums.free + share)[bad].sum())
-            if restored < _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum())):
-                return
+        tests = [(sums.leave_out - noise * sums.free - share, noise * np.sqrt(2 * sums.free))]
+        if sums.pairs:
+            data, of_sums = sums.pairs[0, 0].size, noise + noise.mean() / (count - 1)
+            rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(noise.shape)], noise.shape)
+            whole = sums.squares.size / data
+            tests.append((whole * (rest - of_sums * data) - share, 2 * whole * of_sums * np.sqrt(2 * data)))
+        excess = float(sums.squares.sum() - noise.sum() * sums.squares.size * self._data.prepared.spare) - self._beside
+        off = np.zeros(noise.shape)
+        for beyond, chance in tests:
+            part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
+            usual = float(np.median(part)) if count > 2 else float(part.max())
+            bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
+            few = 0 < int(np.count_nonzero(bad)) <= max(1, _MOST_BAD * count)
+            if few and beyond is tests[0][0]:
+                # Single frames are at fault only if the rest fits without them.
+                restored = sums.without([(int(i), int(j)) for i, j in np.argwhere(bad)])
+                restored -= float((noise * sums.free + share)[bad].sum())
+                few = restored >= _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
+            off = np.maximum(off, np.where(bad, part, 0.0)) if few or beyond is not tests[0][0] else off
+        named = sorted(((int(i), int(j)) for i, j in np.argwhere(off)), key=lambda place: -off[place])
+        if len(named) <= max(1, _MOST_BAD * count):
             for row, column in named:
-                size, signs = float(np.sqrt(part[row, column])), [0]
+                size, signs = float(np.sqrt(off[row, column])), [0]
                 if self._signed:  # the sums of pairs decide which half
                     side = self._sums.pairs[row, column].side if self._sums.pairs else 0.0
                     signs = [1, -1] if abs(side) < _SIDE else [int(np.sign(side))]

@@ -324,24 +324,23 @@ def _common_light(data: Accumulation, sums: Residuals, expected: float) -> Float
     prepared, count = data.prepared, data.noise.variance.size
     if data.noise.shots == 2 or count < 2:
         return None
-    lit = np.outer(*(side.sum(axis=1) for side in data.factors.sides))
-    fields = [prepared.as_solved(each) for each in (np.ones(lit.shape), lit / max(np.sqrt(np.mean(lit**2)), TINY))]
-    left, right = prepared.left.common, prepared.right.common
-    weights = [left.T @ field @ right for field in fields]
-    normal = count * _products(fields) - _products(weights)
+    lights = [
+        np.stack([np.ones(len(side)), side.sum(axis=1) / max(float(side.sum()), TINY)]) for side in data.factors.sides
+    ]
+    if prepared.centre:
+        lights = [light - light.mean(axis=1, keepdims=True) for light in lights]
+    weights = [light @ side.common for light, side in zip(lights, (prepared.left, prepared.right), strict=True)]
+    whole = count * np.prod([light @ light.T for light in lights], axis=0)
+    normal = whole - np.prod([weight @ weight.T for weight in weights], axis=0)
     # Light of an even scene may lie in the model's range, and light without contrast is lost by centring.
-    scale = np.sqrt(np.maximum(np.diag(normal), _IN_RANGE * count * lit.size))
-    side = np.array([np.vdot(field, sums.total) for field in fields]) / scale
+    scale = np.sqrt(np.maximum(np.diag(normal), _IN_RANGE * np.diag(whole)) + TINY)
+    side = np.einsum("fi,ij,fj->f", lights[0], sums.total, lights[1], optimize=True) / scale
     found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=_IN_RANGE) @ side
     energy, excess = max(float(sums.energy.sum()), TINY), float(sums.squares.sum()) - expected
     least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * energy)
     if found @ side < max(least, _MOSTLY * excess):
         return None
-    return np.asarray(np.tensordot(found / scale, fields, axes=1))
-
-
-def _products(values: list[FloatArray]) -> FloatArray:
-    return np.array([[np.vdot(one, other) for other in values] for one in values])
+    return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
 
 
 def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -> float:

@@ -29,11 +29,11 @@ from mitsim.core.arrays import FloatArray
 
 IntArray = npt.NDArray[np.intp]
 
-POWER, _SHIFT = 0.1, 0.5
+_POWER, _SHIFT = 0.1, 0.5
 """Standard deviations of the power of a frame and of its place [scene pixels] before the frames are seen."""
 _SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
-_PIXELS = 6000
+_PIXELS = 4000
 """Pixels to which the stencil is fitted at most, to save time."""
 _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
@@ -89,7 +89,7 @@ class PictureCheck:
         self.decides = bool(stencil.offsets) and stencil.pixels.size >= _FEWEST * (count + len(stencil.offsets))
         if not self.decides:
             return
-        self.power, self.power_error = stencil.fit(image, [image], POWER, _SCALES)
+        self.power, self.power_error = stencil.fit(image, [image], _POWER, _SCALES)
         self._even = image * (1 - self.power[frame_of])
         left_over = stencil.differences(self._even)
         differences = left_over / stencil.scale(left_over, stencil.pixels)

@@ -29,7 +29,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.picture_check import POWER, IntArray, robust_scatter
+from mitsim.reconstruct.picture_check import IntArray, robust_scatter
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
@@ -37,8 +37,8 @@ TINY = 1e-300
 """Replaces 0 in a denominator."""
 _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
-_NOISE_TILE, _NOISE_ROWS = 16, 66
-"""Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
+_NOISE_TILE, _NOISE_TILES = 16, 1500
+"""Least pixels a side of a tile whose noise is measured, and tiles of all frames that are enough, to save time."""
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
@@ -48,8 +48,9 @@ _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
 _PAIR_ROWS = 96
 """Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
-_BRIGHT = 50.0
-"""Energy of a half over that of its noise from which it is no black one."""
+_BRIGHT, _ALIKE = 50.0, 1e-3
+"""Energy of a half over that of its noise from which it is no black one, because it would be fitted to its own noise;
+and determinant of the products of a pair's halves, over the square of the larger, below which they are alike."""
 _EXACT, _STEPS = 1e-2, 50
 """Relative residual at which conjugate gradients end, and steps at most; patterns that share little need a few."""
 _SAMPLE = 20_000
@@ -112,9 +113,12 @@ class Pair(NamedTuple):
     ----------
     powers, errors
         (2,) relative power of the first and of the second half beyond that of the other pairs, and their standard
-        errors.
+        errors; infinite where a half is as good as black, or as the other one.
+    rest, size
+        energy that no power of the halves explains, and number of the data that are compared.
     side
-        its correlation with the residual of the halves' difference: 1 if the first half is wrong, -1 if the second is.
+        correlation of the rest with the residual of the halves' difference: 1 if the first half is wrong, -1 if the
+        second is.
     costly
         power whose error of both halves has twice the energy of the noise of their difference.
     contrast
@@ -123,6 +127,8 @@ class Pair(NamedTuple):
 
     powers: FloatArray
     errors: FloatArray
+    rest: float
+    size: int
     side: float
     costly: float
     contrast: float
@@ -143,8 +149,8 @@ class Residuals:
 
     Attributes
     ----------
-    energy
-        (tiles, tiles) sum of the squares of measurements.
+    energy, residual
+        (tiles, tiles) sums of the squares of measurements and of residuals.
     pixels
         (tiles, tiles) pixels of each tile.
     squares, total
@@ -176,10 +182,9 @@ class Residuals:
         self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
-        self.squares, self._early, self.total = (np.zeros(sizes) for _ in range(3))
+        self.squares, self._early, self.total, self._powers = (np.zeros(sizes) for _ in range(4))
         # Arrays of one frame, because to make them anew takes longer than to fill them.
         self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
-        self.energy = np.zeros(self.pixels.shape)
         self.weights = data.weights
         if light is not None:
             self.weights = self.weights - prepared.left.common.T @ prepared.as_solved(light) @ prepared.right.common
@@ -194,6 +199,7 @@ class Residuals:
             if 2 * number < total <= 2 * number + 2:
                 self._early = self.squares.copy()
             self._add(measurement, data.coefficients.get((measurement.row, measurement.column)))
+        self.energy, self.residual = self._tiles(self._powers), self._tiles(self.squares)
 
     def _add(self, measurement: Measurement, coefficients: FloatArray | None) -> None:
         pattern, prepared = (measurement.row, measurement.column), self._prepared
@@ -204,10 +210,9 @@ class Residuals:
         np.subtract(frame, residual, out=residual)
         self.squares += np.multiply(residual, residual, out=self._squared)
         self.total += residual
-        rows = np.stack([np.einsum("ij,ij->j", frame[strip], frame[strip]) for strip in self._strips])
-        self.energy += (energy := np.add.reduceat(rows, self._starts, axis=1))
+        self._powers += np.multiply(frame, frame, out=self._squared)
         # Behind a mask with a constant term most of the light contributes nothing to the image.
-        self.shots[pattern] = float(energy.sum()) if prepared.centre else measurement.power
+        self.shots[pattern] = float(self._squared.sum()) if prepared.centre else measurement.power
         (turn, values), (other_turn, other_values) = (self._grams[side][index] for side, index in enumerate(pattern))
         known = np.outer(values, other_values)
         alone = known > 1 - 1e-6
@@ -231,17 +236,22 @@ class Residuals:
                 each[some, some].ravel() for each in (measurement.light, measurement.frame, residual, self.noise.light)
             )
             beyond = (total * (1 + others) - every) / others
-            halves = np.stack([total + difference, total - difference]) / 2
-            variance = max(2 * float(self.noise.variance[pattern]), TINY)
-            # A black half would be fitted to its own noise.
-            costly = float(np.sqrt(variance * total.size / max(sum_of_squares(halves), TINY)))
-            halves *= (np.square(halves).sum(axis=1) > _BRIGHT * variance / 4 * halves.shape[1])[:, None]
-            covariance = np.linalg.inv(halves @ halves.T / variance + np.eye(2) / POWER**2)
-            powers = np.asarray(covariance @ (halves @ beyond) / variance)
-            size = np.sqrt(sum_of_squares(beyond) * sum_of_squares(left_over))
-            side = float(beyond @ left_over / max(size, TINY))
-            contrast = float(difference.sum() / max(total.sum(), TINY))
-            self.pairs[pattern] = Pair(powers, np.sqrt(np.diag(covariance)).astype(np.float64), side, costly, contrast)
+            halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
+            normal = halves @ halves.T
+            powers: FloatArray = np.zeros(2)
+            errors: FloatArray = np.full(2, np.inf)
+            bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
+            if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
+                inverse = np.linalg.inv(normal)
+                powers, errors = (
+                    inverse @ (halves @ beyond),
+                    np.asarray(np.sqrt(variance * np.diag(inverse)), np.float64),
+                )
+            rest = beyond - powers @ halves
+            side = float(rest @ left_over) / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
+            costly = float(np.sqrt(variance * total.size / max(float(np.trace(normal)), TINY)))
+            contrast = float(difference.sum() / max(float(total.sum()), TINY))
+            self.pairs[pattern] = Pair(powers, errors, sum_of_squares(rest), rest.size, side, costly, contrast)
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
@@ -268,8 +278,9 @@ class Residuals:
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
-        first = max(len(residual) - _NOISE_ROWS, 0) // 2
-        rows = slice(first, first + _NOISE_ROWS)
+        tiles = -(-_NOISE_TILES * _NOISE_TILE // (residual.shape[1] * self.noise.variance.size))
+        first = max(len(residual) - tiles * _NOISE_TILE - 2, 0) // 2
+        rows = slice(first, first + tiles * _NOISE_TILE + 2)
         rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1))
         light = measurement.light[rows][1:-1, 1:-1]
         size = 36 * (len(residual) - 2) * (residual.shape[1] - 2)
@@ -309,11 +320,6 @@ class Residuals:
         gain = 2 * ratio / (1 - share + float(np.sqrt((1 - share) ** 2 + 4 * share * ratio)))
         return NoiseTest(ratio, error, gain, error if self.noise.stated else float("inf"))
 
-    @property
-    def residual(self) -> FloatArray:
-        """(tiles, tiles) sum of the squares of residuals."""
-        return self._tiles(self.squares)
-
     def expected_energy(self, ratio: float, beside: float) -> FloatArray:
         """Return (tiles, tiles) the energy that residuals should have.
 
@@ -349,7 +355,8 @@ class Residuals:
             # The cube root of a chi-square is nearly normal (Wilson and Hilferty 1931).
             spread = 2 / (9 * np.maximum(free, 0.5))
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
-            beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
+            usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
+            beyond[name] = np.where(away > _PLACE, squares - usual * own, 0.0)
         change = tiles[0] - 2 * self._tiles(self._early)
         far = np.abs(_deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))) > _PLACE
         beyond["half"] = np.where(far, np.abs(change), 0.0)
