@@ -134,8 +134,8 @@ class DepthMap:
         variance = float(noise.variance.mean()) * self.data * spare
         expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
         whole = self.left_over, self.energy, expected, self.data / noise.variance.size
-        residual, energy, allowed, pixels = (np.array([[value]]) for value in whole)
-        return weigh(residual, energy, allowed, pixels, factor_energy is not None, noise, self.part * print_energy)[0]
+        energies = tuple(np.array([[value]]) for value in whole)
+        return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
 
     def channels(self) -> dict[str, npt.NDArray[np.float32]]:
         """As a file has it: depth [mm], and confidence."""

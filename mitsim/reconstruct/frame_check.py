@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +38,8 @@ _FOREIGN, _DISTURBED = 6.5, 7.5
 _FLICKERS, _POWER = 15.0, 0.01
 """Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a
 print of a regular texture imitates smaller ones; all are part of the uncertainty."""
-_FEWEST_PAIRS, _COSTS = 4, 0.5
-"""Pairs from which a flicker is reported, and its scatter over that which adds twice the energy of the noise."""
+_FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
+"""Pairs, and frames that overlap, from which powers are told, and numbers that their fit may keep in memory."""
 _DOTS = (
     "under dots each scene pixel is in one frame, so that only the picture tells a lamp, camera or scene that changed."
 )
@@ -75,17 +75,6 @@ class FrameFault:
     def summary(self) -> dict[str, Any]:
         """Return the entry of result.json."""
         return {"fault": self.kind, "frames": list(self.numbers), "files": list(self.files), "words": self.words}
-
-
-class Limit(NamedTuple):
-    """What the frames leave undecided: ``words`` for people, and the ``sizes`` up to which it is not seen, by name."""
-
-    words: str
-    sizes: dict[str, float | None]
-
-    def summary(self) -> dict[str, Any]:
-        """Return the entry of result.json."""
-        return {"words": self.words, **self.sizes}
 
 
 class FrameCheck:
@@ -201,14 +190,34 @@ class FrameCheck:
         yield from self._powers(found.power, found.power_error, range(len(self._shots)), limit)
 
     def _flicker(self) -> Iterator[FrameFault]:
-        """Report halves of signed patterns of another power, because the halves of all pairs add up to one light."""
-        pairs = self._sums.pairs
+        """Report shots of another power.
+
+        The halves of all signed patterns add up to the same light. Where other patterns overlap, a frame of power 1 + a
+        adds a (I - H) Y to all residuals, so that the powers follow from normal equations with the matrix |Y_k|^2
+        delta_kl - C_k . C_l, C being the coefficients of frames in the model's range.
+        """
+        pairs, weights, count = self._sums.pairs, self._sums.weights, self._variance.size
         if len(pairs) >= _FEWEST_PAIRS and self._data.noise.stated:
             power, error = np.concatenate([(pair.powers, pair.errors) for pair in pairs.values()], axis=1)
             numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
-            costly = _COSTS * float(np.median([pair.costly for pair in pairs.values()]))
-            limit = max(CHANCE * float(np.median(error)), costly)
+            limit = max(_POWER, CHANCE * float(np.median(error)))
             yield from self._powers(power, error, numbers, limit)
+        if self._signed or self._exclusive or count < _FEWEST_FRAMES or count * weights.size > _MOST_NUMBERS:
+            return
+        seen, whole, patterns = np.zeros((count, *weights.shape)), np.zeros(count), [*np.ndindex(*self._variance.shape)]
+        for k, pattern in enumerate(patterns):
+            places = self._data.prepared.places(pattern)
+            left, right = (slab.matrix.T @ slab.matrix for slab in self._data.prepared.slabs(pattern))
+            seen[k][places] = left @ weights[places] @ right
+            whole[k] = float(np.vdot(weights, seen[k]))
+        flat, variance = seen.reshape(count, -1), float(self._variance.mean())
+        values, vectors = np.linalg.eigh(np.diag(whole) - flat @ flat.T)
+        known = values > max(variance, 1e-9 * float(values.max()))
+        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+        error = np.sqrt(variance * np.diag(inverse))
+        limit = max(_POWER, CHANCE * float(np.median(error)))
+        numbers = [self._number[(*pattern, 0)] for pattern in patterns]
+        yield from self._powers(inverse @ self._sums.fitted.ravel(), error, numbers, limit)
 
     def _powers(
         self, power: FloatArray, error: FloatArray, numbers: Sequence[int], most: float
@@ -270,8 +279,9 @@ class FrameCheck:
 
     # ---- What no test decides
 
-    def limits(self) -> tuple[Limit, ...]:
-        """Return what the frames of a real camera leave undecided, unless a uniform closing frame decides it."""
+    def limits(self) -> tuple[dict[str, Any], ...]:
+        """Return what the frames of a real camera leave undecided, unless a uniform closing frame decides it: entries
+        of result.json, with words and the sizes up to which nothing is seen."""
         shots = self._data.shots
         if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
             return ()
@@ -286,11 +296,11 @@ class FrameCheck:
                     f"decides pixels to {found.predicted:.2g}, power to {power:.1%}, places to {place:.2g} scene pixels"
                 )
             words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
-            return (Limit(words, sizes),)
+            return ({"words": words, **sizes},)
         pair = self._sums.pairs.get(whole) if whole else None
         leak = (1 - pair.contrast) / (1 + pair.contrast) if pair else 0.0
         words = f"the dark half of the even pattern has {leak:.1%} of the light of the bright one. {_LEAKING} {_REMEDY}"
-        return (Limit(words, {"leak": leak}),) if leak > _LEAK else ()
+        return ({"words": words, "leak": leak},) if leak > _LEAK else ()
 
     # ---- Words
 

@@ -24,7 +24,7 @@ from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
 from mitsim.reconstruct.defects import Defects, find_defects
 from mitsim.reconstruct.estimate_factors import decibels
-from mitsim.reconstruct.frame_check import FrameCheck, FrameFault, Limit
+from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, noise_chance
@@ -128,7 +128,7 @@ class Misfit:
     detail: float = 0.0
     picture: PictureCheck | None = None
     common: float = 0.0
-    limits: tuple[Limit, ...] = ()
+    limits: tuple[dict[str, Any], ...] = ()
 
     @property
     def gist(self) -> str:
@@ -197,7 +197,7 @@ class Misfit:
             "readings": [reading.summary() for reading in self.readings],
             "places": [place.words for place in self.places],
             "faults": [fault.summary() for fault in self.faults],
-            "limits": [limit.summary() for limit in self.limits],
+            "limits": list(self.limits),
             "power_error": float(np.median(self.picture.power_error)) if self.picture else None,
             "map": self.tiles.tolist(),
         }
@@ -258,8 +258,8 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         off = False  # numbers without an ADC may be means of many shots
     ratio = test.ratio if test and off else max(test.ratio, 1.0) if test and not noise.stated else 1.0
     expected, known = sums.expected_energy(ratio, factor_energy or 0.0), factor_energy is not None
-    balance = sums.residual, sums.energy, expected, sums.pixels, known, noise
-    found, excess = weigh(*balance, of_ramps)
+    energies = sums.residual, sums.energy, expected, sums.pixels
+    found, excess = weigh(energies, known, noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
         found = replace(found, chi_square=whole / max(stated + beside, TINY))
@@ -281,7 +281,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     found = replace(found, readings=(scaled,) if scaled else others)
     detail = _detail(data, sums, excess, beside) if found.flagged and not (found.readings or faults) else 0.0
     if detail:
-        fine, _ = weigh(*balance, max(of_ramps, detail))
+        fine, _ = weigh(energies, known, noise, max(of_ramps, detail))
         if not fine.flagged:
             found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
             found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
@@ -357,23 +357,15 @@ def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -
 
 
 def weigh(
-    residual: FloatArray,
-    energy: FloatArray,
-    expected: FloatArray,
-    pixels: FloatArray,
-    factors_stated: bool,
-    noise: FrameNoise,
-    print_energy: float,
+    energies: tuple[FloatArray, ...], factors_stated: bool, noise: FrameNoise, print_energy: float
 ) -> tuple[Misfit, float]:
     """Return the misfit, without its cause, and the energy that is unexplained.
 
     Parameters
     ----------
-    residual, energy, expected
-        (rows, columns) energy that a model leaves, of the measurements, and that is expected to be left, by tile of the
-        sensor, or of all of it.
-    pixels
-        (rows, columns) pixels of each tile.
+    energies
+        four arrays (rows, columns) by tile of the sensor, or of all of it: energy that a model leaves, of the
+        measurements, and that is expected to be left, and the pixels.
     factors_stated
         whether the noise of the factors was stated.
     noise
@@ -381,6 +373,7 @@ def weigh(
     print_energy
         energy that print within a pixel may add.
     """
+    residual, energy, expected, pixels = energies
     beyond = residual - expected - print_energy * pixels / pixels.sum()
     excess = float(beyond.sum())
     unexplained = float(np.sqrt(max(excess, 0.0) / max(float(energy.sum()), TINY)))

@@ -116,7 +116,7 @@ class Reconstruction(Solution):
     @property
     def trust(self) -> tuple[str, ...]:
         """Lines on the misfit, on the uncertainty by source, and on what the frames leave undecided, where known."""
-        limits = tuple(f"not decided: {limit.words}" for limit in self.misfit.limits) if self.misfit else ()
+        limits = tuple(f"not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
         return (*(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known), *limits)
 
     def summary(self) -> dict[str, Any]:

@@ -119,8 +119,6 @@ class Pair(NamedTuple):
     side
         correlation of the rest with the residual of the halves' difference: 1 if the first half is wrong, -1 if the
         second is.
-    costly
-        power whose error of both halves has twice the energy of the noise of their difference.
     contrast
         difference of the halves' light over their sum.
     """
@@ -130,7 +128,6 @@ class Pair(NamedTuple):
     rest: float
     size: int
     side: float
-    costly: float
     contrast: float
 
 
@@ -162,6 +159,8 @@ class Residuals:
         (K, K') energy of a pattern's shots.
     free
         (K, K') data of a pattern that others predict too.
+    fitted
+        (K, K') product of a pattern's residual and of what the model has of it.
     pairs
         by signed pattern, the difference of the sum of its halves from the sums of all other pairs.
     same, clipped
@@ -177,7 +176,7 @@ class Residuals:
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         counts = prepared.left.pattern_count, prepared.right.pattern_count
-        self.own, self.leave_out, self.shots, self.free = (np.zeros(counts) for _ in range(4))
+        self.own, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
         self.pairs: dict[tuple[int, int], Pair] = {}
         self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
@@ -223,6 +222,7 @@ class Residuals:
                 coefficients = left.matrix.T @ frame @ right.matrix
             seen = turn.T @ coefficients @ other_turn - known * (turn.T @ own @ other_turn)
             self._seen[pattern] = turn @ seen @ other_turn.T
+            self.fitted[pattern] = float(np.vdot(own, self._seen[pattern]))
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
@@ -242,16 +242,12 @@ class Residuals:
             errors: FloatArray = np.full(2, np.inf)
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
-                inverse = np.linalg.inv(normal)
-                powers, errors = (
-                    inverse @ (halves @ beyond),
-                    np.asarray(np.sqrt(variance * np.diag(inverse)), np.float64),
-                )
+                inverse: FloatArray = np.linalg.inv(normal)
+                powers, errors = inverse @ (halves @ beyond), np.asarray(np.sqrt(variance * np.diag(inverse)), float)
             rest = beyond - powers @ halves
             side = float(rest @ left_over) / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
-            costly = float(np.sqrt(variance * total.size / max(float(np.trace(normal)), TINY)))
             contrast = float(difference.sum() / max(float(total.sum()), TINY))
-            self.pairs[pattern] = Pair(powers, errors, sum_of_squares(rest), rest.size, side, costly, contrast)
+            self.pairs[pattern] = Pair(powers, errors, sum_of_squares(rest), rest.size, side, contrast)
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.

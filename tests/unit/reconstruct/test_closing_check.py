@@ -84,6 +84,6 @@ def test_a_projector_that_leaks_light() -> None:
     leaking = with_frames(shots, lambda frames: [dn + 0.05 * ((bright - even) - (dn - even)) for dn in frames])
     assert digital.black_level_dn == BLACK
     misfit = reconstruct(leaking, bench().calibrated(1)).misfit
-    assert misfit is not None and misfit.limits[0].sizes["leak"] == pytest.approx(0.05, rel=0.05)
+    assert misfit is not None and misfit.limits[0]["leak"] == pytest.approx(0.05, rel=0.05)
     known = reconstruct(shots, bench().calibrated(1)).misfit
     assert known is not None and not known.limits
