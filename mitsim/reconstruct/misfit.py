@@ -324,9 +324,8 @@ def _common_light(data: Accumulation, sums: Residuals, expected: float) -> Float
     prepared, count = data.prepared, data.noise.variance.size
     if data.noise.shots == 2 or count < 2:
         return None
-    lights = [
-        np.stack([np.ones(len(side)), side.sum(axis=1) / max(float(side.sum()), TINY)]) for side in data.factors.sides
-    ]
+    even_scene = [side.sum(axis=1) for side in data.factors.sides]
+    lights = [np.stack([np.ones(len(seen)), seen / max(float(np.abs(seen).max()), TINY)]) for seen in even_scene]
     if prepared.centre:
         lights = [light - light.mean(axis=1, keepdims=True) for light in lights]
     weights = [light @ side.common for light, side in zip(lights, (prepared.left, prepared.right), strict=True)]

@@ -238,12 +238,12 @@ class Residuals:
             beyond = (total * (1 + others) - every) / others
             halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
             normal = halves @ halves.T
-            powers: FloatArray = np.zeros(2)
-            errors: FloatArray = np.full(2, np.inf)
+            powers, errors = np.zeros(2), np.full(2, np.inf)
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
-                inverse: FloatArray = np.linalg.inv(normal)
-                powers, errors = inverse @ (halves @ beyond), np.asarray(np.sqrt(variance * np.diag(inverse)), float)
+                inverse = np.linalg.inv(normal)
+                powers = np.asarray(inverse @ (halves @ beyond), dtype=np.float64)
+                errors = np.asarray(np.sqrt(variance * np.diag(inverse)), dtype=np.float64)
             rest = beyond - powers @ halves
             side = float(rest @ left_over) / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
             contrast = float(difference.sum() / max(float(total.sum()), TINY))
