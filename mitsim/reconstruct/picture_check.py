@@ -33,7 +33,7 @@ _POWER, _SHIFT = 0.1, 0.5
 """Standard deviations of the power of a frame and of its place [scene pixels] before the frames are seen."""
 _SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
-_PIXELS = 4000
+_PIXELS = 2500
 """Pixels to which the stencil is fitted at most, to save time."""
 _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
@@ -148,7 +148,8 @@ def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: S
             total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
             scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
             # A texture with a period of its own deviates in most frames, and a disturbance in few.
-            scores /= np.maximum(np.quantile(scores, _FEW, axis=0) / _OF_NORMAL, 1.0)
+            few = int(_FEW * (len(scores) - 1))
+            scores /= np.maximum(np.partition(scores, few, axis=0)[few] / _OF_NORMAL, 1.0)
             for k, worst in enumerate(scores.max(axis=(1, 2))):
                 found[k : k + length] = np.maximum(found[k : k + length], worst)
     return found

@@ -115,9 +115,13 @@ class Reconstruction(Solution):
 
     @property
     def trust(self) -> tuple[str, ...]:
-        """Lines on the misfit, on the uncertainty by source, and on what the frames leave undecided, where known."""
-        limits = tuple(f"not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
-        return (*(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known), *limits)
+        """A line on the misfit, and one on the uncertainty by source, where these are known."""
+        return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
+
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """A sentence or more on each thing that the frames of a real camera leave undecided."""
+        return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -229,7 +233,11 @@ class Reconstruction(Solution):
             pictures[caption] = normalise(self.uncertainty)
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
-        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
+        return card(
+            f"Reconstruction: {self.status.verdict.value}",
+            pictures,
+            (str(self.status), *self.trust, *self.limits, facts),
+        )
 
 
 def _check_stored(more: object) -> None:

@@ -29,7 +29,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.picture_check import IntArray, robust_scatter
+from mitsim.reconstruct.picture_check import robust_scatter
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
@@ -391,14 +391,10 @@ def _deviations(values: FloatArray) -> FloatArray:
 
 def _words(name: str, beyond: FloatArray) -> str:
     """Return where the energy ``beyond`` is: by rows and columns of the sensor, or tiles of it."""
+    spans = [" to ".join(dict.fromkeys((str(each.min()), str(each.max())))) for each in np.nonzero(beyond)]
     if beyond.ndim == 1:
-        return f"sensor {name} {_span(np.flatnonzero(beyond))}"
-    rows, columns = (_span(np.unique(each)) for each in np.nonzero(beyond))
+        return f"sensor {name} {spans[0]}"
     if name in ("pixel", "mean"):
-        return f"{np.count_nonzero(beyond)} pixels in rows {rows}, columns {columns}"
+        return f"{np.count_nonzero(beyond)} pixels in rows {spans[0]}, columns {spans[1]}"
     when = " in one half of the session" if name == "half" else ""
-    return f"tile rows {rows}, columns {columns} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"
-
-
-def _span(numbers: IntArray) -> str:
-    return f"{numbers[0]}" if numbers[0] == numbers[-1] else f"{numbers[0]} to {numbers[-1]}"
+    return f"tile rows {spans[0]}, columns {spans[1]} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"

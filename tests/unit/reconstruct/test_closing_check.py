@@ -61,7 +61,7 @@ def test_what_dots_leave_undecided_is_stated_until_a_closing_frame_decides_it() 
     found = reconstruct(shots, factors)
     assert found.ok and found.misfit is not None
     (limit,) = found.summary()["misfit"]["limits"]
-    assert "--closing-frame uniform" in limit["words"] and limit["words"] in found.trust[-1]
+    assert "--closing-frame uniform" in limit["words"] and limit["words"] in found.limits[0]
     # Two of three pixels are bright: others hardly tell a pixel of such a page, and each frame has 64 of them.
     assert 0.1 < limit["pixel"] < 0.5 and 0.005 < limit["power"] < 0.1
     simulated = shots.manifest.model_copy(update={"plan": {"systematic_error": 0.0}})
