@@ -12,6 +12,8 @@ Each run has one fault. Its twin is the same run without the fault, with the sam
 
 - ``F`` flagged: refused, or flagged by the import or by the image;
 - ``.`` not flagged, and the rms error against the truth is at most twice the stated rms uncertainty;
+- ``L`` as ``S``, but the image states the limit (``limits`` in result.json), and the same run with a uniform closing
+  frame, which the limit names as the remedy, is flagged;
 - ``S`` silent: not flagged, the error is more than twice the stated one, and the fault adds to it: it is more than 1.2
   times that of the twin;
 - ``T`` not flagged, the error is more than twice the stated one, and that of the twin is as large: the uncertainty is
@@ -32,7 +34,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -766,12 +768,12 @@ class Judge:
             self.calibrations[camera] = place / "cal", factors
         return self.calibrations[camera]
 
-    def report(self, run: Run) -> dict[str, Any]:
-        """What mitsim reports of a run, and its error."""
+    def report(self, run: Run, last: tuple[float, np.ndarray] | None = None) -> dict[str, Any]:
+        """What mitsim reports of a run, and its error; ``last`` are exposure and numbers of a uniform closing frame."""
         calibration, factors = self.calibration(run.camera)
         self.count += 1
         place, camera = self.folder / f"run{self.count}", run.camera
-        write_frames(run.frames(), place / "frames")
+        write_frames([*run.frames(), *([last[1]] if last else [])], place / "frames")
         stated = {"gain": camera.gain, "black": camera.black, "read": camera.read, **run.stated}
         (place / "camera.toml").write_text(
             f'name = "own"\npixel_pitch_um = {1000 * SENSOR_MM / camera.pixels[0]}\nfull_well_e = 1e6\n'
@@ -793,6 +795,8 @@ class Judge:
                 camera=str(place / "camera.toml"),
                 exposure=run.exposure,
                 calibration=str(calibration),
+                closing_frame="uniform" if last else None,
+                closing_exposure=last[0] if last else None,
             )
             image = ms.reconstruct(ms.load_run(place / "run"), factors)
         except ms.MitsimError as error:
@@ -810,6 +814,7 @@ class Judge:
             "words": "; ".join([*warnings, str(image.status), *image.trust]),
             "chi_square": found.get("chi_square"),
             "unexplained": found.get("unexplained"),
+            "limits": [each["words"] for each in found.get("limits") or []],
             "cause": found.get("cause"),
             "named": sorted({n for one in found.get("faults") or [] for n in one["frames"]}),
             "stated": float(np.sqrt(np.mean(np.square(known.total)))) if known else None,
@@ -843,6 +848,10 @@ class Judge:
         run = Run(*case)
         wrong = lay(run, levels[severity], np.random.default_rng([self.seed, kind_number, severity, number]))
         found, twin = self.report(run), self.twin(*case)
+        letter, closed = verdict(found, twin), None
+        if letter in "ST" and found.get("limits"):
+            closed = self.report(run, closing_frame(run, kind, levels[severity]))
+            letter = "L" if letter == "S" and closed["flagged"] else letter
         return {
             "kind": kind,
             "severity": severity,
@@ -853,9 +862,27 @@ class Judge:
             "wrong": sorted(wrong or ()),
             "twin": {key: twin.get(key) for key in ("flagged", "misfit", "stated", "error", "inside", "chi_square")},
             "harmful": all(is_harmed(found, twin)),
-            "verdict": verdict(found, twin),
+            "verdict": letter,
+            "with_closing_frame": closed,
             "seconds": time.perf_counter() - begun,
         }
+
+
+def closing_frame(run: Run, kind: str, level: Any) -> tuple[float, np.ndarray]:
+    """Exposure and numbers of a uniform frame at the end of a run, when what moved is still there."""
+    part = run.exposure / max(len(run.light), 4)
+    moves: dict[str, dict[str, Any]] = {
+        "scene_moved": {"steps": (level, 0)},
+        "camera_moved": {"moved": level},
+        "camera_creeps": {"moved": level},
+    }
+    camera, rng = run.camera, np.random.default_rng([run.seed, 6])
+    light = run.light_of(0, lamp=np.ones((camera.n, camera.n)), **moves.get(kind, {})) * part / run.exposure
+    power = 1 - level if kind == "drift" else 1 + level * rng.standard_normal() if kind == "flicker" else 1.0
+    numbers = replace(camera, dark=camera.dark * part / run.exposure).numbers(light * power, rng)
+    for change in run.after:
+        (numbers,) = change([numbers])
+    return part, numbers
 
 
 def described(case: tuple[Camera, str, str, float, int]) -> dict[str, Any]:
@@ -902,7 +929,7 @@ def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[st
         yield (
             f"{'kind':16s}"
             + "".join(f"{name:>14s}" for name in families)
-            + f"{'flagged':>12s}{'silent':>8s}{'named':>9s}"
+            + f"{'flagged':>12s}{'limit':>7s}{'silent':>8s}{'named':>9s}"
         )
     for kind in (name for name in FAULTS if any(one["kind"] == name for one in rows)):
         own = [one for one in rows if one["kind"] == kind]
@@ -910,26 +937,27 @@ def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[st
         for name in families:
             runs = sorted((one for one in own if one["family"] == name), key=lambda one: (one["severity"], one["run"]))
             letters.append("".join(one["verdict"] for one in runs) or "-")
-        flagged, silent = (sum(one["verdict"] == letter for one in own) for letter in "FS")
+        flagged, limited, silent = (sum(one["verdict"] == letter for one in own) for letter in "FLS")
         framed = [one for one in own if one["wrong"] and one["flagged"] and not one["refused"]]
         named = sum(set(one["wrong"]) <= set(one["named"]) for one in framed)
         yield (
             f"{kind:16s}"
             + "".join(f"{each:>14s}" for each in letters)
-            + f"{flagged:>6d} of {len(own):<3d}{silent:>7d}"
+            + f"{flagged:>6d} of {len(own):<3d}{limited:>6d}{silent:>8d}"
             + (f"{named:>6d}/{len(framed)}" if framed else "")
         )
     for name in (*families, "all"):
         own = [one for one in rows if name in (one["family"], "all")]
-        count = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.ST"}
+        count = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.LST"}
         if own:
             harmful = [one for one in own if one["harmful"]]
             yield (
                 f"{name:16s} {len(own)} runs: {count['F']} flagged ({count['F'] / len(own):.1%}), {count['.']} not "
-                f"flagged and within twice the stated error, {count['S']} silent, {count['T']} off like their twins; "
+                f"flagged and within twice the stated error, {count['L']} within a stated limit that the closing "
+                f"frame decides, {count['S']} silent, {count['T']} off like their twins; "
                 f"{sum(one['flagged'] for one in harmful)} of {len(harmful)} harmful ones are flagged"
             )
-    for one in (one for one in rows if one["verdict"] in "ST"):
+    for one in (one for one in rows if one["verdict"] in "LST"):
         stated = "none" if one["stated"] is None else f"{one['stated']:.2g}"
         yield (
             f"{one['verdict']} {one['kind']} {one['level']} {case_text(one)} run {one['run']}: error {one['error']:.2g}"

@@ -225,6 +225,7 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> 
         *([] if payload["white"] == 1 else [f"image.png shows {payload['white']:.3g} electrons/s as white"]),
         *([] if image.focus is None else [str(image.focus)]),
         *([trust.capitalize()] if trust else []),
+        *image.limits,
         *common.details(
             *([str(image.status)] if image.ok else []),  # a warning has it otherwise
             f"lambda {payload['lambda']:.3g}, residual {payload['residual']:.1e}{rank_words}",

@@ -543,4 +543,6 @@ def read_head(folder: Path) -> RunHead:
 
 def write_manifest(folder: Path, manifest: RunHead | CalibrationManifest) -> None:
     """Write ``manifest`` to ``folder``, all or nothing. MitsimError when it cannot be written."""
-    write_json(folder / MANIFEST, manifest)
+    # Version 0.10.0 refuses keys that it does not know.
+    left_out = {key for key in ("closing_frame", "order") if getattr(manifest, key, None) is None}
+    write_json(folder / MANIFEST, manifest.model_dump(exclude=left_out))

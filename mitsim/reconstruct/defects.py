@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.runs import Measurement
-from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
+from mitsim.reconstruct.accumulation import Accumulation
 from mitsim.reconstruct.factorisation import IndexArray
 from mitsim.reconstruct.focus import DerivedCapture
 
@@ -86,36 +86,14 @@ class Defects:
                 left, right = prepared.slabs((row, column))
                 own, other = left.matrix[self.rows], right.matrix[self.columns]
                 predicted = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
-                leverage = np.square(own).sum(axis=1) * np.square(other).sum(axis=1)
-                step = (predicted - value) / np.maximum(1 - leverage / gain, 0.5)
-                value += step
-                step /= gain
+                step = (predicted - value) / gain
+                value += gain * step
                 change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
             weights += change
         moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        lit = [np.flatnonzero((side > 0).all(axis=0)) for side in data.shots.patterns]
-        total = np.zeros(len(self.rows))
-        if all(map(len, lit)):
-            total = prepared.frame(weights, (int(lit[0][0]), int(lit[1][0])))[self.rows, self.columns]
+        whole = lit_everywhere(data)
+        total = np.zeros(len(self.rows)) if whole is None else prepared.frame(weights, whole)[self.rows, self.columns]
         return LeftOut(data, self, moved, total)
-
-    def beyond_chance(self, rest: LeftOut, noise: FrameNoise) -> Defects | None:
-        """Those of them whose readings differ by more than noise from what all others tell; None where none does.
-
-        Parameters
-        ----------
-        rest
-            the capture without these.
-        noise
-            of the capture with them.
-        """
-        count = len(rest.moved)
-        variance = noise.of(noise.light[self.rows, self.columns] / count, noise.shots)
-        variance = np.maximum(variance, noise.of(float(noise.light.mean()) / count, noise.shots))
-        off = sum(np.square(moved) for moved in rest.moved.values()) / variance / count
-        # What the others tell has noise of its own: as much, at a leverage of a half.
-        kept = off > 2 * _limit(count)
-        return Defects(self.rows[kept], self.columns[kept]) if kept.any() else None
 
 
 class LeftOut(DerivedCapture):
@@ -145,6 +123,37 @@ class LeftOut(DerivedCapture):
             # The sum of a pair's halves is that of all pairs.
             light[places] = frame[places] if each.shots == 1 else np.maximum(np.abs(frame[places]), self._total)
             yield replace(each, frame=frame, light=light)
+
+
+def lit_everywhere(data: Accumulation) -> tuple[int, int] | None:
+    """Return a pattern of ``data`` that lights all scene pixels; None where there is none."""
+    lit = [np.flatnonzero((side > 0).all(axis=0)) for side in data.shots.patterns]
+    return (int(lit[0][0]), int(lit[1][0])) if all(map(len, lit)) else None
+
+
+def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defects | None:
+    """Return pixels that are off in all measurements of ``data``; None where there are none.
+
+    Parameters
+    ----------
+    data
+        the run.
+    squares
+        (m, m') sum of the squares of the residuals of each pixel.
+    ratio
+        measured over stated variance of the noise.
+    """
+    noise, prepared = data.noise, data.prepared
+    count = noise.variance.size
+    mean = noise.light / count
+    variance = ratio * noise.of(mean, noise.shots)
+    found = defects_of(squares, count * variance, count)
+    if noise.shots == 1 or (whole := lit_everywhere(data)) is None:
+        return found
+    # Differences of halves show little of pixels that stand still, and their sums show all of it.
+    away = prepared.as_solved(mean) - prepared.frame(data.weights, whole)
+    still = defects_of(np.square(away), variance / count, 1)
+    return still.with_others(found) if still else found
 
 
 def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects | None:

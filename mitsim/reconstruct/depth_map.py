@@ -36,7 +36,7 @@ from mitsim.reconstruct.accumulation import FrameNoise
 from mitsim.reconstruct.depth import Alternative, CommonBasis, best_depth, chance_difference, shifts_searched
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import STEP, are_dots, parallax_of, pixels_of_parallax, unambiguous_parallax
-from mitsim.reconstruct.misfit import Balance, Misfit
+from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import prepare
 
@@ -134,9 +134,8 @@ class DepthMap:
         variance = float(noise.variance.mean()) * self.data * spare
         expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
         whole = self.left_over, self.energy, expected, self.data / noise.variance.size
-        residual, energy, allowed, pixels = (np.array([[value]]) for value in whole)
-        balance = Balance(residual, energy, allowed, pixels, factor_energy is not None)
-        return balance.misfit(noise, self.part * print_energy)[0]
+        energies = tuple(np.array([[value]]) for value in whole)
+        return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
 
     def channels(self) -> dict[str, npt.NDArray[np.float32]]:
         """As a file has it: depth [mm], and confidence."""

@@ -17,7 +17,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation
-from mitsim.reconstruct.picture_check import PictureCheck, check_picture, robust_scatter
+from mitsim.reconstruct.defects import lit_everywhere
+from mitsim.reconstruct.picture_check import PictureCheck, robust_scatter
 from mitsim.reconstruct.residuals import CHANCE, TINY, Residuals
 from mitsim.reconstruct.uncertainty import Propagation
 
@@ -25,6 +26,10 @@ Pattern = tuple[int, int]
 
 OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
+_CLOSING = 4e-3
+"""Part of a closing frame, rms, by which it may be off: no calibration and no print is between it and other frames."""
+_SIDE = 0.3
+"""Correlation of a pair's sum with its difference from which one of its halves is at fault."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
 """Times the median excess, and part of the largest, from which a frame is named; part of all frames above which the run
 does not fit as a whole, and no single frames are named."""
@@ -33,17 +38,24 @@ _FOREIGN, _DISTURBED = 6.5, 7.5
 _FLICKERS, _POWER = 15.0, 0.01
 """Scatter of the powers of frames over its error, and least scatter, from which a flicker is reported. The picture of a
 print of a regular texture imitates smaller ones; all are part of the uncertainty."""
-_COSTS, _FEWEST_PAIRS, _MEDIAN_SQUARE = 0.5, 4, 0.455
-"""Energy of a flicker over that of noise from which it is reported; pairs that are needed; and the median of the square
-of a normal number."""
+_FEWEST_PAIRS, _FEWEST_FRAMES, _MOST_NUMBERS = 4, 3, 3e7
+"""Pairs, and frames that overlap, from which powers are told, and numbers that their fit may keep in memory."""
+_DOTS = (
+    "under dots each scene pixel is in one frame, so that only the picture tells a lamp, camera or scene that changed."
+)
+_LEAKING = (
+    "Light of the room cancels. A projector that leaks it, and did not when calibrated, darkens the image as much."
+)
+_REMEDY = "A closing frame (--closing-frame uniform) decides it."
+"""Sentences on what is not decided."""
+_LEAK = 5e-3
+"""Light of a dark pattern, over that of the bright one, from which a leaking projector is spoken of."""
 _RESTORED = 0.9
 """Part of the unexplained energy by which the residual must fall without frames that are at fault."""
 _SCATTERS = 4.0
 """Scatters of the power up to which the difference of a single frame is that of a flicker."""
 _OUTLIER, _DIMMED = 6.5, 0.02
 """Robust deviations, and change, from which the power of a single frame is reported."""
-_MOST_NUMBERS = 3e7
-"""Numbers that the joint fit of all powers may keep in memory."""
 
 
 @dataclass(frozen=True)
@@ -86,97 +98,82 @@ class FrameCheck:
         self._shots = data.shots.manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
         self._patterns = [(shot.row, shot.column) for shot in self._shots]
-        self._signed = any(shot.sign for shot in self._shots)
+        self._signed = data.noise.shots == 2
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
-        self._exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
-        self._numbers = [self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*self._variance.shape)]
-        self.picture = self._check_picture(lam) if self._exclusive else None
-        self.power = self._joint_powers() if not (self._signed or self._exclusive) else None
+        exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
+        self.picture = self._check_picture(lam) if exclusive else None
+        self._exclusive = exclusive
 
     def faults(self) -> tuple[FrameFault, ...]:
         """Return all frames that do not fit the others."""
-        found = [*self._dark(), *self._equal(), *self._check_clipping()]
-        by_others = [*self._unlike_model()]
+        found, by_others = [*self._alone()], [*self._unlike_model()]
         powers = [*self._unlike_picture(), *self._flicker()]
         # A lamp that flickers disturbs single frames by a few times its scatter; a wrong frame, the power of all.
-        flicker = max((fault.part for fault in powers if len(fault.numbers) > 1 and fault.kind == "power"), default=0.0)
+        flicker = max((fault.part for fault in powers), default=0.0)
         if by_others and by_others[0].part >= _SCATTERS * flicker:
             found += by_others
         named = {self._patterns[number] for fault in found for number in fault.numbers}
-        known = [
-            fault for fault in powers if fault.kind == "power" and named & {self._patterns[n] for n in fault.numbers}
-        ]
+        known = [each for each in powers if each.kind == "power" and named & {self._patterns[n] for n in each.numbers}]
         return (*found, *(fault for fault in powers if fault not in known), *self._closing())
 
     # ---- Tests of single frames
 
-    def _dark(self) -> Iterator[FrameFault]:
-        """Report a run without light: with several frames, the others predict a dark one."""
-        noise = self._data.noise
+    def _alone(self) -> Iterator[FrameFault]:
+        """Report a run without light, frames that are equal to the last bit, and single frames that are clipped."""
+        noise, count = self._data.noise, len(self._shots)
         least = CHANCE * float(np.sqrt(noise.variance.sum() / self._sums.squares.size))
         if abs(float(noise.means.sum())) < least:
-            words = "holds no light" if len(self._shots) == 1 else "hold no light"
-            yield self._fault("dark", range(len(self._shots)), words)
-
-    def _equal(self) -> Iterator[FrameFault]:
-        if not self._data.noise.variance.any():
-            return
+            yield self._fault("dark", range(count), "holds no light" if count == 1 else "hold no light")
         for digest, shots in self._sums.same.items():
-            if digest and len(shots) > 1:
+            if digest and len(shots) > 1 and noise.variance.any():
                 yield self._fault("repeated", [self._of(*each) for each in shots], "are equal, noise and all")
-
-    def _check_clipping(self) -> Iterator[FrameFault]:
-        if len(self._sums.clipped) <= max(1, _MOST_BAD * len(self._shots)):
-            for shot, count in self._sums.clipped.items():
-                yield self._fault("clipped", [self._of(*shot)], f"has {count} readings at its largest number")
+        if len(self._sums.clipped) <= max(1, _MOST_BAD * count):
+            for shot, readings in self._sums.clipped.items():
+                yield self._fault("clipped", [self._of(*shot)], f"has {readings} readings at its largest number")
 
     def _unlike_model(self) -> Iterator[FrameFault]:
-        """Compare each frame with the prediction of the others by the model, and signed pairs by their sums."""
-        sums, count = self._sums, self._variance.size
+        """Compare each frame with the prediction of the others by the model."""
+        sums, count, noise = self._sums, self._variance.size, self._variance
         share = self._beside * sums.shots / max(float(sums.shots.sum()), TINY)
-        # Single frames are at fault only if the rest fits without them.
-        tests = [(sums.leave_out - self._variance * sums.free - share, self._variance * np.sqrt(2 * sums.free))]
-        if self._signed and sums.pairs:
-            data = sums.pairs[0, 0].size
-            rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(sums.left.shape)], sums.left.shape)
-            noise = self._variance + self._variance.mean() / max(count - 1, 1)
-            part_of = data / sums.squares.size
-            tests.append(((rest - noise * data) / part_of - share, 2 * noise * np.sqrt(2 * data) / part_of))
-        expected = float(self._variance.sum()) * sums.squares.size * self._data.prepared.spare + self._beside
-        excess = float(sums.left.sum()) - expected
-        off = np.zeros(sums.left.shape)
+        tests = [(sums.leave_out - noise * sums.free - share, noise * np.sqrt(2 * sums.free))]
+        if sums.pairs:
+            data, of_sums = sums.pairs[0, 0].size, noise + noise.mean() / (count - 1)
+            rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(noise.shape)], noise.shape)
+            whole = sums.squares.size / data
+            tests.append((whole * (rest - of_sums * data) - share, 2 * whole * of_sums * np.sqrt(2 * data)))
+        excess = float(sums.squares.sum() - noise.sum() * sums.squares.size * self._data.prepared.spare) - self._beside
+        off = np.zeros(noise.shape)
         for beyond, chance in tests:
             part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
             usual = float(np.median(part)) if count > 2 else float(part.max())
             bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
-            if beyond is tests[0][0] and 0 < np.count_nonzero(bad) <= max(1, _MOST_BAD * count):
-                named = [(int(row), int(column)) for row, column in np.argwhere(bad)]
-                noise = (self._variance * sums.free + share)[bad].sum()
-                if sums.without(named) - noise < _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum())):
-                    continue
-            off = np.maximum(off, np.where(bad, part, 0.0))
-        if 0 < np.count_nonzero(off) <= max(1, _MOST_BAD * count):
-            for place in np.argsort(-off, axis=None)[: np.count_nonzero(off)]:
-                row, column = (int(index) for index in np.unravel_index(place, off.shape))
-                size, numbers = float(np.sqrt(off[row, column])), self._halves((row, column))
+            few = 0 < int(np.count_nonzero(bad)) <= max(1, _MOST_BAD * count)
+            if few and beyond is tests[0][0]:
+                # Single frames are at fault only if the rest fits without them.
+                restored = sums.without([(int(i), int(j)) for i, j in np.argwhere(bad)])
+                restored -= float((noise * sums.free + share)[bad].sum())
+                few = restored >= _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
+            off = np.maximum(off, np.where(bad, part, 0.0)) if few or beyond is not tests[0][0] else off
+        named = sorted(((int(i), int(j)) for i, j in np.argwhere(off)), key=lambda place: -off[place])
+        if len(named) <= max(1, _MOST_BAD * count):
+            for row, column in named:
+                size, signs = float(np.sqrt(off[row, column])), [0]
+                if self._signed:  # the sums of pairs decide which half
+                    side = self._sums.pairs[row, column].side if self._sums.pairs else 0.0
+                    signs = [1, -1] if abs(side) < _SIDE else [int(np.sign(side))]
+                numbers = [self._number[row, column, sign] for sign in signs]
                 yield self._fault("model", numbers, f"differ by {size:.1%} from what the other frames predict", size)
-
-    def _halves(self, pattern: Pattern) -> list[int]:
-        """Return the shots of a pattern that may be wrong: one half of a pair where the sums decide which."""
-        if not self._signed:
-            return [self._number[(*pattern, 0)]]
-        side = self._sums.pairs[pattern].side if pattern in self._sums.pairs else 0.0
-        signs = (1, -1) if abs(side) < 0.3 else (int(np.sign(side)),)
-        return [self._number[(*pattern, sign)] for sign in signs]
 
     # ---- The picture of shifting dots
 
     def _check_picture(self, lam: float) -> PictureCheck | None:
         seen = Propagation(self._data.model, lam)
         rows, columns = ((side != 0).argmax(axis=1) for side in self._data.shots.patterns)
-        numbers = np.reshape(self._numbers, self._variance.shape)
+        shape = self._variance.shape
+        numbers = np.reshape([self._number.get((*pattern, 0), 0) for pattern in np.ndindex(*shape)], shape)
         image, noise = self._data.prepared.image(seen.gain * self._sums.weights), float(self._variance.mean())
-        return check_picture(image, numbers[np.ix_(rows, columns)], self._variance.shape, seen.of_white(noise))
+        found = PictureCheck(image, numbers[np.ix_(rows, columns)], shape, seen.of_white(noise))
+        return found if found.decides else None
 
     def _unlike_picture(self) -> Iterator[FrameFault]:
         found = self.picture
@@ -189,7 +186,38 @@ class FrameCheck:
         if len(disturbed) and not len(foreign):
             strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]
             yield self._fault("picture", strongest, "show a part of the scene otherwise than the frames around")
-        yield from self._powers(found.power, found.power_error, range(len(self._shots)), _FLICKERS)
+        limit = max(_POWER, _FLICKERS * float(np.median(found.power_error)))
+        yield from self._powers(found.power, found.power_error, range(len(self._shots)), limit)
+
+    def _flicker(self) -> Iterator[FrameFault]:
+        """Report shots of another power.
+
+        The halves of all signed patterns add up to the same light. Where other patterns overlap, a frame of power 1 + a
+        adds a (I - H) Y to all residuals, so that the powers follow from normal equations with the matrix |Y_k|^2
+        delta_kl - C_k . C_l, C being the coefficients of frames in the model's range.
+        """
+        pairs, weights, count = self._sums.pairs, self._sums.weights, self._variance.size
+        if len(pairs) >= _FEWEST_PAIRS and self._data.noise.stated:
+            power, error = np.concatenate([(pair.powers, pair.errors) for pair in pairs.values()], axis=1)
+            numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
+            limit = max(_POWER, CHANCE * float(np.median(error)))
+            yield from self._powers(power, error, numbers, limit)
+        if self._signed or self._exclusive or count < _FEWEST_FRAMES or count * weights.size > _MOST_NUMBERS:
+            return
+        seen, whole, patterns = np.zeros((count, *weights.shape)), np.zeros(count), [*np.ndindex(*self._variance.shape)]
+        for k, pattern in enumerate(patterns):
+            places = self._data.prepared.places(pattern)
+            left, right = (slab.matrix.T @ slab.matrix for slab in self._data.prepared.slabs(pattern))
+            seen[k][places] = left @ weights[places] @ right
+            whole[k] = float(np.vdot(weights, seen[k]))
+        flat, variance = seen.reshape(count, -1), float(self._variance.mean())
+        values, vectors = np.linalg.eigh(np.diag(whole) - flat @ flat.T)
+        known = values > max(variance, 1e-9 * float(values.max()))
+        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+        error = np.sqrt(variance * np.diag(inverse))
+        limit = max(_POWER, CHANCE * float(np.median(error)))
+        numbers = [self._number[(*pattern, 0)] for pattern in patterns]
+        yield from self._powers(inverse @ self._sums.fitted.ravel(), error, numbers, limit)
 
     def _powers(
         self, power: FloatArray, error: FloatArray, numbers: Sequence[int], most: float
@@ -203,118 +231,76 @@ class FrameCheck:
         numbers
             of the shots.
         most
-            scatter over error from which all differ.
+            scatter from which all differ.
         """
-        scatter, usual = robust_scatter(power), float(np.median(error))
-        known = np.isfinite(error)
-        away = np.where(known, np.abs(power - np.median(power[known])) if known.any() else 0.0, 0.0)
-        single = (away > _OUTLIER * np.maximum(error, scatter)) & (away > _DIMMED)
+        scatter, middle = robust_scatter(power), float(np.median(power))
+        single = np.abs(power - middle) > np.maximum(_OUTLIER * np.maximum(error, scatter), _DIMMED)
         if single.any() and single.sum() <= max(1, _MOST_BAD * len(power)):
             for index in np.flatnonzero(single):
-                words = f"has {1 + power[index] - np.median(power):.2f} times the light that the others predict"
+                words = f"has {1 + power[index] - middle:.2f} times the light that the others predict"
                 yield self._fault("power", [numbers[int(index)]], words)
-        elif single.any() or scatter > max(_POWER, most * usual):
-            yield self._fault("power", range(len(self._shots)), f"differ by {scatter:.1%} in their power", scatter)
-
-    # ---- The power of frames that overlap
-
-    def _joint_powers(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the relative power of all frames and its standard errors, (K,) in the order of patterns.
-
-        A frame of power 1 + a adds a (I - H) Y to all residuals, so that the powers follow from normal equations with
-        the matrix |Y_k|^2 delta_kl - C_k . C_l, C being the coefficients of frames in the model's range.
-        """
-        prepared, sums = self._data.prepared, self._sums
-        count = self._variance.size
-        if count < 3 or count * sums.weights.size > _MOST_NUMBERS:
-            return None
-        seen, whole = np.zeros((count, *sums.weights.shape)), np.zeros(count)
-        for k, pattern in enumerate(np.ndindex(*self._variance.shape)):
-            left, right = prepared.slabs(pattern)
-            own = sums.weights[left.columns][:, right.columns]
-            found = (left.matrix.T @ left.matrix) @ own @ (right.matrix.T @ right.matrix)
-            seen[k][prepared.places(pattern)] = found
-            whole[k] = float(np.vdot(own, found))
-        flat = seen.reshape(count, -1)
-        normal = np.diag(whole) - flat @ flat.T
-        values, vectors = np.linalg.eigh(normal)
-        variance = float(self._variance.mean())
-        known = values > max(variance, 1e-9 * float(values.max()))
-        if not known.any():
-            return None
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        power = inverse @ sums.fitted.ravel()
-        return power, np.sqrt(variance * np.diag(inverse))
-
-    def _flicker(self) -> Iterator[FrameFault]:
-        """Report a lamp whose power differs from shot to shot by what costs more than part of the noise."""
-        everything = range(len(self._shots))
-        if self.power is not None:
-            yield from self._powers(*self.power, self._numbers, CHANCE)
-        pairs = self._sums.pairs
-        if len(pairs) < _FEWEST_PAIRS or not self._data.noise.stated:
-            return
-        noise = np.array([self._variance[pattern] for pattern in pairs])
-        cost = np.array([pair.cost for pair in pairs.values()]) / np.maximum(noise * pairs[0, 0].size, TINY)
-        times = float(np.median(cost)) / _MEDIAN_SQUARE
-        powers = np.array([power for pair in pairs.values() for power in pair.powers])
-        errors = np.array([error for pair in pairs.values() for error in pair.errors]) * np.sqrt(
-            2 * np.repeat(noise, 2)
-        )
-        numbers = [self._number[(*pattern, sign)] for pattern in pairs for sign in (1, -1)]
-        single = [fault for fault in self._powers(powers, errors, numbers, np.inf)]
-        yield from single
-        differ = float(np.std(powers))
-        if times > _COSTS and differ > CHANCE * float(np.median(errors)) and not single:
-            words = f"differ by {differ:.2%} in their power, which costs {times:.2g} times as much as their noise"
-            yield self._fault("power", everything, words, differ)
+        elif single.any() or scatter > most:
+            words = f"differ by {float(np.std(power)):.2%} in their power"
+            yield self._fault("power", range(len(self._shots)), words, scatter)
 
     # ---- A closing frame
 
     def _closing(self) -> Iterator[FrameFault]:
         """Compare the closing frame with the frames before it."""
-        closing = self._data.shots.closing
+        closing, noise, sides = self._data.shots.closing, self._data.noise, self._data.shots.patterns
         if closing is None:
             return
-        predicted, variance = self._prediction(closing.kind)
-        if predicted is None or closing.saturated:
+        first, shot = closing.kind == "first", self._shots[0]
+        half = first and shot.sign != 0
+        # Shares of the patterns that add up to the closing one.
+        shares = [np.eye(side.shape[1])[index] for side, index in zip(sides, (shot.row, shot.column), strict=True)]
+        if not first:
+            shares = [np.linalg.lstsq(side, np.ones(len(side)), rcond=None)[0] for side in sides]
+        even = all(np.abs(side @ share - 1).max() < 1e-6 for side, share in zip(sides, shares, strict=True))
+        if closing.saturated or not (first or even):
             reason = "it is saturated" if closing.saturated else "the patterns do not add up to even light"
             yield FrameFault("closing", (), (), f"the closing frame decides nothing, because {reason}")
             return
-        power = float(np.vdot(closing.light, predicted)) / max(sum_of_squares(predicted), TINY)
-        away = closing.light - predicted
-        own = variance + closing.variance
-        beyond = sum_of_squares(away) - float(own.sum())
-        chance = CHANCE * float(np.sqrt(2 * np.square(own).sum()))
-        part = float(np.sqrt(max(beyond, 0.0) / max(sum_of_squares(predicted), TINY)))
-        if beyond > chance and part > OFF:
+        predicted, variance = np.zeros_like(closing.light), closing.variance
+        for each in self._data.measurements_again():
+            if share := float(shares[0][each.row] * shares[1][each.column]):
+                light = (each.light + shot.sign * each.frame) / 2 if half else each.frame
+                own = noise.of(light, 1) if half else noise.of(each.light, each.shots)
+                predicted, variance = predicted + share * light, variance + share**2 * np.maximum(own, 0.0)
+        energy = max(sum_of_squares(predicted), TINY)
+        beyond = sum_of_squares(closing.light - predicted) - float(variance.sum())
+        part = float(np.sqrt(max(beyond, 0.0) / energy))
+        if beyond > CHANCE * float(np.sqrt(2 * np.square(variance).sum())) and part > _CLOSING:
             words = (
-                f"{part:.1%} of the closing frame differs from the frames before it, and its power is {power:.3f} of "
-                "theirs: lamp, camera or scene changed"
+                f"{part:.1%} of the closing frame differs from the frames before it, and its power is "
+                f"{np.vdot(closing.light, predicted) / energy:.3f} of theirs: lamp, camera or scene changed"
             )
             yield FrameFault("closing", tuple(range(len(self._shots))), (), words, part)
 
-    def _prediction(self, kind: str) -> tuple[FloatArray | None, FloatArray]:
-        """Return what the frames predict of the closing frame, and its noise variance (m, m')."""
-        noise, measurements = self._data.noise, self._data.measurements_again()
-        if kind == "first":
-            shot = self._shots[0]
-            for each in measurements:
-                if (each.row, each.column) == (shot.row, shot.column):
-                    light = each.frame if not shot.sign else (each.light + shot.sign * each.frame) / 2
-                    return light, np.maximum(noise.of(light, 1), 0.0)
-        # Shares of the patterns that add up to light of all pixels.
-        shares = [np.linalg.lstsq(side, np.ones(len(side)), rcond=None)[0] for side in self._data.shots.patterns]
-        sums = [side @ share for side, share in zip(self._data.shots.patterns, shares, strict=True)]
-        if any(np.abs(each - 1).max() > 1e-6 for each in sums):
-            return None, np.zeros(())
-        light, variance = np.zeros(self._sums.squares.shape), np.zeros(self._sums.squares.shape)
-        for each in measurements:
-            share = float(shares[0][each.row] * shares[1][each.column])
-            if share:
-                light += share * each.frame
-                variance += share**2 * np.maximum(noise.of(each.light, each.shots), 0.0)
-        return light, variance
+    # ---- What no test decides
+
+    def limits(self) -> tuple[dict[str, Any], ...]:
+        """Return what the frames of a real camera leave undecided, unless a uniform closing frame decides it: entries
+        of result.json, with words and the sizes up to which nothing is seen."""
+        shots = self._data.shots
+        if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
+            return ()
+        whole, found = lit_everywhere(self._data), self.picture
+        if self._exclusive:
+            sizes: dict[str, float | None] = dict.fromkeys(("pixel", "power", "place"))
+            told = "is too small to decide about single frames"
+            if found:
+                power, place = (float(np.median(each)) for each in (found.power_error, found.place[1]))
+                sizes = {"pixel": found.predicted, "power": power, "place": place}
+                told = (
+                    f"decides pixels to {found.predicted:.2g}, power to {power:.1%}, places to {place:.2g} scene pixels"
+                )
+            words = f"{_DOTS} The picture {told}; an object over few dots of some frames is not seen. {_REMEDY}"
+            return ({"words": words, **sizes},)
+        pair = self._sums.pairs.get(whole) if whole else None
+        leak = (1 - pair.contrast) / (1 + pair.contrast) if pair else 0.0
+        words = f"the dark half of the even pattern has {leak:.1%} of the light of the bright one. {_LEAKING} {_REMEDY}"
+        return ({"words": words, "leak": leak},) if leak > _LEAK else ()
 
     # ---- Words
 

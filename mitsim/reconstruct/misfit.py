@@ -22,21 +22,12 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.defects import Defects, defects_of
+from mitsim.reconstruct.defects import Defects, find_defects
 from mitsim.reconstruct.estimate_factors import decibels
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
-from mitsim.reconstruct.residuals import (
-    CHANCE,
-    TINY,
-    NoiseTest,
-    Place,
-    Residuals,
-    common_energy,
-    common_weights,
-    noise_chance,
-)
+from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, noise_chance
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.subpixel import LitFrames, print_energy
 from mitsim.reconstruct.uncertainty import Propagation
@@ -44,8 +35,6 @@ from mitsim.reconstruct.uncertainty import Propagation
 UNEXPLAINED = 3.5e-3
 """Part of the measurements, rms, that a fitting scene may leave unexplained: prints leave up to 6e-4 (the shipped ones)
 and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 dots) to 1.0e-2 (49)."""
-UNEXPLAINED_TILE = 2e-2
-"""The same part of a single tile, where print is not averaged: above all that fitting scenes left."""
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 """Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated:
 read noise of as many electrons makes 2."""
@@ -56,6 +45,8 @@ _LAMBDA_BESIDE = 1e-3
 own."""
 _MOSTLY = 0.5
 """Part of the unexplained energy at defective pixels from which nothing else is blamed."""
+_IN_RANGE = 1e-6
+"""Part of the energy of a common light below which it counts as lying in the model's range."""
 _COMMON_IMAGE = 0.01
 """Change of the image, rms, by light that is the same in all frames, from which it is reported."""
 
@@ -116,6 +107,8 @@ class Misfit:
         what the picture decides of frames under shifting dots; None under other patterns.
     common
         relative change of the image, rms, by light that is the same in all frames.
+    limits
+        what the frames leave undecided.
     """
 
     chi_square: float
@@ -135,6 +128,7 @@ class Misfit:
     detail: float = 0.0
     picture: PictureCheck | None = None
     common: float = 0.0
+    limits: tuple[dict[str, Any], ...] = ()
 
     @property
     def gist(self) -> str:
@@ -203,6 +197,7 @@ class Misfit:
             "readings": [reading.summary() for reading in self.readings],
             "places": [place.words for place in self.places],
             "faults": [fault.summary() for fault in self.faults],
+            "limits": list(self.limits),
             "power_error": float(np.median(self.picture.power_error)) if self.picture else None,
             "map": self.tiles.tolist(),
         }
@@ -251,33 +246,33 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
     beside = noise.rendering + (factor_energy or 0.0)
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
-    common = _common_light(data, stated + beside)
-    sums = Residuals(data, common)
-    change, energy = _change(data, solution, common), float(sums.energy.sum())
-    test = sums.noise_test
-    whole = float(sums.squares.sum())
+    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
+    sums, change = Residuals(data), 0.0
+    if (common := _common_light(data, sums, stated + beside)) is not None:
+        sums = Residuals(data, common)
+        moved = prepared.image(Propagation(data.model, lam).gain * (data.weights - sums.weights))
+        change = float(np.sqrt(sum_of_squares(moved) / max(sum_of_squares(image), TINY)))
+    test, energy, whole = sums.noise_test, float(sums.energy.sum()), float(sums.squares.sum())
     off = test is not None and test.off(noise, whole, stated, beside)
     if off and test and test.ratio < 1 and not data.digital.step_dn:
         off = False  # numbers without an ADC may be means of many shots
     ratio = test.ratio if test and off else max(test.ratio, 1.0) if test and not noise.stated else 1.0
     expected, known = sums.expected_energy(ratio, factor_energy or 0.0), factor_energy is not None
-    balance = Balance(sums.residual, sums.energy, expected, sums.pixels, known)
-    found, excess = balance.misfit(noise, of_ramps)
+    energies = sums.residual, sums.energy, expected, sums.pixels
+    found, excess = weigh(energies, known, noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
         found = replace(found, chi_square=whole / max(stated + beside, TINY))
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
-    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
-    if with_defects and noise.stated and not sums.clipped and (defects := _defects(data, sums, ratio)):
+    if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
         return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
     faults = check.faults()
     places = sums.places(ratio) if noise.stated and not off else []
-    found = replace(found, faults=faults, places=tuple(places), picture=check.picture)
+    found = replace(found, faults=faults, places=tuple(places), picture=check.picture, limits=check.limits())
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
-    signed = any(shot.sign for shot in data.shots.manifest.patterns.captures)
-    turned = signed and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
+    turned = noise.shots == 2 and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.
     hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
@@ -286,7 +281,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     found = replace(found, readings=(scaled,) if scaled else others)
     detail = _detail(data, sums, excess, beside) if found.flagged and not (found.readings or faults) else 0.0
     if detail:
-        fine, _ = balance.misfit(noise, max(of_ramps, detail))
+        fine, _ = weigh(energies, known, noise, max(of_ramps, detail))
         if not fine.flagged:
             found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
             found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
@@ -319,65 +314,32 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
 
 
-def _common_light(data: Accumulation, expected: float) -> FloatArray | None:
+def _common_light(data: Accumulation, sums: Residuals, expected: float) -> FloatArray | None:
     """Return the light (m, m') that is the same in all measurements; None where it is no more than chance, or explains
     less than most of the residual beyond the ``expected`` energy.
 
-    The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room: F = f g^T,
-    of which the residuals tell K |F|^2 less the energy in the model's range.
+    The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room. The sum of
+    all residuals has it times the energy K |F|^2 less that in the model's range.
     """
-    if any(shot.sign for shot in data.shots.manifest.patterns.captures) or data.noise.variance.size < 2:
+    prepared, count = data.prepared, data.noise.variance.size
+    if data.noise.shots == 2 or count < 2:
         return None
-    left, right = data.factors.sides
-    lit = np.outer(left.sum(axis=1), right.sum(axis=1))
-    shapes = [np.ones(lit.shape), lit / max(float(np.sqrt(np.mean(np.square(lit)))), TINY)]
-    fields = [data.prepared.as_solved(each) for each in shapes]
+    even_scene = [side.sum(axis=1) for side in data.factors.sides]
+    lights = [np.stack([np.ones(len(seen)), seen / max(float(np.abs(seen).max()), TINY)]) for seen in even_scene]
+    if prepared.centre:
+        lights = [light - light.mean(axis=1, keepdims=True) for light in lights]
+    weights = [light @ side.common for light, side in zip(lights, (prepared.left, prepared.right), strict=True)]
+    whole = count * np.prod([light @ light.T for light in lights], axis=0)
+    normal = whole - np.prod([weight @ weight.T for weight in weights], axis=0)
     # Light of an even scene may lie in the model's range, and light without contrast is lost by centring.
-    fields = [each for each in fields if common_energy(data, each) > 1e-9 * data.noise.variance.size * each.size]
-    if not fields:
-        return None
-    pairs = [(field, common_weights(data, field)) for field in fields]
-    count = data.noise.variance.size
-    frames = (each.frame for each in data.measurements_again()) if data.shots.ambient else (data.noise.light,)
-    total = data.prepared.as_solved(sum(frames, start=np.zeros(())))
-    data_weights = data.weights
-    normal = np.array([[count * np.vdot(f, g) - np.vdot(v, w) for g, w in pairs] for f, v in pairs])
-    side = np.array([np.vdot(f, total) - np.vdot(w, data_weights) for f, w in pairs])
-    scale = np.sqrt(np.diag(normal))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-6) / np.outer(scale, scale)
-    found = inverse @ side
-    explained = float(found @ side)
-    energy = max(float(data.frames.energy), TINY)
+    scale = np.sqrt(np.maximum(np.diag(normal), _IN_RANGE * np.diag(whole)) + TINY)
+    side = np.einsum("fi,ij,fj->f", lights[0], sums.total, lights[1], optimize=True) / scale
+    found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=_IN_RANGE) @ side
+    energy, excess = max(float(sums.energy.sum()), TINY), float(sums.squares.sum()) - expected
     least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * energy)
-    excess = energy - sum_of_squares(data_weights) - expected
-    if explained < max(least, _MOSTLY * excess):
+    if found @ side < max(least, _MOSTLY * excess):
         return None
-    return np.asarray(sum(value * field for value, field in zip(found, fields, strict=True)))
-
-
-def _change(data: Accumulation, solution: Solution, common: FloatArray | None) -> float:
-    """Return the relative change of the image, rms, by a ``common`` light (m, m')."""
-    if common is None or not solution.image.any():
-        return 0.0
-    lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * data.prepared.problem(data.frames).scale
-    moved = data.prepared.image(Propagation(data.model, lam).gain * common_weights(data, common))
-    return float(np.sqrt(sum_of_squares(moved) / sum_of_squares(solution.image)))
-
-
-def _defects(data: Accumulation, sums: Residuals, ratio: float) -> Defects | None:
-    """Return pixels that are off in all measurements."""
-    noise, prepared = data.noise, data.prepared
-    count = noise.variance.size
-    mean = noise.light / count
-    variance = ratio * noise.of(mean, noise.shots)
-    found = defects_of(sums.squares, count * variance, count)
-    lit = [np.flatnonzero((side > 0).all(axis=0)) for side in data.shots.patterns]
-    if not any(shot.sign for shot in data.shots.manifest.patterns.captures) or not all(map(len, lit)):
-        return found
-    # Differences of halves show little of pixels that stand still, and their sums show all of it.
-    whole = prepared.frame(data.weights, (int(lit[0][0]), int(lit[1][0])))
-    still = defects_of(np.square(prepared.as_solved(mean) - whole), variance / count, 1)
-    return still.with_others(found) if still else found
+    return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
 
 
 def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -> float:
@@ -393,48 +355,34 @@ def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -
 # ---- Energies found and expected ----
 
 
-@dataclass(frozen=True, eq=False)
-class Balance:
-    """Energies by tile of the sensor, or of all of it.
+def weigh(
+    energies: tuple[FloatArray, ...], factors_stated: bool, noise: FrameNoise, print_energy: float
+) -> tuple[Misfit, float]:
+    """Return the misfit, without its cause, and the energy that is unexplained.
 
-    Attributes
+    Parameters
     ----------
-    residual, energy, expected
-        (rows, columns) energy that a model leaves, of the measurements, and that is expected to be left.
-    pixels
-        (rows, columns) pixels of each tile.
-    stated
+    energies
+        four arrays (rows, columns) by tile of the sensor, or of all of it: energy that a model leaves, of the
+        measurements, and that is expected to be left, and the pixels.
+    factors_stated
         whether the noise of the factors was stated.
+    noise
+        of the measurements.
+    print_energy
+        energy that print within a pixel may add.
     """
-
-    residual: FloatArray
-    energy: FloatArray
-    expected: FloatArray
-    pixels: FloatArray
-    stated: bool
-
-    def misfit(self, noise: FrameNoise, print_energy: float) -> tuple[Misfit, float]:
-        """Return the misfit, without its cause, and the energy that is unexplained.
-
-        Parameters
-        ----------
-        noise
-            of the measurements.
-        print_energy
-            energy that print within a pixel may add.
-        """
-        beyond = self.residual - self.expected - print_energy * self.pixels / self.pixels.sum()
-        energy, excess = float(self.energy.sum()), float(beyond.sum())
-        unexplained = float(np.sqrt(max(excess, 0.0) / max(energy, TINY)))
-        tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(self.energy, TINY))
-        chi_square = float(self.residual.sum() / max(float(self.expected.sum()), TINY))
-        chi_squares = self.residual / np.maximum(self.expected, TINY)
-        stated = noise.stated and self.stated
-        if stated:
-            flagged = unexplained > UNEXPLAINED and chi_square > 1 + noise_chance(noise, float(self.pixels.sum()))
-            local = (tiles > UNEXPLAINED_TILE) & (chi_squares > 1 + noise_chance(noise, float(self.pixels.min())))
-            flagged = flagged or bool(local.any())
-        else:
-            flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
-        cause = Cause.MODEL if flagged else None
-        return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess
+    residual, energy, expected, pixels = energies
+    beyond = residual - expected - print_energy * pixels / pixels.sum()
+    excess = float(beyond.sum())
+    unexplained = float(np.sqrt(max(excess, 0.0) / max(float(energy.sum()), TINY)))
+    tiles = np.sqrt(np.maximum(beyond, 0.0) / np.maximum(energy, TINY))
+    chi_square = float(residual.sum() / max(float(expected.sum()), TINY))
+    chi_squares = residual / np.maximum(expected, TINY)
+    stated = noise.stated and factors_stated
+    if stated:
+        flagged = unexplained > UNEXPLAINED and chi_square > 1 + noise_chance(noise, float(pixels.sum()))
+    else:
+        flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
+    cause = Cause.MODEL if flagged else None
+    return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess

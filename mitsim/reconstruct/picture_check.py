@@ -17,7 +17,7 @@ What the picture leaves undecided is stated as a standard error of the power and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -29,19 +29,21 @@ from mitsim.core.arrays import FloatArray
 
 IntArray = npt.NDArray[np.intp]
 
+_POWER, _SHIFT = 0.1, 0.5
+"""Standard deviations of the power of a frame and of its place [scene pixels] before the frames are seen."""
 _SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
+_PIXELS = 2500
+"""Pixels to which the stencil is fitted at most, to save time."""
 _WINDOWS = 3, 5
 """Dots along each side of the windows in which a disturbance is looked for."""
 _FEW, _OF_NORMAL = 0.2, 0.253
 """Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
-_BLACK, _DARK, _DARKER = 6.0, 0.5, 1.5
-"""Deviations of noise up to which a frame has no light; part of its predicted light whose lack counts as
-darkness; and weight of its deviation, because no good frame lacks so much."""
+_BLACK, _DARKER = 6.0, 1.5
+"""Deviations of noise up to which a frame has no light, and weight of its deviation, because no good frame lacks all of
+what the picture predicts."""
 _MOST = 3.0
 """Scales at which a single pixel's difference counts in full: edges of a print reach more."""
-_POWER, _SHIFT = 0.1, 0.5
-"""Standard deviations of the power of a frame and of its place [scene pixels] before the picture is seen."""
 _FIXED = 1e12
 """Weight with which the mean change of all frames is held at zero."""
 _LONGEST = 4
@@ -50,47 +52,13 @@ _FEWEST = 4
 """Pixels for each number that is fitted, below which the picture decides nothing."""
 
 
-@dataclass(frozen=True, eq=False)
-class PictureCheck:
-    """What the picture decides of the frames of a run of shifting dots, in the order of its K shots.
-
-    Attributes
-    ----------
-    power, power_error
-        (K,) relative power of each frame beyond the mean, and its standard error.
-    shift, shift_error
-        (2, K) place of each frame along rows and columns [scene pixels], and its standard error.
-    foreign, disturbed
-        (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
-    """
-
-    power: FloatArray
-    power_error: FloatArray
-    shift: FloatArray
-    shift_error: FloatArray
-    foreign: FloatArray
-    disturbed: FloatArray
-
-    def uncertainty(self, image: FloatArray) -> FloatArray:
-        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames:
-        their scatter over the frames, beyond what the picture makes of it, which may be twice the errors."""
-        power, *moves = (
-            np.sqrt(max(robust_scatter(own) ** 2 - float(np.median(2 * error)) ** 2, 0.0))
-            for own, error in ((self.power, self.power_error), *zip(self.shift, self.shift_error, strict=True))
-        )
-        parts = [image * power, *(slope * move for slope, move in zip(np.gradient(image), moves, strict=True))]
-        return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
-
-
 def robust_scatter(values: FloatArray) -> float:
     """Return 1.4826 times the median absolute deviation of ``values``, the standard deviation of normal numbers."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def check_picture(
-    image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray
-) -> PictureCheck | None:
-    """Compare each frame of shifting dots with the picture of the others; None where the picture is too small.
+class PictureCheck:
+    """What the picture decides of the frames of a run of shifting dots, in the order of its K shots.
 
     Parameters
     ----------
@@ -102,55 +70,62 @@ def check_picture(
         scene pixels from one dot to the next along rows and columns.
     noise
         (n, n') variance of the image by the frames' noise.
+
+    Attributes
+    ----------
+    decides
+        whether the picture is large enough to decide anything; without it there are no other attributes.
+    power, power_error
+        (K,) relative power of each frame beyond the mean, and its standard error.
+    predicted
+        standard error with which the other frames predict a pixel, reflectance.
+    foreign, disturbed
+        (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
     """
-    count = int(frame_of.max()) + 1
-    stencil = _Stencil(image, frame_of)
-    if not stencil.offsets or stencil.pixels.size < _FEWEST * (count + len(stencil.offsets)):
-        return None
-    power, power_error, differences = stencil.fit(count, noise, _POWER)
-    predicted = stencil.predict(image)
-    # A shift is looked for in the picture without the powers, because in even parts these look like a slope.
-    even = image / np.maximum(1 + power, _POWER)[frame_of]
-    shift, shift_error = stencil.fit_with_weights(even, [*np.gradient(even)], count, noise, _SHIFT)
-    own = frame_of.ravel()[stencil.pixels]
-    lit = np.maximum(np.bincount(own, minlength=count), 1)
-    roughness = np.log1p(np.square(differences))
-    means = np.bincount(own, roughness, count) / lit
-    foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
-    # A black frame decides nothing of its own power, but its mean is far below the predicted one.
-    missing = np.bincount(own, predicted - image.ravel()[stencil.pixels], count) / lit
-    squares = np.bincount(own, np.square(predicted - image.ravel()[stencil.pixels]), count) / lit
-    shown = np.bincount(own, predicted, count) / lit
-    black = np.square(shown - missing) < _BLACK**2 * np.bincount(own, noise.ravel()[stencil.pixels], count) / lit**2
-    dark = black & (missing > _DARK * shown)
-    chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
-    foreign = np.maximum(foreign, np.where(dark, _DARKER * missing / chance, 0.0))
-    disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
-    return PictureCheck(power, power_error, shift.reshape(2, -1), shift_error.reshape(2, -1), foreign, disturbed)
 
+    def __init__(self, image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray) -> None:
+        count = int(frame_of.max()) + 1
+        self._stencil = stencil = _Stencil(image, frame_of, noise)
+        self.decides = bool(stencil.offsets) and stencil.pixels.size >= _FEWEST * (count + len(stencil.offsets))
+        if not self.decides:
+            return
+        self.power, self.power_error = stencil.fit(image, [image], _POWER, _SCALES)
+        self._even = image * (1 - self.power[frame_of])
+        left_over = stencil.differences(self._even)
+        differences = left_over / stencil.scale(left_over, stencil.pixels)
+        self.predicted = float(np.sqrt(np.mean(np.square(left_over))))
+        own = frame_of.ravel()[stencil.pixels]
+        lit = np.maximum(np.bincount(own, minlength=count), 1)
+        roughness = np.log1p(np.square(differences))
+        means = np.bincount(own, roughness, count) / lit
+        self.foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
+        # A black frame decides nothing of its own power, but its mean is far below the predicted one.
+        lack = -stencil.differences(image)
+        shown, missing, squares, noises = (
+            np.bincount(own, each, count) / lit
+            for each in (image.ravel()[stencil.pixels], lack, np.square(lack), noise.ravel()[stencil.pixels])
+        )
+        black = (np.square(shown) < _BLACK**2 * noises / lit) & (missing > shown)
+        chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
+        self.foreign = np.maximum(self.foreign, np.where(black, _DARKER * missing / chance, 0.0))
+        self.disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
 
-def _solve(
-    design: csr_matrix, weights: FloatArray, rest: FloatArray, prior: float, count: int
-) -> tuple[FloatArray, FloatArray, csr_matrix]:
-    """Return weighted least squares of ``rest``, the inverse of the normal matrix, and the weighted design.
+    @cached_property
+    def place(self) -> tuple[FloatArray, FloatArray]:
+        """The place (2, K) of each frame along rows and columns [scene pixels], and its standard error."""
+        # Looked for in the picture without the powers, because in even parts these look like a slope.
+        place, error = self._stencil.fit(self._even, [*np.gradient(self._even)], _SHIFT)
+        return place.reshape(2, -1), error.reshape(2, -1)
 
-    The same change of all ``count`` frames is a change of the picture, and is held at zero.
-    """
-    size = design.shape[1]
-    known = np.eye(size) / prior**2 + np.kron(np.eye(size // count), np.full((count, count), _FIXED))
-    weighted = design.multiply(weights[:, None]).tocsr()
-    inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
-    return inverse @ (weighted.T @ rest), inverse, weighted
+    def uncertainty(self, image: FloatArray) -> FloatArray:
+        """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
 
-
-def _errors(weighted: csr_matrix, inverse: FloatArray, left_over: FloatArray, prior: float, count: int) -> FloatArray:
-    """Return the standard errors of the sandwich estimator (Huber 1967), which does not take differences for normal
-    numbers."""
-    scores = weighted.multiply(left_over[:, None]).tocsr()
-    known = np.eye(len(inverse)) / prior**2
-    covariance = inverse @ ((scores.T @ scores).toarray() + known) @ inverse
-    spare = max(len(left_over) - len(inverse), 1) / len(left_over)
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare))
+        It is made of their scatter over the frames. A regular print makes part of that, which cannot be told from a
+        flicker.
+        """
+        power, *moves = (robust_scatter(own) for own in (self.power, *self.place[0]))
+        parts = [image * power, *(slope * move for slope, move in zip(np.gradient(image), moves, strict=True))]
+        return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
 
 
 def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
@@ -173,7 +148,8 @@ def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: S
             total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
             scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
             # A texture with a period of its own deviates in most frames, and a disturbance in few.
-            scores /= np.maximum(np.quantile(scores, _FEW, axis=0) / _OF_NORMAL, 1.0)
+            few = int(_FEW * (len(scores) - 1))
+            scores /= np.maximum(np.partition(scores, few, axis=0)[few] / _OF_NORMAL, 1.0)
             for k, worst in enumerate(scores.max(axis=(1, 2))):
                 found[k : k + length] = np.maximum(found[k : k + length], worst)
     return found
@@ -182,84 +158,83 @@ def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: S
 class _Stencil:
     """Predicts pixels from the means of pairs of opposite neighbours, none of which is in the pixel's own frame."""
 
-    def __init__(self, image: FloatArray, frame_of: IntArray) -> None:
-        self.shape, self._image, self._frames = image.shape, image.ravel(), frame_of.ravel()
+    def __init__(self, image: FloatArray, frame_of: IntArray, noise: FloatArray) -> None:
+        self.shape, self._frames, self._noise = image.shape, frame_of.ravel(), noise.ravel()
+        self._floor, self._count = 1e-9 * float(np.abs(image).max()) + 1e-300, int(frame_of.max()) + 1
         reach = [2 if size >= 24 else 1 for size in self.shape]
         inner = (np.arange(far, size - far) for far, size in zip(reach, self.shape, strict=True))
         self.pixels: IntArray = np.ravel_multi_index(np.meshgrid(*inner, indexing="ij"), self.shape).ravel()
+        self._some = self.pixels
+        if len(self.pixels) > _PIXELS:
+            self._some = np.random.default_rng(0).choice(self.pixels, _PIXELS, replace=False)
         width, own = self.shape[1], self._frames[self.pixels]
         offsets = [y * width + x for y in range(reach[0] + 1) for x in range(-reach[1], reach[1] + 1) if y or x > 0]
         self.offsets = [
             each for each in offsets if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
         ]
+        self.weights = np.full(len(self.offsets) + 2, 1.0 / max(len(self.offsets), 1))
 
-    def fit(self, count: int, noise: FloatArray, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit the stencil together with the power of each frame.
+    def fit(
+        self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n').
 
-        Returns the ``count`` relative powers, their standard errors, and the differences of the pixels from their
-        predictions in units of their scale. Least squares are reweighted by Cauchy's weights, because edges of the
-        print are outliers; powers have a normal ``prior``.
+        Returns the parameters, change by change, and their standard errors by the sandwich estimator (Huber 1967),
+        which does not take differences for normal numbers. Parameters have a normal ``prior``. Least squares are
+        reweighted by Cauchy's weights, because edges of the print are outliers; with scales ``learned`` for these, the
+        stencil is fitted, too.
 
         The stencil has no negative weights, because these imitate a lamp that flickers in the period of the dots. A
         stencil along the other direction may still do so, and the errors of the powers then show it.
         """
-        image = self._image.reshape(self.shape)
-        own, target = self._pairs(self._image), self._image[self.pixels]
-        self.weights, found = np.full(own.shape[1], 1.0 / len(self.offsets)), np.zeros(count)
-        left_over = target - own @ self.weights
-        design = self._sensitivity([image], count)
-        for wider in _SCALES:
-            weights = self._robust(left_over, noise, wider)[0]
-            explained = target - design @ found
-            normal = own.T @ (weights[:, None] * own)
-            normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
-            root = np.linalg.cholesky(normal)
-            self.weights = nnls(root.T, np.linalg.solve(root, own.T @ (weights * explained)))[0]
-            design = self._sensitivity([image], count)
-            rest = target - own @ self.weights
-            found, inverse, weighted = _solve(design, weights, rest, prior, count)
+        own, target = self._pairs(image, self._some), image.ravel()[self._some]
+        # The same change of all frames is a change of the picture, and is held at zero.
+        known = np.eye(len(changes) * self._count) / prior**2
+        known += np.kron(np.eye(len(changes)), np.full((self._count, self._count), _FIXED))
+        found, left_over = np.zeros(len(known)), target - own @ self.weights
+        design = self._sensitivity(changes)
+        for wider in learned or (1.0, 1.0):
+            weights = 1 / (np.square(wider * self.scale(left_over, self._some)) + np.square(left_over))
+            if learned:
+                normal = own.T @ (weights[:, None] * own)
+                normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
+                root = np.linalg.cholesky(normal)
+                side = own.T @ (weights * (target - design @ found))
+                self.weights = nnls(root.T, np.linalg.solve(root, side))[0]
+                design = self._sensitivity(changes)
+            rest, weighted = target - own @ self.weights, design.multiply(weights[:, None]).tocsr()
+            inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
+            found = inverse @ (weighted.T @ rest)
             left_over = rest - design @ found
-        errors = _errors(weighted, inverse, left_over, prior, count)
-        return found, errors, left_over / self._robust(left_over, noise, 1.0)[1]
+        scores = weighted.multiply(left_over[:, None]).tocsr()
+        covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(len(known)) / prior**2) @ inverse
+        spare = max(len(left_over) - len(inverse), 1) / len(left_over)
+        return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)
 
-    def fit_with_weights(
-        self, image: FloatArray, changes: Sequence[FloatArray], count: int, noise: FloatArray, prior: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n') with the present
-        stencil; return the parameters and their standard errors."""
-        rest = image.ravel()[self.pixels] - self.predict(image)
-        design, left_over = self._sensitivity(changes, count), rest
-        for _ in range(2):
-            weights = self._robust(left_over, noise, 1.0)[0]
-            found, inverse, weighted = _solve(design, weights, rest, prior, count)
-            left_over = rest - design @ found
-        return found, _errors(weighted, inverse, left_over, prior, count)
+    def differences(self, image: FloatArray) -> FloatArray:
+        """Return the pixels inside of an ``image`` (n, n') less what the stencil predicts of them."""
+        return np.asarray(image.ravel()[self.pixels] - self._pairs(image, self.pixels) @ self.weights)
 
-    def predict(self, image: FloatArray) -> FloatArray:
-        """Return the pixels inside as the stencil predicts them from an ``image`` (n, n')."""
-        return np.asarray(self._pairs(image.ravel()) @ self.weights)
+    def scale(self, left_over: FloatArray, pixels: IntArray) -> FloatArray:
+        """Return the scale of the differences ``left_over`` of ``pixels``."""
+        return np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + self._noise[pixels]), self._floor)
 
-    def _pairs(self, values: FloatArray) -> FloatArray:
+    def _pairs(self, image: FloatArray, pixels: IntArray) -> FloatArray:
         """Return the means of opposite neighbours (pixels, pairs), and a constant of either sign."""
-        pairs = [(values[self.pixels + each] + values[self.pixels - each]) / 2 for each in self.offsets]
-        ones = np.ones(len(self.pixels))
+        values, ones = image.ravel(), np.ones(len(pixels))
+        pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self.offsets]
         return np.stack([*pairs, ones, -ones], axis=1)
 
-    def _robust(self, left_over: FloatArray, noise: FloatArray, wider: float) -> tuple[FloatArray, FloatArray]:
-        """Return Cauchy's weights of differences, and their scale."""
-        floor = 1e-9 * float(np.abs(self._image).max()) + 1e-300
-        scale = np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + noise.ravel()[self.pixels]), floor)
-        return 1 / (np.square(wider * scale) + np.square(left_over)), scale
-
-    def _sensitivity(self, changes: Sequence[FloatArray], count: int) -> csr_matrix:
-        """Return the change of pixels less their predictions (pixels, len(changes) count) by one frame alone."""
-        place, terms = np.arange(len(self.pixels)), [(0, 1.0)]
+    def _sensitivity(self, changes: Sequence[FloatArray]) -> csr_matrix:
+        """Return the change of pixels less their predictions (pixels, len(changes) K) by one frame alone."""
+        place, terms = np.arange(len(self._some)), [(0, 1.0)]
         for offset, weight in zip(self.offsets, self.weights, strict=False):
             terms += [(offset, -weight / 2), (-offset, -weight / 2)] if weight else []
         parts = [
-            (weight * change.ravel()[self.pixels + offset], place, self._frames[self.pixels + offset] + number * count)
+            (weight * change.ravel()[places], place, self._frames[places] + number * self._count)
             for number, change in enumerate(changes)
             for offset, weight in terms
+            for places in (self._some + offset,)
         ]
         values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return csr_matrix((values, (rows, columns)), shape=(len(place), len(changes) * count))
+        return csr_matrix((values, (rows, columns)), shape=(len(place), len(changes) * self._count))

@@ -74,6 +74,10 @@ class Reading:
         return {"words": self.words, "order": self.order, "unexplained": self.left}
 
 
+Found = tuple[str, str | None, float]
+"""Words of a reading, the order if `mitsim import --order` has it, and the misfit."""
+
+
 def multiple(factor: int, chi_square: float) -> Reading | None:
     """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its
     ``chi_square``."""
@@ -128,37 +132,21 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     whole = max(run.energy, TINY)
     allowed = noise + beside * run.energy / max(float(data.frames.energy), TINY)
     chance = CHANCE * noise * float(np.sqrt(2 / max(run.size * data.noise.variance.size * run.prepared.spare, 1)))
-    now = run.misfit(_KEPT, _TAKEN)  # infinite if the image is negative
+    now = run.misfit(run.shots())  # infinite if the image is negative
     unexplained = min(max(now - allowed, 0.0), whole)
     if unexplained <= chance / 2:
         return ()
-    found = [(_describe(*each), run.misfit(*each)) for each in run.candidates(together=False)]
-    by_chance = min(chance, unexplained / 2)
-
-    def fits(misfit: float) -> bool:
-        return misfit - allowed < max(min(_FITS * unexplained, _AT_MOST**2 * whole), by_chance)
-
-    if not any(fits(misfit) for _, misfit in found):
-        found += [(_describe(*each), run.misfit(*each)) for each in run.candidates(together=True)]
-    if not any(fits(misfit) for _, misfit in found):
-        found += run.curves()
-    good = sorted((each for each in found if fits(each[1])), key=lambda each: each[1])
-    if not good:
-        return ()
-    limit = good[0][1] * (1 + _ALIKE) + chance
+    limit = allowed + max(min(_FITS * unexplained, _AT_MOST**2 * whole), min(chance, unexplained / 2))
+    good: list[Found] = []
+    for stage in (run.alone, run.together, run.curves):
+        good = sorted((each for each in stage() if each[2] < limit), key=lambda each: each[2])
+        if good:
+            break
     seen: dict[str, Reading] = {}
-    for (words, order), misfit in good:
-        if misfit <= limit:
-            left = float(np.sqrt(max(misfit - allowed, 0.0) / whole))
-            seen.setdefault(words, Reading(words, left, order))
+    for words, order, misfit in good:
+        if misfit <= good[0][2] * (1 + _ALIKE) + chance:
+            seen.setdefault(words, Reading(words, float(np.sqrt(max(misfit - allowed, 0.0) / whole)), order))
     return tuple(seen.values())
-
-
-def _describe(turn: str, order: str) -> tuple[str, str | None]:
-    """Return the words of a reading, and the order where `mitsim import --order` knows it."""
-    parts = [] if turn == _KEPT else [f"the frames are {turn}"]
-    parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
-    return " and ".join(parts), None if order == _TAKEN or order in _STEPS else order
 
 
 class _Part:
@@ -184,81 +172,73 @@ class _Part:
                 halves = [(1, (each.light + each.frame) / 2), (-1, (each.light - each.frame) / 2)]
             for sign, light in halves:
                 frames[number[each.row, each.column, sign]] = light.astype(np.float32)
-        self._turned: dict[str, list[FloatArray]] = {}
         self._frames, shape = frames, frames[0].shape
         self._turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape]
         taken = np.arange(len(frames))
-        self.orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
-        self.orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
+        self._orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
+        self._orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
         self.size = len(sides[0]) * len(sides[1])
-        self.energy = sum(sum_of_squares(frame) for _, frame in self._measurements(self._shots(_KEPT, _TAKEN)))
+        self.energy = self._weights(self.shots())[1]
 
-    def candidates(self, together: bool) -> Iterator[tuple[str, str]]:
-        """Yield turns alone and orders alone, or turns ``together`` with orders; orders that differ from each other."""
-        distinct = {tuple(order): name for name, order in reversed(self.orders.items())}
-        orders = [name for name in distinct.values() if name != _TAKEN]
-        if together:
-            yield from product(self._turns[1:], orders)
-        else:
-            yield from (*((turn, _TAKEN) for turn in self._turns[1:]), *((_KEPT, order) for order in orders))
+        distinct = {tuple(order): name for name, order in reversed(self._orders.items())}
+        self._others = [name for name in distinct.values() if name != _TAKEN]
 
-    def curves(self) -> list[tuple[tuple[str, str | None], float]]:
-        """Return the best tone curve and the best lag, with their misfits."""
-        shots = self._shots(_KEPT, _TAKEN)
+    def alone(self) -> Iterator[Found]:
+        """Yield turns of the frames, and other orders of the shots."""
+        pairs = [(turn, _TAKEN) for turn in self._turns[1:]] + [(_KEPT, order) for order in self._others]
+        return (self._found(*each) for each in pairs)
+
+    def together(self) -> Iterator[Found]:
+        """Yield turns together with other orders."""
+        return (self._found(*each) for each in product(self._turns[1:], self._others))
+
+    def _found(self, turn: str, order: str) -> Found:
+        parts = [] if turn == _KEPT else [f"the frames are {turn}"]
+        parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
+        known = None if order == _TAKEN or order in _STEPS else order
+        return " and ".join(parts), known, self.misfit(self.shots(turn, order))
+
+    def curves(self) -> Iterator[Found]:
+        """Yield the best tone curve and the best lag."""
+        shots = self.shots()
 
         def misfit_of_lag(part: float) -> float:
             earlier = [np.zeros_like(shots[0]), *shots[:-1]]
             now = [(own - part * before) / (1 - part) for own, before in zip(shots, earlier, strict=True)]
-            return min(self._misfit(now), self.energy) * (1 - part) ** 2  # the search needs finite numbers
+            return min(self.misfit(now), self.energy) * (1 - part) ** 2  # the search needs finite numbers
 
-        found: list[tuple[tuple[str, str | None], float]] = []
         if not self.prepared.centre:  # without means of rows and columns, no number is known
             best = minimize_scalar(self._bent_misfit, bounds=np.log(_EXPONENTS), args=(shots,), method="bounded")
             if abs(best.x) > _LINEAR:
                 words = "the numbers went through a tone curve: they are the light to the power of "
-                found.append(((f"{words}{np.exp(-best.x):.2g}", None), float(best.fun)))
+                yield f"{words}{np.exp(-best.x):.2g}", None, float(best.fun)
         if not self._signed:
             best = minimize_scalar(misfit_of_lag, bounds=_LAGS, method="bounded")
             if best.x > _NO_LAG:
-                found.append(((f"the sensor lags: each frame holds {best.x:.1%} of the frame before", None), best.fun))
-        return found
+                yield f"the sensor lags: each frame holds {best.x:.1%} of the frame before", None, float(best.fun)
 
-    def misfit(self, turn: str, order: str) -> float:
-        """Return the energy that the model leaves; infinite where the image would be negative in the mean."""
-        return self._misfit(self._shots(turn, order))
+    def shots(self, turn: str = _KEPT, order: str = _TAKEN) -> list[FloatArray]:
+        """Return this part of all shots, their frames brought back by a ``turn`` and taken in another ``order``."""
+        frames = (_TURNS[turn](self._frames[index])[self._part] for index in self._orders[order])
+        return [np.ascontiguousarray(frame, dtype=np.float64) for frame in frames]
 
-    def _shots(self, turn: str, order: str) -> list[FloatArray]:
-        if turn not in self._turned:
-            bring_back = _TURNS[turn]
-            self._turned[turn] = [
-                np.ascontiguousarray(bring_back(frame)[self._part]).astype(np.float64) for frame in self._frames
-            ]
-        shots = self._turned[turn]
-        return [shots[index] for index in self.orders[order]]
-
-    def _measurements(self, shots: Sequence[FloatArray]) -> Iterator[tuple[tuple[int, int], FloatArray]]:
-        """Yield pattern and frame of every measurement: the difference of a signed pattern's halves."""
-        waiting: dict[tuple[int, int], FloatArray] = {}
-        for capture, light in zip(self._captures, shots, strict=True):
-            pattern = capture.row, capture.column
-            if not capture.sign:
-                yield pattern, self.prepared.as_solved(light)
-            elif pattern in waiting:
-                yield pattern, self.prepared.as_solved(waiting.pop(pattern) + capture.sign * light)
-            else:
-                waiting[pattern] = capture.sign * light
-
-    def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
-        weights = np.zeros_like(self.prepared.sigma)
-        energy = 0.0
-        for pattern, frame in self._measurements(shots):
-            weights[self.prepared.places(pattern)] += self.prepared.weights(frame, pattern)
-            energy += sum_of_squares(frame)
-        return np.where(self.prepared.sigma > 0, weights, 0.0), energy
-
-    def _misfit(self, shots: Sequence[FloatArray]) -> float:
+    def misfit(self, shots: Sequence[FloatArray]) -> float:
+        """Return the energy that the model leaves of ``shots``; infinite where the image is negative in the mean."""
         weights, energy = self._weights(shots)
         return float("inf") if negative(self.prepared, self._groups, weights) else energy - sum_of_squares(weights)
+
+    def _weights(self, shots: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+        """Return W (r, r') of all measurements, and their energy; of a signed pattern, of the halves' difference."""
+        weights, energy = np.zeros_like(self.prepared.sigma), 0.0
+        frames: dict[tuple[int, int], FloatArray] = {}
+        for capture, light in zip(self._captures, shots, strict=True):
+            pattern = capture.row, capture.column
+            frames[pattern] = frames.get(pattern, 0.0) + (capture.sign or 1) * light
+        for pattern, frame in frames.items():
+            seen = self.prepared.as_solved(frame)
+            weights[self.prepared.places(pattern)] += self.prepared.weights(seen, pattern)
+            energy += sum_of_squares(seen)
+        return np.where(self.prepared.sigma > 0, weights, 0.0), energy
 
     def _bent_misfit(self, logarithm: float, shots: Sequence[FloatArray]) -> float:
         """Return the misfit, in numbers as they were read, of light that is a power of them, exp(``logarithm``)."""

@@ -22,7 +22,6 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
 from mitsim.reconstruct.background import Margin
-from mitsim.reconstruct.defects import Defects, LeftOut
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
@@ -118,6 +117,11 @@ class Reconstruction(Solution):
     def trust(self) -> tuple[str, ...]:
         """A line on the misfit, and one on the uncertainty by source, where these are known."""
         return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
+
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """A sentence or more on each thing that the frames of a real camera leave undecided."""
+        return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:
         """What result.json and the command line's JSON say of it."""
@@ -229,7 +233,11 @@ class Reconstruction(Solution):
             pictures[caption] = normalise(self.uncertainty)
         if self.depths:
             pictures[f"depth of each pixel\n{span(self.depths.mm, 'mm')}"] = normalise(self.depths.mm)
-        return card(f"Reconstruction: {self.status.verdict.value}", pictures, (str(self.status), *self.trust, facts))
+        return card(
+            f"Reconstruction: {self.status.verdict.value}",
+            pictures,
+            (str(self.status), *self.trust, *self.limits, facts),
+        )
 
 
 def _check_stored(more: object) -> None:
@@ -472,24 +480,15 @@ def _without_defects(
     """Sums without the readings of defective pixels, their solution at ``lam`` and misfit; all as it was where the
     frames fit no better so. ``misfit`` is that of ``data``, with the first defects."""
 
-    def left_out(defects: Defects) -> tuple[LeftOut, Accumulation, Solution]:
-        rest = defects.left_out(data)
-        without = accumulate(rest, data.factors, data.solver, **data.iterative)
-        return rest, without, without.solution(lam)
-
     found, now, without = None, misfit, data
     for _ in range(_DEFECT_ROUNDS):
         if now.defects is None:
             break
         found = now.defects.with_others(found)
-        rest, without, solution = left_out(found)
+        without = accumulate(found.left_out(data), data.factors, data.solver, **data.iterative)
+        solution = without.solution(lam)
         now = find_misfit(without, solution) or now
-    # What bright ones put into other pixels is none of these: they are taken in again.
-    changed = False
-    while found and (own := found.beyond_chance(rest, data.noise)) and len(own.rows) < len(found.rows):
-        found, changed = own, True
-        rest, without, solution = left_out(found)
-    if changed or now.flagged:
+    if now.flagged:
         now = find_misfit(without, solution, with_defects=False) or now
     if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
         solution = data.solution(lam)

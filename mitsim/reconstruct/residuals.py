@@ -21,13 +21,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
 from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
-from mitsim.reconstruct.picture_check import IntArray, robust_scatter
+from mitsim.reconstruct.picture_check import robust_scatter
 
 CHANCE = 6.0
 """Standard deviations that are left to chance: once in 10^7 images of 64 tiles."""
@@ -35,8 +37,8 @@ TINY = 1e-300
 """Replaces 0 in a denominator."""
 _TILES = 8
 """Tiles a side of the sensor's map: 64 x 64 pixels each of 512 x 512, so that a highlight fills some of them."""
-_NOISE_TILE, _NOISE_ROWS = 16, 66
-"""Least pixels a side of a tile whose noise is measured, and sensor rows that are measured at most, to save time."""
+_NOISE_TILE, _NOISE_TILES = 16, 1500
+"""Least pixels a side of a tile whose noise is measured, and tiles of all frames that are enough, to save time."""
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
@@ -46,13 +48,11 @@ _CORRELATED = (70 / 36) ** 2
 """Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
 _PAIR_ROWS = 96
 """Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
-_BRIGHT = 50.0
-"""Energy of a half over that of its noise from which its power is known."""
-_STEPS = 50
-"""Steps of conjugate gradients at most; patterns that share little need a few."""
-_ALIKE = 1e-3
-"""Determinant of the products of a pair's halves, over the square of the larger, below which one is as good as
-black."""
+_BRIGHT, _ALIKE = 50.0, 1e-3
+"""Energy of a half over that of its noise from which it is no black one, because it would be fitted to its own noise;
+and determinant of the products of a pair's halves, over the square of the larger, below which they are alike."""
+_EXACT, _STEPS = 1e-2, 50
+"""Relative residual at which conjugate gradients end, and steps at most; patterns that share little need a few."""
 _SAMPLE = 20_000
 """Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
@@ -106,62 +106,32 @@ class NoiseTest:
         return white and more and seen
 
 
-@dataclass(frozen=True)
-class Pair:
-    """How the sum of a signed pattern's halves differs from those of all other pairs, which are the same light.
+class Pair(NamedTuple):
+    """Difference of the sum of a signed pattern's halves from those of all other pairs, which are the same light.
 
     Attributes
     ----------
     powers, errors
-        relative power of the first and of the second half beyond that of the other pairs, and their standard errors for
-        noise of variance 1; infinite where a half is as good as black.
-    rest
-        energy that no power of the halves explains.
+        (2,) relative power of the first and of the second half beyond that of the other pairs, and their standard
+        errors; infinite where a half is as good as black, or as the other one.
+    rest, size
+        energy that no power of the halves explains, and number of the data that are compared.
     side
-        correlation of the rest with the residual of the difference: 1 if the first half is wrong, -1 if the second is.
-    cost, size
-        energy that the powers put into the difference, and number of the data that are compared.
+        correlation of the rest with the residual of the halves' difference: 1 if the first half is wrong, -1 if the
+        second is.
+    contrast
+        difference of the halves' light over their sum.
     """
 
-    powers: tuple[float, float]
-    errors: tuple[float, float]
+    powers: FloatArray
+    errors: FloatArray
     rest: float
-    side: float
-    cost: float
     size: int
-
-    @classmethod
-    def of(
-        cls, beyond: FloatArray, total: FloatArray, difference: FloatArray, residual: FloatArray, noise: float
-    ) -> Pair:
-        """Fit a sum of halves to the two halves, (total +- difference) / 2, by least squares.
-
-        Parameters
-        ----------
-        beyond
-            (m, m') difference of the sum of this pair from the mean of the others.
-        total, difference, residual
-            (m, m') sum and difference of its halves, and what the model leaves of the difference.
-        noise
-            energy of a half's noise; a half that is hardly brighter would be fitted to its own noise.
-        """
-        halves = (total + difference) / 2, (total - difference) / 2
-        normal = np.array([[float(np.vdot(one, other)) for other in halves] for one in halves])
-        powers, errors = np.zeros(2), np.full(2, np.inf)
-        known = float(np.diag(normal).min()) > _BRIGHT * noise
-        if known and np.linalg.det(normal) > _ALIKE * float(np.diag(normal).max()) ** 2:
-            inverse = np.linalg.inv(normal)
-            powers = inverse @ [float(np.vdot(beyond, half)) for half in halves]
-            errors = np.sqrt(np.diag(inverse))
-        rest = beyond - powers[0] * halves[0] - powers[1] * halves[1]
-        energies = sum_of_squares(rest), sum_of_squares(residual)
-        side = float(np.vdot(rest, residual)) / max(float(np.sqrt(energies[0] * energies[1])), TINY)
-        cost = sum_of_squares(powers[0] * halves[0] - powers[1] * halves[1])
-        return cls((powers[0], powers[1]), (errors[0], errors[1]), energies[0], side, cost, beyond.size)
+    side: float
+    contrast: float
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Part of the sensor or of the session where frames do not fit: its ``words``, and its unexplained ``energy``."""
 
     words: str
@@ -176,14 +146,15 @@ class Residuals:
 
     Attributes
     ----------
-    energy, power
-        (tiles, tiles) sums of the squares of measurements and of shots.
+    energy, residual
+        (tiles, tiles) sums of the squares of measurements and of residuals.
     pixels
         (tiles, tiles) pixels of each tile.
-    squares
-        (m, m') sum of the squares of residuals of each sensor pixel.
-    left, leave_out
-        (K, K') energy of a pattern's residual, and e^T (I - H_kk)^-1 e, what is left of it when the others predict it.
+    squares, total
+        (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
+    own, leave_out
+        (K, K') energy of a pattern's residual e, and e^T (I - H_kk)^-1 e: what is left of it when the others predict
+        it.
     shots
         (K, K') energy of a pattern's shots.
     free
@@ -191,7 +162,7 @@ class Residuals:
     fitted
         (K, K') product of a pattern's residual and of what the model has of it.
     pairs
-        by signed pattern, what the sum of its halves differs by from the sums of all other pairs.
+        by signed pattern, the difference of the sum of its halves from the sums of all other pairs.
     same, clipped
         patterns and halves by a number that equal frames share, and readings at the largest number of such a frame.
     """
@@ -205,16 +176,17 @@ class Residuals:
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
         counts = prepared.left.pattern_count, prepared.right.pattern_count
-        self.left, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
+        self.own, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
         self.pairs: dict[tuple[int, int], Pair] = {}
         self._seen: dict[tuple[int, int], FloatArray] = {}
         self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
         self.clipped: dict[tuple[tuple[int, int], int], int] = {}
-        self.squares, self._early, self._sum = (np.zeros(sizes) for _ in range(3))
+        self.squares, self._early, self.total, self._powers = (np.zeros(sizes) for _ in range(4))
         # Arrays of one frame, because to make them anew takes longer than to fill them.
         self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
-        self.energy, self.power = (np.zeros(self.pixels.shape) for _ in range(2))
-        self.weights = data.weights if light is None else data.weights - common_weights(data, light)
+        self.weights = data.weights
+        if light is not None:
+            self.weights = self.weights - prepared.left.common.T @ prepared.as_solved(light) @ prepared.right.common
         self._grams = [[_gram(slab.matrix) for slab in side.slabs] for side in (prepared.left, prepared.right)]
         self._rough = [
             [float(np.square(np.diff(slab.matrix, 2, axis=0)).sum()) for slab in side.slabs]
@@ -226,6 +198,7 @@ class Residuals:
             if 2 * number < total <= 2 * number + 2:
                 self._early = self.squares.copy()
             self._add(measurement, data.coefficients.get((measurement.row, measurement.column)))
+        self.energy, self.residual = self._tiles(self._powers), self._tiles(self.squares)
 
     def _add(self, measurement: Measurement, coefficients: FloatArray | None) -> None:
         pattern, prepared = (measurement.row, measurement.column), self._prepared
@@ -235,29 +208,21 @@ class Residuals:
         residual = np.matmul(left.matrix @ own, right.matrix.T, out=self._residual)
         np.subtract(frame, residual, out=residual)
         self.squares += np.multiply(residual, residual, out=self._squared)
-        self._sum += residual
-        energy = self._squares(frame)
-        light = energy if frame is measurement.light else self._squares(measurement.light)
-        if measurement.shots == 2:  # as Measurement.power has it
-            light = (light + energy) / 2
-        self.energy += energy
-        self.power += light
+        self.total += residual
+        self._powers += np.multiply(frame, frame, out=self._squared)
         # Behind a mask with a constant term most of the light contributes nothing to the image.
-        self.shots[pattern] = float((energy if prepared.centre else light).sum())
-        flat = residual.ravel()
-        self.left[pattern] = float(np.dot(flat, flat))
+        self.shots[pattern] = float(self._squared.sum()) if prepared.centre else measurement.power
         (turn, values), (other_turn, other_values) = (self._grams[side][index] for side, index in enumerate(pattern))
         known = np.outer(values, other_values)
         alone = known > 1 - 1e-6
         self.free[pattern] = residual.size - np.count_nonzero(alone)
-        self.leave_out[pattern] = self.left[pattern]
+        self.own[pattern] = self.leave_out[pattern] = sum_of_squares(residual)
         if not alone.all():
             if coefficients is None or self._light is not None:
                 coefficients = left.matrix.T @ frame @ right.matrix
-            explained = (turn * values) @ (turn.T @ own @ other_turn) @ (other_turn * other_values).T
-            self.fitted[pattern] = float(np.vdot(own, coefficients - explained))
-            self._seen[pattern] = coefficients - explained
-            seen = turn.T @ self._seen[pattern] @ other_turn
+            seen = turn.T @ coefficients @ other_turn - known * (turn.T @ own @ other_turn)
+            self._seen[pattern] = turn @ seen @ other_turn.T
+            self.fitted[pattern] = float(np.vdot(own, self._seen[pattern]))
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
         for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
@@ -268,48 +233,50 @@ class Residuals:
         if measurement.shots == 2 and others:
             some = slice(None, None, max(min(residual.shape) // _PAIR_ROWS, 1))
             total, difference, left_over, every = (
-                each[some, some] for each in (measurement.light, measurement.frame, residual, self.noise.light)
+                each[some, some].ravel() for each in (measurement.light, measurement.frame, residual, self.noise.light)
             )
-            noise = float(self.noise.variance[pattern]) * total.size / 2
-            self.pairs[pattern] = Pair.of((total * (1 + others) - every) / others, total, difference, left_over, noise)
+            beyond = (total * (1 + others) - every) / others
+            halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
+            normal = halves @ halves.T
+            powers, errors = np.zeros(2), np.full(2, np.inf)
+            bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
+            if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
+                inverse = np.linalg.inv(normal)
+                powers = np.asarray(inverse @ (halves @ beyond), dtype=np.float64)
+                errors = np.asarray(np.sqrt(variance * np.diag(inverse)), dtype=np.float64)
+            rest = beyond - powers @ halves
+            side = float(rest @ left_over) / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
+            contrast = float(difference.sum() / max(float(total.sum()), TINY))
+            self.pairs[pattern] = Pair(powers, errors, sum_of_squares(rest), rest.size, side, contrast)
 
     def without(self, patterns: Sequence[tuple[int, int]]) -> float:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
 
         That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
-        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952).
-        Directions that no other pattern sees have no curvature: the steps end there, which scipy's cg would not do.
+        + <z, x> with z = A^T e and (I - A^T A) x = z.
         """
         grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
+        seen = np.zeros_like(self.weights)
+        for each in patterns:
+            seen[self._prepared.places(each)] += self._seen.get(each, 0.0)
 
         def apart(values: FloatArray) -> FloatArray:
-            found = values.copy()
+            found = values.reshape(seen.shape).copy()
             for each, (left, right) in grams.items():
                 places = self._prepared.places(each)
-                found[places] -= left @ values[places] @ right
-            return found
+                found[places] -= left @ values.reshape(seen.shape)[places] @ right
+            return found.ravel()
 
-        rest = np.zeros_like(self.weights)
-        for each in patterns:
-            if each in self._seen:
-                rest[self._prepared.places(each)] += self._seen[each]
-        found, step, seen = np.zeros_like(rest), rest.copy(), rest.copy()
-        squared = sum_of_squares(rest)
-        for _ in range(_STEPS):
-            moved = apart(step)
-            curvature = float(np.vdot(step, moved))
-            if curvature <= 1e-9 * sum_of_squares(step):
-                break
-            found += squared / curvature * step
-            rest = rest - squared / curvature * moved
-            before, squared = squared, sum_of_squares(rest)
-            step = rest + squared / max(before, TINY) * step
-        return sum(float(self.left[each]) for each in patterns) + float(np.vdot(seen, found))
+        # Directions that no other pattern sees have no curvature: later steps would end there.
+        operator = LinearOperator((seen.size, seen.size), matvec=apart, dtype=np.float64)
+        found, _ = cg(operator, seen.ravel(), rtol=_EXACT, maxiter=_STEPS)
+        return sum(float(self.own[each]) for each in patterns) + float(np.vdot(seen, found))
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
         """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
-        first = max(len(residual) - _NOISE_ROWS, 0) // 2
-        rows = slice(first, first + _NOISE_ROWS)
+        tiles = -(-_NOISE_TILES * _NOISE_TILE // (residual.shape[1] * self.noise.variance.size))
+        first = max(len(residual) - tiles * _NOISE_TILE - 2, 0) // 2
+        rows = slice(first, first + tiles * _NOISE_TILE + 2)
         rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1))
         light = measurement.light[rows][1:-1, 1:-1]
         size = 36 * (len(residual) - 2) * (residual.shape[1] - 2)
@@ -349,19 +316,6 @@ class Residuals:
         gain = 2 * ratio / (1 - share + float(np.sqrt((1 - share) ** 2 + 4 * share * ratio)))
         return NoiseTest(ratio, error, gain, error if self.noise.stated else float("inf"))
 
-    @cached_property
-    def variance(self) -> FloatArray:
-        """(tiles, tiles) sum of the stated variance of the noise."""
-        # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
-        count = self.noise.variance.size
-        light = self._tiles(self.noise.light) / self.pixels / count
-        return self.noise.of(light, self.noise.shots) * self.pixels * count
-
-    @property
-    def residual(self) -> FloatArray:
-        """(tiles, tiles) sum of the squares of residuals."""
-        return self._tiles(self.squares)
-
     def expected_energy(self, ratio: float, beside: float) -> FloatArray:
         """Return (tiles, tiles) the energy that residuals should have.
 
@@ -372,16 +326,12 @@ class Residuals:
         beside
             energy that the factors' noise adds, evenly.
         """
-        rendering = self.noise.rendering * self.power / max(float(self.power.sum()), TINY)
-        noise = ratio * self.variance * self._prepared.spare
+        rendering = self.noise.rendering * self.energy / max(float(self.energy.sum()), TINY)
+        # The variance is linear in the light, so that the mean light of a tile has the mean variance of the tile.
+        count = self.noise.variance.size
+        variance = self.noise.of(self._tiles(self.noise.light) / self.pixels / count, self.noise.shots)
+        noise = ratio * variance * self.pixels * count * self._prepared.spare
         return np.asarray(noise + rendering + beside * self.pixels / self.pixels.sum())
-
-    @cached_property
-    def _freedom(self) -> FloatArray:
-        """(m, m') degrees of freedom of the residuals of each pixel: K (1 - h)."""
-        sides = (self._prepared.left, self._prepared.right)
-        left, right = (sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides)
-        return np.asarray(np.maximum(self.noise.variance.size - np.outer(left, right), 1e-3))
 
     def places(self, ratio: float) -> list[Place]:
         """Return tiles, rows, columns and pixels that fit worse than the rest of the sensor, the worst first.
@@ -389,31 +339,28 @@ class Residuals:
         ``ratio`` is that of measured to stated noise.
         """
         count = self.noise.variance.size
-        variance = ratio * np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
-        expected = variance * self._freedom
-        least = _PLACE_ENERGY * float(expected.sum())
-        whole = self.squares, expected, self._freedom
+        sides = (self._prepared.left, self._prepared.right)
+        taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides]
+        freedom = np.maximum(count - np.outer(*taken), 1e-3)
+        variance = np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
+        whole = self.squares, ratio * variance * freedom, freedom
         tiles = [self._tiles(each) for each in whole]
         lines = ([each.sum(axis=axis) for each in whole] for axis in (1, 0))
         beyond = {}
-        for name, (squares, own, freedom) in zip(
-            ("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True
-        ):
+        for name, (squares, own, free) in zip(("tile", "pixel", "row", "column"), (tiles, whole, *lines), strict=True):
             # The cube root of a chi-square is nearly normal (Wilson and Hilferty 1931).
-            spread = 2 / (9 * np.maximum(freedom, 0.5))
+            spread = 2 / (9 * np.maximum(free, 0.5))
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
-            beyond[name] = np.where(away > _PLACE, squares - np.median(squares / own) * own, 0.0)
+            usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
+            beyond[name] = np.where(away > _PLACE, squares - usual * own, 0.0)
         change = tiles[0] - 2 * self._tiles(self._early)
         far = np.abs(_deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))) > _PLACE
         beyond["half"] = np.where(far, np.abs(change), 0.0)
-        far = np.abs(_deviations(self._sum / np.sqrt(expected))) > _PLACE
-        beyond["mean"] = np.where(far, np.maximum(self.squares - expected, 0.0), 0.0)
+        far = np.abs(_deviations(self.total / np.sqrt(whole[1]))) > _PLACE
+        beyond["mean"] = np.where(far, np.maximum(self.squares - whole[1], 0.0), 0.0)
+        least = _PLACE_ENERGY * float(whole[1].sum())
         found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
-
-    def _squares(self, values: FloatArray) -> FloatArray:
-        rows = np.stack([np.einsum("ij,ij->j", values[strip], values[strip]) for strip in self._strips])
-        return np.asarray(np.add.reduceat(rows, self._starts, axis=1))
 
     def _tiles(self, values: FloatArray) -> FloatArray:
         # Not reduceat along the rows: it takes five times as long.
@@ -430,18 +377,6 @@ def noise_chance(noise: FrameNoise, pixels: float) -> float:
     return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
 
 
-def common_weights(data: Accumulation, light: FloatArray) -> FloatArray:
-    """Return what one ``light`` (m, m') in every measurement of ``data`` adds to the coefficients W (r, r') of all."""
-    left, right = data.prepared.left.common, data.prepared.right.common
-    return np.asarray(left.T @ data.prepared.as_solved(light) @ right)
-
-
-def common_energy(data: Accumulation, light: FloatArray) -> float:
-    """Return the energy outside the model's range of one ``light`` (m, m') in every measurement of ``data``."""
-    whole = data.noise.variance.size * sum_of_squares(data.prepared.as_solved(light))
-    return max(whole - sum_of_squares(common_weights(data, light)), 0.0)
-
-
 def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return eigenvectors and eigenvalues, 0 to 1, of U^T U of a ``slab`` U (m, c)."""
     values, vectors = np.linalg.eigh(slab.T @ slab)
@@ -456,14 +391,10 @@ def _deviations(values: FloatArray) -> FloatArray:
 
 def _words(name: str, beyond: FloatArray) -> str:
     """Return where the energy ``beyond`` is: by rows and columns of the sensor, or tiles of it."""
+    spans = [" to ".join(dict.fromkeys((str(each.min()), str(each.max())))) for each in np.nonzero(beyond)]
     if beyond.ndim == 1:
-        return f"sensor {name} {_span(np.flatnonzero(beyond))}"
-    rows, columns = (_span(np.unique(each)) for each in np.nonzero(beyond))
+        return f"sensor {name} {spans[0]}"
     if name in ("pixel", "mean"):
-        return f"{np.count_nonzero(beyond)} pixels in rows {rows}, columns {columns}"
+        return f"{np.count_nonzero(beyond)} pixels in rows {spans[0]}, columns {spans[1]}"
     when = " in one half of the session" if name == "half" else ""
-    return f"tile rows {rows}, columns {columns} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"
-
-
-def _span(numbers: IntArray) -> str:
-    return f"{numbers[0]}" if numbers[0] == numbers[-1] else f"{numbers[0]} to {numbers[-1]}"
+    return f"tile rows {spans[0]}, columns {spans[1]} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"

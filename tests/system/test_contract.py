@@ -160,6 +160,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
             "readings",
             "places",
             "power_error",
+            "limits",
             "foretold",
             "map",
             "faults",

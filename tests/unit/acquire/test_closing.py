@@ -1,5 +1,6 @@
 """A closing frame of a capture: the light of the first frame, or of all pixels, with noise of its own."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,6 +43,9 @@ def test_other_frames_are_the_same_bytes_with_and_without_one(
     those of the first frame; the exposure chosen for the closing frame too.)"""
     plain = light.expose(patterns)
     assert plain.closing is None and "closing_frame" not in plain.manifest.configuration
+    light.expose(patterns, tmp_path / "plain")
+    written = json.loads((tmp_path / "plain" / "manifest.json").read_text())
+    assert not {"closing_frame", "order"} & written.keys(), "version 0.10.0 refuses keys that it does not know"
     for kind in ("first", "uniform"):
         closed = light.expose(patterns, tmp_path / kind, closing_frame=kind)
         assert np.array_equal(closed.dn, plain.dn) and np.array_equal(closed.electrons, plain.electrons)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.defects import Defects, defects_of
+from mitsim.reconstruct.defects import defects_of
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import BLACK, CODES, bench, picture
 from tests.unit.reconstruct.test_faults import Frames, with_frames
@@ -62,16 +61,6 @@ def test_a_dead_line() -> None:
     mended = reconstruct(with_frames(shots, dead), bench().calibrated(1))
     assert mended.ok and mended.misfit is not None and mended.misfit.defects is not None
     assert mended.misfit.defects.places == [(row, 51) for row in range(96)]
-
-
-def test_only_readings_that_differ_from_what_others_tell_are_defects() -> None:
-    """A bright pixel's part in the fit makes others be off, which are right."""
-    shots, factors = with_frames(bench().run("uniform", picture(1), 1), broken), bench().calibrated(1)
-    data = accumulate(shots, factors)
-    looked_at = Defects(np.array([10, 10, 40, 40]), np.array([11, 51, 11, 51]))
-    rest = looked_at.left_out(data)
-    found = looked_at.beyond_chance(rest, data.noise)
-    assert found is not None and found.places == [(10, 11), (40, 51)]
 
 
 def test_noise_alone_makes_no_defects() -> None:
