@@ -225,7 +225,7 @@ STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric
 """Materials that let light straight on."""
 _BUMPS = ("bumpmap", "normalmap")
 """Materials that turn another's frame, and do not tell which light it lets straight on."""
-_MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
+MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""
@@ -278,7 +278,7 @@ class Unfit:
 
 def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estimator: str) -> str | None:
     """What an ``estimator`` loses where one of the ``lights`` shines on a mirror."""
-    mirror = next(tree.to(_MIRRORS), None)
+    mirror = next(tree.to(MIRRORS), None)
     light = next((node for node in tree.nodes if node.props.plugin_name() in lights), None)
     if mirror is None or light is None:
         return None
@@ -310,7 +310,7 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
     for node in tree.nodes:
         if node.props.plugin_name() != "shapegroup":
             continue
-        mirror = next(tree.below(node, _MIRRORS), None)
+        mirror = next(tree.below(node, MIRRORS), None)
         if mirror is not None:
             rule = (
                 "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the "

@@ -21,7 +21,7 @@ from mitsim.scene.film import fit_film
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
 from mitsim.scene.own_files import with_own_files
-from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
+from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, put_wrappers, with_thin_shapes_as_meshes
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ def load_scene(
         moved = move_to_camera(checked.outline, checked.state)
         notes = emit_by_faces(checked)  # before thin shapes are meshes, too
         with with_thin_shapes_as_meshes(checked.outline, checked.state):
+            put_wrappers(checked.state)
             scene = mi.parser.instantiate(checked.config, checked.state)
     check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)

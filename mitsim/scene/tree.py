@@ -18,7 +18,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.scene.check import CheckedScene
-from mitsim.scene.limits import PLUGINS, references
+from mitsim.scene.limits import MIRRORS, PLUGINS, STRAIGHT, references
 from mitsim.scene.outline import Outline, Tag
 
 # -------- The camera moved to the origin, or a refusal
@@ -389,6 +389,35 @@ def _write(path: Path, mesh: Mesh) -> None:
     faces["count"], faces["corners"] = 3, triangles
     vertices = np.concatenate([points, normals, uv], axis=1).astype("<f4")
     path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
+
+
+# -------- Materials made of others
+#
+# Those of Mitsuba lose light of mirrors, or hold for light from the camera alone: :mod:`mitsim.transport.plugins`
+# .wrappers says which, and has others in their place.
+
+_CHOICES, _DIRECTED = ("blendbsdf", "mask", "twosided"), ("bumpmap", "normalmap", "hair", "principledthin")
+"""Materials that choose one of two others, and those that are not reciprocal."""
+
+
+def put_wrappers(state: mi.parser.ParserState) -> None:
+    """Replace materials of Mitsuba in a tree by those that give all light, forward and backward.
+
+    A choice between materials without mirrors or holes is right as it is, and stays.
+
+    Parameters
+    ----------
+    state
+        the tree, which is changed.
+    """
+    single = {*MIRRORS, *STRAIGHT}
+    sharp = [bool(_plugins_below(state.nodes, index) & single) for index in range(len(state.nodes))]
+    for node, has_sharp in zip(state.nodes, sharp, strict=True):
+        plugin = node.props.plugin_name()
+        materials = [index for index in references(node.props) if _is(state.nodes[index], "bsdf")]
+        chooses = plugin in _CHOICES and has_sharp and (plugin != "twosided" or len(set(materials)) > 1)
+        if chooses or plugin in _DIRECTED:
+            node.props.set_plugin_name(f"mitsim_{plugin}")
 
 
 # -------- Lamps that are meshes emit by their faces

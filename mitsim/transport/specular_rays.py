@@ -9,7 +9,7 @@ float32: nothing for a mirror that faces the axis squarely; round ones and smoot
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -21,7 +21,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
-from mitsim.transport.transmission import CLEAR, Passage, transmits
+from mitsim.transport.transmission import CLEAR, transmits
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
@@ -215,12 +215,12 @@ class SpecularRays:
     ) -> tuple[mi.BSDFSample3f, FloatArray]:
         """Direction sample, and weights (k, channels) over all wavelength sets."""
         weights = []
-        choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        context.component = lobe.component
         for wavelengths in self._wavelengths:
             if wavelengths is not None:
                 si.wavelengths = wavelengths
-            sample, weight = si.bsdf().sample(lobe.context, si, choice, mi.Point2f(0.5), active)
-            weight = weight * sample.pdf if lobe.by_chance else weight
+            sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
             if lobe.kind == int(mi.BSDFFlags.Null):
                 # Whatever was sampled, light that passes keeps its direction.
                 weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
@@ -232,57 +232,34 @@ class SpecularRays:
 
 @dataclass(frozen=True, eq=False)
 class _Lobe:
-    """One way on at a material, of a ``kind``: the context and random number that choose it, and whether of several.
+    """A way on at a material: its ``kind``, and the number of the ``component`` of the material that sends light there.
 
-    If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
+    Of a component a BSDF gives the part of the light, so that nothing is left to chance.
     """
 
     bsdf: mi.BSDF
-    context: mi.BSDFContext
     kind: int
-    choice: float = 0.5
-    by_chance: bool = False
+    component: int
 
 
 def _group_lobes(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
     """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
-    found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
+    found: dict[tuple[int, int], tuple[_Lobe, list[int]]] = {}
     for lobe in lobes:
-        key = lobe.kind, lobe.choice, lobe.by_chance, lobe.context.type_mask, lobe.context.component
         number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(lobe.bsdf))).ravel()[0])
-        found.setdefault(key, (lobe, []))[1].append(number)
+        found.setdefault((lobe.kind, lobe.component), (lobe, []))[1].append(number)
     return list(found.values())
 
 
-def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
-    """Every delta part of a material, so that nothing is left to chance.
-
-    Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
-    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome short of the hole are
-    taken (a mirror, or the reflection of glass and its transmission). What passes is the same for all materials.
-    """
-    flags = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
-    reflected, refracted, straight = (int(flag) for flag in flags)
-    name, delta = str(bsdf), reflected | refracted
-    lobes = [_Lobe(bsdf, _context(), straight)] if bsdf.flags() & straight else []
-    if name.startswith("Mask"):
-        outcomes = (reflected, 0.0), (refracted, 1 - 2**-23)
-        return lobes + [_Lobe(bsdf, _context(), kind, choice, True) for kind, choice in outcomes if bsdf.flags() & kind]
-    if "BlendBSDF" in name:
-        for component in range(bsdf.component_count()):
-            if bsdf.flags(component) & delta:
-                lobes.append(_Lobe(bsdf, _context(), delta))
-                lobes[-1].context.component = component
-        return lobes
-    for kind in (reflected, refracted):
-        if bsdf.flags() & kind:
-            lobes.append(_Lobe(bsdf, _context(), kind))
-            lobes[-1].context.type_mask = kind
-    return lobes
-
-
-def _context() -> mi.BSDFContext:
-    return mi.BSDFContext(mi.TransportMode.Importance)
+def _lobes(bsdf: mi.BSDF) -> Iterator[_Lobe]:
+    """Every delta part of a material; light that passes straight is one part, whatever the material is made of."""
+    straight = int(mi.BSDFFlags.Null)
+    if bsdf.flags() & straight:
+        yield _Lobe(bsdf, straight, 0)
+    for component in range(bsdf.component_count()):
+        kind = int(bsdf.flags(component)) & (int(mi.BSDFFlags.Delta) & ~straight)
+        if kind:
+            yield _Lobe(bsdf, kind, component)
 
 
 def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
