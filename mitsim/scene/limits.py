@@ -223,10 +223,16 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
-_BUMPS = ("bumpmap", "normalmap")
+BUMPS = ("bumpmap", "normalmap")
 """Materials that turn another's frame, and do not tell which light it lets straight on."""
+DIRECTED = (*BUMPS, "hair", "principledthin")
+"""All materials that are not reciprocal."""
+CHOICES = ("blendbsdf", "mask", "twosided")
+"""Materials that choose one of two others."""
 MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
+_TURNING, _ALONG = (*BUMPS, "hair", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
+"""Materials that differ along the surface, and parameters that make others do so."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""
 _VOLUMETRIC = ("volpath", "volpathmis")
@@ -321,18 +327,25 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
 
 
 def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
-    """The refusal of a hole or pane inside a material that hides from connections what passes it."""
-    for node, name in tree.to(_BUMPS):
+    """Return the refusal of a material inside of bumps that these hide from connections, or turn the wrong way."""
+    for node, name in tree.to(BUMPS):
         bumps = tree.nodes[node.props[name].index()]
-        hidden = next(tree.below(bumps, STRAIGHT), None)
-        if hidden is not None:
-            what = str(hidden.props.plugin_name())
-            rule = (
-                f"inside of a {bumps.props.plugin_name()} Mitsuba takes it for opaque wherever it connects a surface "
-                "to a light, so that is missing; turn them round: the mask, or other material that light passes, "
-                "outermost"
-            )
-            return outline.tag(hidden).refusal("bsdf", repr(what), rule)
+        what = str(bumps.props.plugin_name())
+        for inner in tree.below(bumps, PLUGINS["bsdf"].split()):
+            plugin = str(inner.props.plugin_name())
+            if plugin in STRAIGHT:
+                rule = (
+                    f"inside of a {what} Mitsuba takes it for opaque wherever it connects a surface to a light, so "
+                    "that is missing; turn them round: the mask, or other material that light passes, outermost"
+                )
+            elif what == "bumpmap" and (plugin in _TURNING or any(each in inner.props for each in _ALONG)):
+                rule = (
+                    "inside of a bumpmap Mitsuba mixes up the axes along the surface, so it would be turned about its "
+                    "normal; give one bumpmap, a normalmap outermost, or a material that is alike in all directions"
+                )
+            else:
+                continue
+            return outline.tag(inner).refusal("bsdf", repr(plugin), rule)
     return None
 
 

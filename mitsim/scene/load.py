@@ -17,11 +17,17 @@ import numpy.typing as npt
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import check_file, looking_beside
-from mitsim.scene.film import fit_film
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
 from mitsim.scene.own_files import with_own_files
-from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, put_wrappers, with_thin_shapes_as_meshes
+from mitsim.scene.tree import (
+    check_meshes,
+    emit_by_faces,
+    fit_film,
+    move_to_camera,
+    put_wrappers,
+    with_thin_shapes_as_meshes,
+)
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ float32: nothing for a mirror that faces the axis squarely; round ones and smoot
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -114,9 +114,7 @@ class SpecularRays:
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = _group_lobes(
-            lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)
-        )
+        self._lobes = _lobes(delta_bsdfs(scene, int(mi.BSDFFlags.Delta)))
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
@@ -183,12 +181,12 @@ class SpecularRays:
         point, geometric, normal = hits.point, hits.geometric, hits.normal
         onward: list[_Rays] = []
         materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
-        for lobe, own in self._lobes:
+        for (lobe, component), own in self._lobes.items():
             own_lobe = active & np.isin(materials, own)
             if not own_lobe.any():
                 continue
             here = mi.Bool(own_lobe)
-            sample, weight = self._sample_lobe(lobe, si, here)
+            sample, weight = self._sample_lobe(lobe, component, si, here)
             kind, eta = host_values(sample.sampled_type, count), host_values(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
@@ -202,8 +200,10 @@ class SpecularRays:
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
             clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
+            # Mirrors of one shape that face different ways are parts of different beams.
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
-            straight = lobe.kind == int(mi.BSDFFlags.Null)
+            code += np.maximum(component - ~reflected, 0).astype(np.uint64) << np.uint64(40)
+            straight = lobe == int(mi.BSDFFlags.Null)
             chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
             start = point[chosen] + direction * clear[:, None]
             if len(chosen):
@@ -211,55 +211,40 @@ class SpecularRays:
         return onward
 
     def _sample_lobe(
-        self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool
+        self, kind: int, component: int, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.BSDFSample3f, FloatArray]:
-        """Direction sample, and weights (k, channels) over all wavelength sets."""
+        """Direction sample of a component, and weights (k, channels) over all wavelength sets."""
         weights = []
         context = mi.BSDFContext(mi.TransportMode.Importance)
-        context.component = lobe.component
+        context.component = component
         for wavelengths in self._wavelengths:
             if wavelengths is not None:
                 si.wavelengths = wavelengths
             sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
-            if lobe.kind == int(mi.BSDFFlags.Null):
+            if kind == int(mi.BSDFFlags.Null):
                 # Whatever was sampled, light that passes keeps its direction.
                 weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
-                sample.sampled_type, sample.eta = mi.UInt32(lobe.kind), mi.Float(1)
-            weight = dr.select((sample.sampled_type & lobe.kind) != 0, weight, 0)
+                sample.sampled_type, sample.eta = mi.UInt32(kind), mi.Float(1)
+            weight = dr.select((sample.sampled_type & kind) != 0, weight, 0)
             weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
         return sample, np.concatenate(weights, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Lobe:
-    """A way on at a material: its ``kind``, and the number of the ``component`` of the material that sends light there.
+def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
+    """Return the numbers, in Dr.Jit's registry, of the ``materials`` that have a delta part, by its kind and component.
 
-    Of a component a BSDF gives the part of the light, so that nothing is left to chance.
+    Of a component a BSDF gives the part of the light, so that nothing is left to chance. Light that passes straight is
+    one part, whatever the material is made of.
     """
-
-    bsdf: mi.BSDF
-    kind: int
-    component: int
-
-
-def _group_lobes(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
-    """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
-    found: dict[tuple[int, int], tuple[_Lobe, list[int]]] = {}
-    for lobe in lobes:
-        number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(lobe.bsdf))).ravel()[0])
-        found.setdefault((lobe.kind, lobe.component), (lobe, []))[1].append(number)
-    return list(found.values())
-
-
-def _lobes(bsdf: mi.BSDF) -> Iterator[_Lobe]:
-    """Every delta part of a material; light that passes straight is one part, whatever the material is made of."""
+    found: dict[tuple[int, int], list[int]] = {}
     straight = int(mi.BSDFFlags.Null)
-    if bsdf.flags() & straight:
-        yield _Lobe(bsdf, straight, 0)
-    for component in range(bsdf.component_count()):
-        kind = int(bsdf.flags(component)) & (int(mi.BSDFFlags.Delta) & ~straight)
-        if kind:
-            yield _Lobe(bsdf, kind, component)
+    for bsdf in materials:
+        kinds = [int(bsdf.flags(i)) & int(mi.BSDFFlags.Delta) for i in range(bsdf.component_count())]
+        parts = [(kind, i) for i, kind in enumerate(kinds) if kind not in (0, straight)]
+        for part in [(straight, 0)] * (straight in kinds) + parts:
+            number = np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)))
+            found.setdefault(part, []).append(int(number.ravel()[0]))
+    return found
 
 
 def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:

@@ -8,16 +8,17 @@ in Mitsuba's manual, shares no code with the package, and leaves nothing to chan
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from skimage.io import imsave
 
 from mitsim.api.bench import Bench
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.integrator import Paths
-from tests.conftest import write_png
 
-Material = tuple
+Material = tuple[Any, ...]
 """``("mirror",)``, ``("glass",)``, ``("black",)`` or a wrapper, its number or ``"textured"``, and its materials."""
 WRAPPERS = ("blendbsdf", "mask", "twosided", "bumpmap", "normalmap")
 SENSOR, FOV, INDEX, ALBEDO = 0.37504, 38.0, 1.3, 0.7
@@ -38,7 +39,7 @@ _BUMP = 5.0
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def _frame(direction: np.ndarray) -> np.ndarray:
@@ -62,7 +63,9 @@ def xml(material: Material) -> str:
     if kind == "mirror":
         return '<bsdf type="conductor"><string name="material" value="none"/></bsdf>'
     if kind == "glass":
-        return f'<bsdf type="dielectric"><float name="int_ior" value="{INDEX}"/><float name="ext_ior" value="1"/></bsdf>'
+        return (
+            f'<bsdf type="dielectric"><float name="int_ior" value="{INDEX}"/><float name="ext_ior" value="1"/></bsdf>'
+        )
     if kind == "black":
         return '<bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
     number, inner = rest[0], "".join(map(xml, rest[1:]))
@@ -99,7 +102,7 @@ def write_scene(folder: Path, material: Material, lens: float = 0.0) -> Path:
         "normals": _NORMALS[None], "normals_even": _NORMALS[None, :1], "white": np.full((1, 4), 255),
     }  # fmt: skip
     for name, codes in pictures.items():
-        write_png(folder / f"{name}.png", np.repeat(codes, 4, axis=0))
+        imsave(folder / f"{name}.png", np.repeat(codes, 4, axis=0).astype(np.uint8), check_contrast=False)
     light = f"""<float name="fov" value="{BEAM}"/><float name="scale" value="{POWER}"/>
         <texture name="irradiance" type="bitmap"><string name="filename" value="white.png"/>
         <boolean name="raw" value="true"/><string name="filter_type" value="nearest"/>
@@ -159,20 +162,20 @@ def _fresnel(cosine: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _of_texels(codes: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return codes[np.clip((u * len(codes)).astype(int), 0, len(codes) - 1)] / 255
+    return np.asarray(codes[np.clip((u * len(codes)).astype(int), 0, len(codes) - 1)] / 255)
 
 
 def _slope(codes: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Slope along u of a texture with bilinear interpolation."""
     place = np.floor(u * len(codes) - 0.5).astype(int)
     left, right = (np.clip(each, 0, len(codes) - 1) for each in (place, place + 1))
-    return (codes[right] - codes[left]) / 255 * len(codes)
+    return np.asarray((codes[right] - codes[left]) / 255 * len(codes))
 
 
 def _shadowed(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Shadowing of bumps (Estevez et al., Ray Tracing Gems 2019, 12), as Mitsuba has it."""
     tan2 = [np.square(v[:, :2]).sum(axis=1) / np.square(v[:, 2]) for v in (normal, direction)]
-    return 2 / (1 + np.sqrt(1 + np.minimum(tan2[0] / 8, 1) * tan2[1]))
+    return np.asarray(2 / (1 + np.sqrt(1 + np.minimum(tan2[0] / 8, 1) * tan2[1])))
 
 
 def _bumps(kind: str, number: object, at: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -287,9 +290,6 @@ def traced(bench: Bench, seeds: int = 8, samples: int = 2048) -> tuple[float, fl
 
 # -------- All nestings of depth two
 
-_REFUSED = ("bumpmap", "normalmap")
-"""Wrappers that mitsim refuses around a mask."""
-
 
 def nested(outer: str, inner: str, leaf: str, textured: bool) -> Material:
     """The material of two wrappers around a ``leaf``; weights are constant or ``textured``."""
@@ -311,5 +311,10 @@ def all_nestings() -> Iterator[tuple[str, str, str, bool]]:
 
 
 def refused(outer: str, inner: str) -> bool:
-    """Return True if mitsim refuses these wrappers: a hole under bumps."""
-    return outer in _REFUSED and inner == "mask"
+    """Return True if mitsim refuses these wrappers: a hole under bumps, or bumps in a bump map."""
+    return (outer, inner) in (
+        ("bumpmap", "mask"),
+        ("normalmap", "mask"),
+        ("bumpmap", "bumpmap"),
+        ("bumpmap", "normalmap"),
+    )
