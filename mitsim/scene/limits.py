@@ -105,6 +105,10 @@ LIMITS = {
     "temperature": Range(0, 1e5, above=True),
     "g": Range(-1, 1, above=True, below=True),
     "sample_count": Range(1, 1e6),
+    # Of the reference alone, which would lose light by other values.
+    **dict.fromkeys(("shading_samples", "emitter_samples", "bsdf_samples"), Range(1, 1e6)),
+    "sampling_weight": Range(0, _LARGEST, above=True, hint=": the reference would find no light of this lamp"),
+    "timeout": Range(-1, 0, hint=": the reference would stop before all its light is in"),
     "max_depth": Range(-1, 10000),
     "rr_depth": Range(1, 10000),
     # Below a wavelength of light, and too near for a camera whose mask lies in front of it: lengths given in metres.
@@ -264,7 +268,7 @@ class Unfit:
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
-            factored = _blended_picture(outline, tree)
+            factored = _blended_picture(outline, tree) or _thin_sheet(outline, tree)
         else:
             node, name = medium
             rule = (
@@ -309,6 +313,19 @@ def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
                 '<string name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
             )
             return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
+    return None
+
+
+def _thin_sheet(outline: Outline, tree: _References) -> MitsimError | None:
+    """Return the refusal of a sheet that, followed forward, sends on 8 times the light it gets at grazing angles."""
+    for node, name in tree.to(("principledthin",)):
+        thin = tree.nodes[node.props[name].index()]
+        if "spec_trans" in thin.props:
+            rule = (
+                "its sharp transmission is defined for light from the camera alone, so only the reference renders it; "
+                "remove it, or use diff_trans, a thindielectric or render's reference"
+            )
+            return outline.tag(thin, "spec_trans").refusal("spec_trans", "a transmission", rule)
     return None
 
 
