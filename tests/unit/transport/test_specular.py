@@ -140,6 +140,15 @@ GLASS = fresnel(COSINE, 1.5)
         ({"type": "mitsim_twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
         ({"type": "mitsim_twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
         ({"type": "mitsim_blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
+        (
+            {
+                "type": "mitsim_blendbsdf",
+                "weight": 0.25,
+                "a": {"type": "twosided", "in": {**CONDUCTOR, "specular_reflectance": 0.4}},
+                "b": {"type": "mitsim_mask", "opacity": 0.5, "bsdf": CONDUCTOR},
+            },
+            0.75 * 0.4 + 0.25 * 0.5,
+        ),
         ({"type": "mitsim_mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
         ({"type": "mitsim_mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
         pytest.param(
@@ -151,7 +160,19 @@ GLASS = fresnel(COSINE, 1.5)
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
     ],
-    ids=["grey", "front", "back", "blend", "mask", "whole mask", "half glass", "plastic", "glass", "pane"],
+    ids=[
+        "grey",
+        "front",
+        "back",
+        "blend",
+        "two mirrors",
+        "mask",
+        "whole mask",
+        "half glass",
+        "plastic",
+        "glass",
+        "pane",
+    ],
 )
 def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
     """Choices between materials are those that :mod:`mitsim.scene.tree` puts in place of Mitsuba's."""
