@@ -168,6 +168,10 @@ class _Tree:
                 self._check_resource(node)
             if plugin == "mitsim_lensless":
                 self._check_camera(node)
+        for tag in self.tags_of(_ON_SHAPES):
+            raise tag.refusal(
+                "emitter", repr(tag.attributes.get("type")), "it is the light of a shape; put it into one"
+            )
         self._check_sizes()
 
     def tags_of(self, plugins: Sequence[str]) -> Iterator[Tag]:
@@ -203,6 +207,9 @@ class _Tree:
                 )
         elif kind == _Type.String and name not in ("values", "wavelengths"):
             _check_text(tag, plugin, name, node.props[name])
+        elif name == "hide_emitters" and node.props[name]:
+            rule = "the reference alone would leave out lamps that the sensor sees; remove it, or those lamps"
+            raise tag.refusal(name, "true", rule)
         elif kind != _Type.Bool:
             table = self.outline.tag(node).name in ("texture", "spectrum") and name in limits.TABLES
             light = table or kind in (_Type.Color, _Type.Spectrum, _Type.String)

@@ -105,6 +105,10 @@ LIMITS = {
     "temperature": Range(0, 1e5, above=True),
     "g": Range(-1, 1, above=True, below=True),
     "sample_count": Range(1, 1e6),
+    # Of the reference alone, which would lose light by other values.
+    **dict.fromkeys(("shading_samples", "emitter_samples", "bsdf_samples"), Range(1, 1e6)),
+    "sampling_weight": Range(0, _LARGEST, above=True, hint=": the reference would find no light of this lamp"),
+    "timeout": Range(-1, 0, hint=": the reference would stop before all its light is in"),
     "max_depth": Range(-1, 10000),
     "rr_depth": Range(1, 10000),
     # Below a wavelength of light, and too near for a camera whose mask lies in front of it: lengths given in metres.
@@ -223,10 +227,16 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
 """Materials that let light straight on."""
-_BUMPS = ("bumpmap", "normalmap")
+BUMPS = ("bumpmap", "normalmap")
 """Materials that turn another's frame, and do not tell which light it lets straight on."""
-_MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
+DIRECTED = (*BUMPS, "hair", "principledthin")
+"""All materials that are not reciprocal."""
+CHOICES = ("blendbsdf", "mask", "twosided")
+"""Materials that choose one of two others."""
+MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or bend light into single directions."""
+_TURNING, _ALONG = (*BUMPS, "hair", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
+"""Materials that differ along the surface, and parameters that make others do so."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path runs into."""
 _VOLUMETRIC = ("volpath", "volpathmis")
@@ -258,7 +268,7 @@ class Unfit:
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
-            factored = _blended_picture(outline, tree)
+            factored = _blended_picture(outline, tree) or _thin_sheet(outline, tree)
         else:
             node, name = medium
             rule = (
@@ -278,7 +288,7 @@ class Unfit:
 
 def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estimator: str) -> str | None:
     """What an ``estimator`` loses where one of the ``lights`` shines on a mirror."""
-    mirror = next(tree.to(_MIRRORS), None)
+    mirror = next(tree.to(MIRRORS), None)
     light = next((node for node in tree.nodes if node.props.plugin_name() in lights), None)
     if mirror is None or light is None:
         return None
@@ -306,11 +316,24 @@ def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
     return None
 
 
+def _thin_sheet(outline: Outline, tree: _References) -> MitsimError | None:
+    """Return the refusal of a sheet that, followed forward, sends on 8 times the light it gets at grazing angles."""
+    for node, name in tree.to(("principledthin",)):
+        thin = tree.nodes[node.props[name].index()]
+        if "spec_trans" in thin.props:
+            rule = (
+                "its sharp transmission is defined for light from the camera alone, so only the reference renders it; "
+                "remove it, or use diff_trans, a thindielectric or render's reference"
+            )
+            return outline.tag(thin, "spec_trans").refusal("spec_trans", "a transmission", rule)
+    return None
+
+
 def _in_instances(outline: Outline, tree: _References) -> str | None:
     for node in tree.nodes:
         if node.props.plugin_name() != "shapegroup":
             continue
-        mirror = next(tree.below(node, _MIRRORS), None)
+        mirror = next(tree.below(node, MIRRORS), None)
         if mirror is not None:
             rule = (
                 "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the "
@@ -321,18 +344,25 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
 
 
 def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
-    """The refusal of a hole or pane inside a material that hides from connections what passes it."""
-    for node, name in tree.to(_BUMPS):
+    """Return the refusal of a material inside of bumps that these hide from connections, or turn the wrong way."""
+    for node, name in tree.to(BUMPS):
         bumps = tree.nodes[node.props[name].index()]
-        hidden = next(tree.below(bumps, STRAIGHT), None)
-        if hidden is not None:
-            what = str(hidden.props.plugin_name())
-            rule = (
-                f"inside of a {bumps.props.plugin_name()} Mitsuba takes it for opaque wherever it connects a surface "
-                "to a light, so that is missing; turn them round: the mask, or other material that light passes, "
-                "outermost"
-            )
-            return outline.tag(hidden).refusal("bsdf", repr(what), rule)
+        what = str(bumps.props.plugin_name())
+        for inner in tree.below(bumps, PLUGINS["bsdf"].split()):
+            plugin = str(inner.props.plugin_name())
+            if plugin in STRAIGHT:
+                rule = (
+                    f"inside of a {what} Mitsuba takes it for opaque wherever it connects a surface to a light, so "
+                    "that is missing; turn them round: the mask, or other material that light passes, outermost"
+                )
+            elif what == "bumpmap" and (plugin in _TURNING or any(each in inner.props for each in _ALONG)):
+                rule = (
+                    "inside of a bumpmap Mitsuba mixes up the axes along the surface, so it would be turned about its "
+                    "normal; give one bumpmap, a normalmap outermost, or a material that is alike in all directions"
+                )
+            else:
+                continue
+            return outline.tag(inner).refusal("bsdf", repr(plugin), rule)
     return None
 
 

@@ -16,12 +16,11 @@ import numpy.typing as npt
 
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
+from mitsim.scene import tree
 from mitsim.scene.check import check_file, looking_beside
-from mitsim.scene.film import fit_film
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
 from mitsim.scene.own_files import with_own_files
-from mitsim.scene.tree import check_meshes, emit_by_faces, move_to_camera, with_thin_shapes_as_meshes
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
 if TYPE_CHECKING:
@@ -117,13 +116,14 @@ def load_scene(
     if needs_projector and checked.unfit.factored is not None:
         raise checked.unfit.factored
     checked.config.variant = mi.variant()
-    sensor_note = None if sensor is None else fit_film(checked, sensor)
+    sensor_note = None if sensor is None else tree.fit_film(checked, sensor)
     with with_own_files(checked), looking_beside(checked.outline):
-        moved = move_to_camera(checked.outline, checked.state)
-        notes = emit_by_faces(checked)  # before thin shapes are meshes, too
-        with with_thin_shapes_as_meshes(checked.outline, checked.state):
+        moved = tree.move_to_camera(checked.outline, checked.state)
+        notes = tree.emit_by_faces(checked)  # before thin shapes are meshes, too
+        with tree.with_thin_shapes_as_meshes(checked.outline, checked.state):
+            tree.put_wrappers(checked.state)
             scene = mi.parser.instantiate(checked.config, checked.state)
-    check_meshes(moved, scene)
+    tree.check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)
     # After normals were added up: once Mitsuba's own had a NaN, which loading the same files again did not.
     check_texels(path, scene, checked.limits)

@@ -17,8 +17,9 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.sensor import PITCH_TOLERANCE, SensorModel
 from mitsim.scene.check import CheckedScene
-from mitsim.scene.limits import PLUGINS, references
+from mitsim.scene.limits import CHOICES, DIRECTED, MIRRORS, PLUGINS, STRAIGHT, references
 from mitsim.scene.outline import Outline, Tag
 
 # -------- The camera moved to the origin, or a refusal
@@ -391,6 +392,31 @@ def _write(path: Path, mesh: Mesh) -> None:
     path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
+# -------- Materials made of others
+#
+# Those of Mitsuba lose light of mirrors, or hold for light from the camera alone: :mod:`mitsim.transport.plugins`
+# .wrappers says which, and has others in their place.
+
+
+def put_wrappers(state: mi.parser.ParserState) -> None:
+    """Replace materials of Mitsuba in a tree by those that give all light, forward and backward.
+
+    A choice between materials without mirrors or holes is right as it is, and stays.
+
+    Parameters
+    ----------
+    state
+        the tree, which is changed.
+    """
+    below = [_plugins_below(state.nodes, index) for index in range(len(state.nodes))]
+    for node, inner in zip(state.nodes, below, strict=True):
+        plugin = str(node.props.plugin_name())
+        sides = {index for index in references(node.props) if _is(state.nodes[index], "bsdf")}
+        sharp = not inner.isdisjoint((*MIRRORS, *STRAIGHT)) and (plugin != "twosided" or len(sides) > 1)
+        if plugin in DIRECTED or (plugin in CHOICES and sharp):
+            node.props.set_plugin_name(f"mitsim_{plugin}")
+
+
 # -------- Lamps that are meshes emit by their faces
 #
 # Mitsuba draws points of a mesh emitter with the normals of its vertices, and weighs the light by their cosine instead
@@ -463,3 +489,82 @@ def tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
         own = own / np.linalg.norm(own, axis=2, keepdims=True)
     sine = np.linalg.norm(np.cross(own, face[:, None]), axis=2)
     return np.minimum(sine, 1).ravel(), (own * face[:, None]).sum(axis=2).ravel()
+
+
+# -------- The film of a camera file
+#
+# A scene's film and ``pixel_pitch`` stand for what no camera file says: a file that is named says what the sensor is.
+
+_FILMS = PLUGINS["film"].split()
+_WINDOW = "crop_offset_x", "crop_offset_y", "crop_width", "crop_height"
+_PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
+
+
+def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
+    """Give the cameras of a scene the pitch and the format of a camera file.
+
+    Parameters
+    ----------
+    checked
+        the scene, whose tree is changed.
+    sensor
+        whose pitch counts where it differs by more than :data:`PITCH_TOLERANCE`, and whose rows and columns, where it
+        states them, count in place of the film's size and crop window.
+
+    Returns
+    -------
+    a sentence that names both, where something changes; else nothing.
+
+    Raises
+    ------
+    MitsimError
+        for a camera without a film whose size can be set.
+    """
+    nodes, words = checked.state.nodes, ""
+    for node in nodes:
+        if node.props.plugin_name() != "mitsim_lensless":
+            continue
+        films = [nodes[at].props for at in references(node.props) if nodes[at].props.plugin_name() in _FILMS]
+        if not films:
+            tag = checked.outline.tag(mi.parser.SceneNode(node))
+            raise tag.refusal("film", "none", "the camera file's rows and columns are its size; give it a <film>")
+        before = _sensor_words(node.props, films[0])
+        _set_pitch(node.props, sensor)
+        _set_size(films[0], sensor)
+        after = _sensor_words(node.props, films[0])
+        if after != before:
+            words = (
+                f"sensor {sensor.name!r}: {after}, as its camera file says; the scene's own, {before}, stand where no "
+                "camera is named"
+            )
+    return words
+
+
+def _sensor_words(camera: mi.Properties, film: mi.Properties) -> str:
+    """Pixels and pitch of a film in words."""
+    column = float(camera.get("pixel_pitch", _PITCH))
+    row = float(camera.get("row_pitch", column))
+    rows, columns = (int(film.get(name, default)) for name, default in (("height", 576), ("width", 768)))
+    pitch = f"{column * 1e3:g}" if row == column else f"{row * 1e3:g} x {column * 1e3:g}"
+    window = f", of which a window of {film['crop_height']} x {film['crop_width']}" if _WINDOW[-1] in film else ""
+    return f"{rows} x {columns} pixels of {pitch} um ({rows * row:.3g} x {columns * column:.3g} mm){window}"
+
+
+def _set_pitch(camera: mi.Properties, sensor: SensorModel) -> None:
+    own_row, own_column = sensor.pitches_mm
+    column = float(camera.get("pixel_pitch", _PITCH))
+    row = float(camera.get("row_pitch", column))
+    if abs(own_column - column) > PITCH_TOLERANCE * column or abs(own_row - row) > PITCH_TOLERANCE * row:
+        camera["pixel_pitch"] = own_column
+        if "row_pitch" in camera:
+            del camera["row_pitch"]
+        if own_row != own_column:
+            camera["row_pitch"] = own_row
+
+
+def _set_size(film: mi.Properties, sensor: SensorModel) -> None:
+    if sensor.frame_shape is not None:
+        film["height"], film["width"] = sensor.frame_shape
+        for name in _WINDOW:
+            if name in film:
+                del film[name]

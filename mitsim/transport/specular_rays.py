@@ -21,7 +21,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
-from mitsim.transport.transmission import CLEAR, Passage, transmits
+from mitsim.transport.transmission import CLEAR, transmits
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
@@ -114,9 +114,7 @@ class SpecularRays:
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
         self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
-        self._lobes = _group_lobes(
-            lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)
-        )
+        self._lobes = _lobes(delta_bsdfs(scene, int(mi.BSDFFlags.Delta)))
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
@@ -183,12 +181,12 @@ class SpecularRays:
         point, geometric, normal = hits.point, hits.geometric, hits.normal
         onward: list[_Rays] = []
         materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
-        for lobe, own in self._lobes:
+        for (lobe, component), own in self._lobes.items():
             own_lobe = active & np.isin(materials, own)
             if not own_lobe.any():
                 continue
             here = mi.Bool(own_lobe)
-            sample, weight = self._sample_lobe(lobe, si, here)
+            sample, weight = self._sample_lobe(lobe, component, si, here)
             kind, eta = host_values(sample.sampled_type, count), host_values(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
@@ -202,8 +200,10 @@ class SpecularRays:
             slope = np.abs((direction * geometric[chosen]).sum(axis=1))
             clear = self._clear * (1 + np.abs(point[chosen]).max(axis=1, initial=0)) / np.maximum(slope, _GRAZING)
             reflected = (kind[chosen] & int(mi.BSDFFlags.DeltaReflection)) != 0
+            # Mirrors of one shape that face different ways are parts of different beams.
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
-            straight = lobe.kind == int(mi.BSDFFlags.Null)
+            code += np.maximum(component - ~reflected, 0).astype(np.uint64) << np.uint64(40)
+            straight = lobe == int(mi.BSDFFlags.Null)
             chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
             start = point[chosen] + direction * clear[:, None]
             if len(chosen):
@@ -211,78 +211,40 @@ class SpecularRays:
         return onward
 
     def _sample_lobe(
-        self, lobe: _Lobe, si: mi.SurfaceInteraction3f, active: mi.Bool
+        self, kind: int, component: int, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.BSDFSample3f, FloatArray]:
-        """Direction sample, and weights (k, channels) over all wavelength sets."""
+        """Direction sample of a component, and weights (k, channels) over all wavelength sets."""
         weights = []
-        choice = lobe.choice * (1 - dr.max(Passage.straight(si, active))) if lobe.by_chance else lobe.choice
+        context = mi.BSDFContext(mi.TransportMode.Importance)
+        context.component = component
         for wavelengths in self._wavelengths:
             if wavelengths is not None:
                 si.wavelengths = wavelengths
-            sample, weight = si.bsdf().sample(lobe.context, si, choice, mi.Point2f(0.5), active)
-            weight = weight * sample.pdf if lobe.by_chance else weight
-            if lobe.kind == int(mi.BSDFFlags.Null):
+            sample, weight = si.bsdf().sample(context, si, 0.5, mi.Point2f(0.5), active)
+            if kind == int(mi.BSDFFlags.Null):
                 # Whatever was sampled, light that passes keeps its direction.
                 weight, sample.wo = si.bsdf().eval_null_transmission(si, active), -si.wi
-                sample.sampled_type, sample.eta = mi.UInt32(lobe.kind), mi.Float(1)
-            weight = dr.select((sample.sampled_type & lobe.kind) != 0, weight, 0)
+                sample.sampled_type, sample.eta = mi.UInt32(kind), mi.Float(1)
+            weight = dr.select((sample.sampled_type & kind) != 0, weight, 0)
             weights.append(channels(mi.unpolarized_spectrum(weight), dr.width(si.t)))
         return sample, np.concatenate(weights, axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Lobe:
-    """One way on at a material, of a ``kind``: the context and random number that choose it, and whether of several.
+def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
+    """Return the numbers, in Dr.Jit's registry, of the ``materials`` that have a delta part, by its kind and component.
 
-    If so, Mitsuba has divided the weight by the probability of the choice, which is the sample's ``pdf``.
+    Of a component a BSDF gives the part of the light, so that nothing is left to chance. Light that passes straight is
+    one part, whatever the material is made of.
     """
-
-    bsdf: mi.BSDF
-    context: mi.BSDFContext
-    kind: int
-    choice: float = 0.5
-    by_chance: bool = False
-
-
-def _group_lobes(lobes: Iterable[_Lobe]) -> list[tuple[_Lobe, list[int]]]:
-    """One of all ``lobes`` that are chosen alike, and the numbers of their materials in Dr.Jit's registry."""
-    found: dict[tuple[object, ...], tuple[_Lobe, list[int]]] = {}
-    for lobe in lobes:
-        key = lobe.kind, lobe.choice, lobe.by_chance, lobe.context.type_mask, lobe.context.component
-        number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(lobe.bsdf))).ravel()[0])
-        found.setdefault(key, (lobe, []))[1].append(number)
-    return list(found.values())
-
-
-def _lobes(bsdf: mi.BSDF) -> list[_Lobe]:
-    """Every delta part of a material, so that nothing is left to chance.
-
-    Parts are chosen by type, because components of a ``twosided`` are not numbered alike on both sides; those of a
-    blend can be told by component only, and a ``mask`` obeys neither: its first and last outcome short of the hole are
-    taken (a mirror, or the reflection of glass and its transmission). What passes is the same for all materials.
-    """
-    flags = mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null
-    reflected, refracted, straight = (int(flag) for flag in flags)
-    name, delta = str(bsdf), reflected | refracted
-    lobes = [_Lobe(bsdf, _context(), straight)] if bsdf.flags() & straight else []
-    if name.startswith("Mask"):
-        outcomes = (reflected, 0.0), (refracted, 1 - 2**-23)
-        return lobes + [_Lobe(bsdf, _context(), kind, choice, True) for kind, choice in outcomes if bsdf.flags() & kind]
-    if "BlendBSDF" in name:
-        for component in range(bsdf.component_count()):
-            if bsdf.flags(component) & delta:
-                lobes.append(_Lobe(bsdf, _context(), delta))
-                lobes[-1].context.component = component
-        return lobes
-    for kind in (reflected, refracted):
-        if bsdf.flags() & kind:
-            lobes.append(_Lobe(bsdf, _context(), kind))
-            lobes[-1].context.type_mask = kind
-    return lobes
-
-
-def _context() -> mi.BSDFContext:
-    return mi.BSDFContext(mi.TransportMode.Importance)
+    found: dict[tuple[int, int], list[int]] = {}
+    straight = int(mi.BSDFFlags.Null)
+    for bsdf in materials:
+        kinds = [int(bsdf.flags(i)) & int(mi.BSDFFlags.Delta) for i in range(bsdf.component_count())]
+        parts = [(kind, i) for i, kind in enumerate(kinds) if kind not in (0, straight)]
+        for part in [(straight, 0)] * (straight in kinds) + parts:
+            number = np.array(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf)))
+            found.setdefault(part, []).append(int(number.ravel()[0]))
+    return found
 
 
 def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-_REGISTERED: set[tuple[str, str]] = set()
-"""Variants and plugins that are known to them."""
+_REGISTERED: set[str] = set()
+"""Variants that know the plugins."""
 
 
 def register() -> None:
@@ -17,12 +17,15 @@ def register() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.plugins import glass, grating, lens, lensless
+    from mitsim.transport.plugins import glass, grating, lens, lensless, wrappers
 
     variant = mi.variant()
     if variant is None:
         raise MitsimError("no Mitsuba variant is selected; call mitsim.core.environment.load_variant first")
+    if variant in _REGISTERED:
+        return
     for kind, plugin in (("sensor", lensless), ("bsdf", grating), ("bsdf", glass), ("emitter", lens)):
-        if (variant, plugin.PLUGIN) not in _REGISTERED:
-            getattr(mi, f"register_{kind}")(plugin.PLUGIN, plugin.plugin_class())
-            _REGISTERED.add((variant, plugin.PLUGIN))
+        getattr(mi, f"register_{kind}")(plugin.PLUGIN, plugin.plugin_class())
+    for name, made in wrappers.plugin_classes().items():
+        mi.register_bsdf(name, made)
+    _REGISTERED.add(variant)

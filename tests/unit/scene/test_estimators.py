@@ -234,3 +234,42 @@ def test_what_light_passes_is_not_hidden_under_bumps(small_scene: Write, bumps: 
 def test_hidden_holes_that_no_shape_has_are_no_matter(small_scene: Write) -> None:
     extra = f'<bsdf type="normalmap" id="unused">{BUMPS["normalmap"]}{HOLE.format(MATT)}</bsdf>'
     open_bench(small_scene(extra=extra), "llvm_ad_mono")
+
+
+AREA = '<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'
+THIN = '<shape type="disk"><bsdf type="principledthin"><float name="spec_trans" value="0.5"/></bsdf></shape>'
+
+
+@pytest.mark.parametrize(
+    ("numbers", "line"),
+    [
+        ({"extra": AREA}, "emitter: got 'area' in <emitter type='area'>; it is the light of a shape"),
+        ({"integrator_options": '<boolean name="hide_emitters" value="true"/>'}, "hide_emitters: got true"),
+        ({"integrator_options": '<float name="timeout" value="2"/>'}, "timeout: got 2"),
+        (
+            {"integrator": "direct", "integrator_options": '<integer name="bsdf_samples" value="0"/>'},
+            "bsdf_samples: got 0",
+        ),
+        (
+            {"extra": AREA.replace("area", "constant").replace("</", '<float name="sampling_weight" value="0"/></', 1)},
+            "sampling_weight: got 0",
+        ),
+        ({"extra": THIN}, "spec_trans: got a transmission"),
+    ],
+    ids=["area", "hide", "timeout", "bsdf", "weight", "thin"],
+)
+def test_what_one_estimator_alone_would_obey_is_refused(small_scene: Write, numbers: dict[str, str], line: str) -> None:
+    """Lamps were in one estimator's frames and not in the other's, with status 0."""
+    assert line in message(lambda: open_bench(small_scene(**numbers), "llvm_ad_mono"))
+
+
+@pytest.mark.usefixtures("flat")
+@pytest.mark.parametrize("inner", [*BUMPS, "mitsim_grating", "roughconductor"])
+def test_what_differs_along_the_surface_is_not_turned_by_a_bump_map(small_scene: Write, inner: str) -> None:
+    """Mitsuba takes the axes of a bump map from another frame: mirrors under two maps lost all their light."""
+    own = BUMPS.get(inner, "") + (MATT if inner in BUMPS else "")
+    own += '<float name="alpha_u" value="0.2"/>' if inner == "roughconductor" else ""
+    extra = (
+        f'<shape type="disk"><bsdf type="bumpmap">{BUMPS["bumpmap"]}<bsdf type="{inner}">{own}</bsdf></bsdf></shape>'
+    )
+    assert f"bsdf: got '{inner}' in " in message(lambda: open_bench(small_scene(extra=extra), "llvm_ad_mono"))

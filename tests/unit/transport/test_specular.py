@@ -137,13 +137,22 @@ GLASS = fresnel(COSINE, 1.5)
     ("bsdf", "part"),
     [
         ({"type": "conductor", "specular_reflectance": {"type": "uniform", "value": 0.3}}, 0.3),
-        ({"type": "twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
-        ({"type": "twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
-        ({"type": "blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
-        ({"type": "mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
-        ({"type": "mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
+        ({"type": "mitsim_twosided", "front": CONDUCTOR, "back": {"type": "diffuse"}}, 1.0),
+        ({"type": "mitsim_twosided", "front": {"type": "diffuse"}, "back": CONDUCTOR}, 0.0),
+        ({"type": "mitsim_blendbsdf", "weight": 0.25, "a": {"type": "diffuse"}, "b": CONDUCTOR}, 0.25),
+        (
+            {
+                "type": "mitsim_blendbsdf",
+                "weight": 0.25,
+                "a": {"type": "twosided", "in": {**CONDUCTOR, "specular_reflectance": 0.4}},
+                "b": {"type": "mitsim_mask", "opacity": 0.5, "bsdf": CONDUCTOR},
+            },
+            0.75 * 0.4 + 0.25 * 0.5,
+        ),
+        ({"type": "mitsim_mask", "opacity": 0.25, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 0.25),
+        ({"type": "mitsim_mask", "opacity": 1.0, "bsdf": {"type": "twosided", "bsdf": CONDUCTOR}}, 1.0),
         pytest.param(
-            {"type": "mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
+            {"type": "mitsim_mask", "opacity": 0.5, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
             GLASS / 2,
             marks=pytest.mark.slow,
         ),
@@ -151,9 +160,22 @@ GLASS = fresnel(COSINE, 1.5)
         ({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, GLASS),
         ({"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}, 2 * GLASS / (1 + GLASS)),
     ],
-    ids=["grey", "front", "back", "blend", "mask", "whole mask", "half glass", "plastic", "glass", "pane"],
+    ids=[
+        "grey",
+        "front",
+        "back",
+        "blend",
+        "two mirrors",
+        "mask",
+        "whole mask",
+        "half glass",
+        "plastic",
+        "glass",
+        "pane",
+    ],
 )
 def test_each_material_sends_on_its_part(bsdf: dict, part: float) -> None:
+    """Choices between materials are those that :mod:`mitsim.scene.tree` puts in place of Mitsuba's."""
     full = flux(scene_with(sheet=plane(0, 400, CONDUCTOR)))
     assert full > 0
     # The reflectance of glass changes by less than 1e-4 over the window's small part that meets the sensor.
