@@ -132,7 +132,7 @@ class SampledLight:
         :attr:`apparent`, where it was traced with that of other lines.
     restated
         factor of the Monte Carlo error over that by the differences of the groups. Sampling stops where these happen to
-        be small; so errors count as large as earlier looks, whose differences did not end it, predicted them.
+        be small; so what an earlier look predicted, whose differences did not end it, counts as much where it is more.
     """
 
     groups: tuple[LightEstimate, ...]
@@ -445,7 +445,7 @@ def _checks(
 ) -> dict[int, _Check]:
     """What :func:`_check` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
     of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is. No
-    error is smaller than the look before has ``predicted``."""
+    error counts without what the look before has ``predicted``."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
@@ -455,7 +455,7 @@ def _checks(
     return checks
 
 
-def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool, least: float) -> _Check:
+def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool, predicted: float) -> _Check:
     """A look at the frames of a light.
 
     Parameters
@@ -464,8 +464,8 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
         whose frames of which shots.
     followed
         whether it is light over several surfaces.
-    least
-        of its error.
+    predicted
+        error by the look before; where it is larger, the error is the root mean square of both.
     """
     shots, classes = lighting.weights.shape
     whole = tells_all(classes, shots, light.bench.geometry.frame_side)
@@ -475,7 +475,7 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
     expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
     more = _error_growth(light, lighting, seen)
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
-    restated = max(least / error, 1.0) if error else 1.0
+    restated = math.sqrt((1 + max(predicted / error, 1.0) ** 2) / 2) if error else 1.0
     light, bound = replace(light, sampling_error=restated * error, restated=restated), restated * bound
     if whole and expected.probed is not None:
         found = FrameCheck(light.groups, light.simulation, light.rows_of(lighting), expected.probed)

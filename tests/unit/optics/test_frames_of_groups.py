@@ -129,16 +129,18 @@ def test_probes_see_every_matrix_with_its_norm_and_what_columns_share_exactly() 
 
 
 KINDS = {"one": np.ones(1), "two": np.ones(2), "four": np.ones(4), "sixteen": np.ones(16), "many": np.ones(100),
-         "fewer and fewer": 0.8 ** np.arange(30)}  # fmt: skip
+         "fewer and fewer": 0.8 ** np.arange(30), "half of one": np.array([50.0, *np.ones(50)])}  # fmt: skip
 """Variance of each kind of noise."""
 
 
 @pytest.mark.parametrize("kinds", KINDS)
 def test_the_bound_of_a_monte_carlo_error_holds(kinds: str) -> None:
-    """4000 errors, each the mean of 4 normal groups with so many kinds of noise: 95 % are below their bound.
+    """4000 errors, each the mean of 4 normal groups with so many kinds of noise: 95 % are below their bound; where one
+    kind has half of the noise, 92 %.
 
     Binomial standard deviation: 0.35 %. The bound by the spread of groups' energies held in 85 % for one kind and in
-    88 % for four. (Planted: that bound; Student's deviate of one side; the bound of many kinds for all.)
+    88 % for four. (Planted: that bound; Student's deviate of one side; a square that grows evenly with the part of one
+    kind.)
     """
     groups, draws, variances = 4, 4000, KINDS[kinds]
     noise = np.random.default_rng(5).normal(size=(draws, groups, len(variances))) * np.sqrt(variances)
@@ -147,7 +149,7 @@ def test_the_bound_of_a_monte_carlo_error_holds(kinds: str) -> None:
     products = off @ off.transpose(0, 2, 1) / (groups * (groups - 1))
     made, bounds = np.square(mean).sum(axis=1), np.array([bound_of(each, 1.0) for each in products])
     held = float((made <= bounds**2).mean())
-    assert 0.93 < held < (0.98 if kinds == "many" else 0.97)
+    assert (0.91 if kinds == "half of one" else 0.935) < held < 0.99
     assert bound_of(np.zeros((4, 4)), 1.0) == bound_of(np.eye(4), 0.0) == 0.0
 
 

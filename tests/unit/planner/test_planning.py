@@ -295,8 +295,9 @@ def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
 
 
 def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
-    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance in pixels of
-    their own, nine tenths of the bounds do with so many samples. (Planted: samples for the error alone.)"""
+    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, in pixels
+    of their own, half of the bounds do with so many samples. (Planted: samples for the error alone, 9 % of the
+    bounds.)"""
     rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
     # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
     noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
@@ -306,7 +307,7 @@ def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
     centre = np.eye(GROUPS) - 1 / GROUPS
     products = [centre @ np.diag(each) @ centre for each in met]
     bounds = np.array([bound_of(each / (samples * GROUPS) ** 2 * GROUPS / (GROUPS - 1), 1.0) for each in products])
-    assert 0.85 < float((bounds < target).mean()) < 0.95
+    assert 0.35 < float((bounds < target).mean()) < 0.75
 
 
 def test_noise_tells_how_unlike_replicates_are() -> None:
