@@ -232,7 +232,8 @@ def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: ar
                 small(Path(bench.loaded.path), options.sensor, Path(folder)), for_render=True, **given
             )
     family, switches = bench.family(patterns, SEED), dict.fromkeys(options.off, False)
-    simulations, rounds, kept = dict[int, Any](), list[int](), (light_module.Simulation, light_module.trace_groups)
+    module: Any = light_module
+    simulations, rounds, kept = dict[int, Any](), list[int](), (module.Simulation, module.trace_groups)
 
     def prepared(apparatus: Any, settings: Any) -> Any:
         """One simulation for each plan, so that its optics are prepared once."""
@@ -244,7 +245,7 @@ def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: ar
         rounds[-1] += 1
         kept[1](*arguments, **named)
 
-    light_module.Simulation, light_module.trace_groups = prepared, counted
+    module.Simulation, module.trace_groups = prepared, counted
     frames, rows, plans, started = list[Frames](), list[tuple[float, ...]](), list[Any](), time.perf_counter()
     for seed in range(1, seeds + 1):
         if time.perf_counter() - started > options.seconds:
@@ -259,7 +260,7 @@ def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: ar
         noise = monte_carlo_error(expected), monte_carlo_bound(expected)
         frames.append(np.array([frame.irradiance for frame in expected]).ravel())
         rows.append((*noise, plan.sampling_target, light.paths, spent))
-    light_module.Simulation, light_module.trace_groups = kept
+    module.Simulation, module.trace_groups = kept
     seen, (stated, bounds, targets, paths, spent) = np.array(frames), np.array(rows).T
     count, off = len(seen), seen - seen.mean(axis=0)
     products = off @ off.T

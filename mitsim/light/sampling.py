@@ -194,7 +194,15 @@ def next_samples(
 
 
 def error_left(done: Mapping[str, int], samples: Mapping[str, int], variances: Mapping[str, float]) -> float:
-    """Return the error after ``samples`` over that after those ``done``, which left ``variances``, by pass."""
+    """Return the relative error that more samples leave of that which fewer left.
+
+    Parameters
+    ----------
+    done, samples
+        of a group before and after, by the name of the pass.
+    variances
+        that those done left, up to one factor.
+    """
     left = [SampledPass(name, done[name], variances[name], 1.0).variance_left(samples[name]) for name in done]
     return math.sqrt(sum(left) / (sum(variances.values()) or 1.0))
 
