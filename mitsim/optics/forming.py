@@ -11,10 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
@@ -348,36 +349,6 @@ def bound_of(products: FloatArray, energy: float) -> float:
     variance, freedom = float(np.trace(products)), len(products) - 1
     if not energy or not variance or not freedom:
         return 0.0
-    one, many, norm = student_quantile(freedom, _SURE) ** 2, _MANY_KINDS**2, float(np.square(products).sum())
+    one, many, norm = scipy.special.stdtrit(freedom, _SURE) ** 2, _MANY_KINDS**2, float(np.square(products).sum())
     part = (freedom * norm / variance**2 - 1) / (freedom - 1) if freedom > 1 else 1.0
     return math.sqrt((many + (one - many) * max(part, 0.0) ** _OF_ONE_KIND) * variance / energy)
-
-
-@cache
-def student_quantile(freedom: int, chance: float) -> float:
-    """What Student's t is below, by halving an angle's range: Abramowitz and Stegun (1964), 26.7.3 and 26.7.4, has its
-    law as a sum. scipy.special has it too, and takes 0.1 s to import.
-
-    Parameters
-    ----------
-    freedom
-        its degrees of freedom, 1 or more.
-    chance
-        of that, 1/2 or more, and below 1.
-    """
-    odd = freedom % 2
-
-    def within(angle: float) -> float:
-        """The chance of -t to t, t = tan(angle) sqrt(freedom)."""
-        cosine = math.cos(angle)
-        total = term = (cosine if odd else 1.0) * (freedom > 1)
-        for k in range(2 + odd, freedom, 2):
-            term *= (k - 1) / k * cosine**2
-            total += term
-        part = math.sin(angle) * total
-        return 2 / math.pi * (angle + part) if odd else part
-
-    low, high = 0.0, math.pi / 2
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if within(middle) < 2 * chance - 1 else (low, middle)
-    return math.tan(middle) * math.sqrt(freedom)

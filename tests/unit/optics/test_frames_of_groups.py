@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 from scipy.special import stdtrit
 
-from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors, student_quantile
+from mitsim.optics.forming import AccumulatedLight, bound_of, probe_vectors
 from mitsim.optics.frames import ClassFrames, monte_carlo_bound, monte_carlo_error
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
@@ -98,13 +98,6 @@ def test_noise_is_told_by_light(family: str) -> None:
     found = np.concatenate([by_light, by_ambient])
     found, apart = (each / np.einsum("lgg->", each) for each in (found, apart))
     assert found == pytest.approx(apart, rel=1e-9)
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 30, 199])
-def test_students_quantile_is_scipys(freedom: int) -> None:
-    """(Planted: a sum that ends a term early.)"""
-    for chance in (0.5, 0.6, 0.95, 0.999):
-        assert student_quantile(freedom, chance) == pytest.approx(stdtrit(freedom, chance), rel=1e-12, abs=1e-15)
 
 
 def test_one_group_has_no_variance_to_tell() -> None:

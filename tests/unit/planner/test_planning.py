@@ -197,7 +197,8 @@ def test_unit_costs_are_those_of_launches_as_the_run_has_them(
     monkeypatch: pytest.MonkeyPatch, paths_per_sample: int, planned: int, disturbed: int
 ) -> None:
     """Within 1.5 times of what all launches of the run take together, in one round and a half, one slow moment or none,
-    where that is more than a second. (Planted: one round; the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
+    where that is more than a second. (Planted: one round; the pace of the first launch alone, 4
+    times too slow; the slower of two launches.)"""
     at_once, machine = 2**21, Machine(disturbed)
     monkeypatch.setattr(planner, "_seconds", machine.seconds)
     each = SimpleNamespace(tracer=SimpleNamespace(paths_per_sample=paths_per_sample), whole=planned)
