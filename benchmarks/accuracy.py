@@ -15,6 +15,14 @@ machine. ``--seeds N`` tells of how many captures with other seeds the error lie
 bound that the run states; it is not timed. ``--equal N`` compares seconds at equal measured errors: with each of N
 seeds the earlier version at 1e-3, and this one at 1e-3 and coarser accuracies, in turn, against the same answer. The
 coarsest accuracy whose root mean square error over the seeds is not above the earlier version's is its equal.
+
+    python benchmarks/accuracy.py --cover 200 --json FILE --scene corner [--patterns uniform ...] [--camera FILE] ...
+
+``--cover N`` is of the Monte Carlo error alone: frames of N seeds, traced with a plan for every 40 of them, against the
+mean of all others. It prints how often the stated 95 % bound holds and how often the target, the variance of the frames
+over the stated one, kinds of noise (trace squared over the squared norm of the frames' covariance), and rounds, paths
+and processor seconds of a light. A scene may be a file; ``--sensor 64`` gives it so many pixels a side.
+To measure an earlier version, set PYTHONPATH to its checkout.
 """
 
 from __future__ import annotations
@@ -24,7 +32,9 @@ import itertools
 import json
 import math
 import os
+import re
 import resource
+import shutil
 import statistics
 import subprocess
 import sys
@@ -43,6 +53,7 @@ from mitsim.acquire.exposure import Exposer
 from mitsim.core.exr import read_frame
 from mitsim.core.job import Job
 from mitsim.core.seeds import integer
+from mitsim.light import light as light_module
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.settings import Estimate
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
@@ -62,6 +73,8 @@ energy drops out."""
 SEEN = 3
 """How many times as closely the pilot of the answer looks, so that more pixels count as occluded, and more is tried."""
 SEED, ANSWERS = 0, 811
+PLANNED = 40
+"""Seeds of ``--cover`` that share a plan."""
 PROMISED, COARSER = 1e-3, tuple(1e-3 * 2 ** (step / 4) for step in range(6))
 """What the earlier version is asked for by ``--equal``, and what this one is: each has some 0.7 of the paths of the one
 before."""
@@ -197,6 +210,79 @@ def covered(scene: str, accuracy: float, seeds: int, halves: Frames) -> dict[str
     }
 
 
+def small(scene: Path, side: int, folder: Path) -> Path:
+    """A copy of a ``scene`` and its files in a ``folder``, whose sensor has ``side`` pixels a side and its old size."""
+    copy = shutil.copytree(scene.parent, folder / "scene") / scene.name
+    text = copy.read_text()
+    (old,) = set(re.findall(r'name="(?:width|height)" value="(\d+)"', text))
+    text = re.sub(r'(name="(?:width|height)" value=)"\d+"', rf'\1"{side}"', text)
+    pitch = re.search(r'name="pixel_pitch" value="([^"]+)"', text)
+    assert pitch is not None
+    copy.write_text(text.replace(pitch[0], f'name="pixel_pitch" value="{float(pitch[1]) * int(old) / side:.9g}"'))
+    return copy
+
+
+def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: argparse.Namespace) -> dict[str, Any]:
+    """How often the stated Monte Carlo error of frames holds, against the mean over the other ``seeds``."""
+    given = {name: getattr(options, name) for name in ("camera", "projector", "mask") if getattr(options, name)}
+    bench = ms.open_bench(scene, for_render=True, **given)
+    if options.sensor:
+        with tempfile.TemporaryDirectory() as folder:
+            bench = ms.open_bench(
+                small(Path(bench.loaded.path), options.sensor, Path(folder)), for_render=True, **given
+            )
+    family, switches = bench.family(patterns, SEED), dict.fromkeys(options.off, False)
+    module: Any = light_module
+    simulations, rounds, kept = dict[int, Any](), list[int](), (module.Simulation, module.trace_groups)
+
+    def prepared(apparatus: Any, settings: Any) -> Any:
+        """One simulation for each plan, so that its optics are prepared once."""
+        if id(settings) not in simulations:
+            simulations[id(settings)] = kept[0](apparatus, settings)
+        return simulations[id(settings)]
+
+    def counted(*arguments: Any, **named: Any) -> None:
+        rounds[-1] += 1
+        kept[1](*arguments, **named)
+
+    module.Simulation, module.trace_groups = prepared, counted
+    frames, rows, plans, started = list[Frames](), list[tuple[float, ...]](), list[Any](), time.perf_counter()
+    for seed in range(1, seeds + 1):
+        if time.perf_counter() - started > options.seconds:
+            break
+        if seed % PLANNED == 1:
+            plans.append(make_plan(bench, family.lighting, accuracy, seed, switches))
+        plan, before = plans[-1], time.process_time()
+        rounds.append(0)
+        light = trace_light(bench, plan, family.lighting, seed, Sampling(by_pixel=False))
+        expected = list(light.frames(family.lighting, seed, leaking=False))
+        spent = time.process_time() - before
+        noise = monte_carlo_error(expected), monte_carlo_bound(expected)
+        frames.append(np.array([frame.irradiance for frame in expected]).ravel())
+        rows.append((*noise, plan.sampling_target, light.paths, spent))
+    module.Simulation, module.trace_groups = kept
+    seen, (stated, bounds, targets, paths, spent) = np.array(frames), np.array(rows).T
+    count, off = len(seen), seen - seen.mean(axis=0)
+    products = off @ off.T
+    # An error against the mean of the others is larger by (N / (N - 1))^(1/2) than against the truth.
+    errors = np.sqrt(np.diag(products) * count / (count - 1) / np.square(seen.mean(axis=0)).sum())
+    return {
+        "seeds": count,
+        "within_bound": float((errors <= bounds).mean()),
+        "within_target": float((errors <= targets).mean()),
+        "variance_ratio": float(np.square(errors).mean() / np.square(stated).mean()),
+        "kinds": float(np.trace(products) ** 2 / np.square(products).sum()),
+        "bound_over_error": float(np.median(bounds / stated)),
+        "error": float(np.sqrt(np.square(errors).mean())),
+        "target": float(targets.mean()),
+        "mean": float(seen.mean()),
+        "rounds": float(np.mean(rounds)),
+        "paths": float(paths.mean()),
+        "processor_seconds": float(np.median(spent)),
+        "work_for_error": float(spent.mean() * np.square(errors).mean() / np.square(targets).mean()),
+    }
+
+
 def side_by_side(scene: str, seed: int, halves: Frames, old: Path, warm: bool) -> dict[str, Any]:
     """One run of the earlier version and one of this at each coarser accuracy; ``warm``: after uncounted ones."""
     for tree in (old, None) if warm else ():
@@ -271,12 +357,27 @@ def main() -> None:
     parser.add_argument("--equal", type=int, default=0)
     parser.add_argument("--noise", type=float, default=NOISE)
     parser.add_argument("--halves", type=int, default=2)
+    parser.add_argument("--cover", type=int, default=0)
+    parser.add_argument("--patterns", nargs="+", default=["uniform", "dots:4"])
+    parser.add_argument("--off", nargs="*", default=[], help="effects that --cover switches off")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="that --cover of one case takes at most")
+    parser.add_argument("--sensor", type=int, help="pixels a side of --cover's scenes")
+    parser.add_argument("--mask", help="of --cover's scenes, such as open")
+    parser.add_argument("--camera")
+    parser.add_argument("--projector")
     options = parser.parse_args()
     if options.equal and not options.old:
         parser.error("--equal needs --old, the checkout to compare with")
     found = json.loads(options.json.read_text()) if options.json.exists() else {}
     for scene in options.scene or SCENES:
         rows = found.setdefault(scene, {})
+        for patterns, accuracy in itertools.product(options.patterns, options.accuracy or ACCURACIES[:1]):
+            if options.cover and (key := f"cover {patterns} {accuracy:g}") not in rows:
+                rows[key] = coverage(scene, patterns, accuracy, options.cover, options)
+                print(scene, key, *(f"{name} {value:.3g}" for name, value in rows[key].items()), sep="\n  ", flush=True)
+                options.json.write_text(json.dumps(found, indent=1))
+        if options.cover:
+            continue
         kept = options.json.with_suffix(f".{Path(scene).stem}.npy")
         if not kept.exists():
             np.save(kept, answer(scene, options.noise, options.halves))

@@ -7,25 +7,36 @@
 For each scene and wanted PSNR: the plan (seed 0), then another capture, another session's light, and N sessions by the
 planned recipe in it, whose every frame is exposed with noise of its own, calibrated and reconstructed. Prints a row of
 Markdown for each: predicted PSNR, the mean of the N images with its standard error, and their difference.
+
+    python benchmarks/plan_promise.py --seconds photograph corner ... [--sensor 32 512]
+
+``--seconds``: instead, predicted and measured seconds of transport of scenes (dots:4, accuracy 1e-2), with so many
+pixels a side: a later light, a first one, and what plan and first light took to compile kernels (with an empty HOME,
+all of them). Needs an idle machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from accuracy import small
 
 import mitsim as ms
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import estimate
 from mitsim.calibrate.lit_session import LitSession
-from mitsim.core.job import Job
+from mitsim.core.job import Job, compiled_kernels
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.sensor import digital_of
+from mitsim.light.light import Sampling, trace_light
+from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.factors import Factors
 
 HEAD = (
@@ -53,13 +64,47 @@ def session_psnrs(bench: Any, patterns: str, recipe: Any, seeds: range) -> list[
     return found
 
 
+def transport(scene: str, side: int | None, projector: str | None) -> str:
+    """A row of predicted and measured seconds of transport."""
+    given = {"projector": projector} if projector else {}
+    bench = ms.open_bench(scene, for_render=True, **given)
+    if side:
+        with tempfile.TemporaryDirectory() as folder:
+            bench = ms.open_bench(small(Path(bench.loaded.path), side, Path(folder)), for_render=True, **given)
+    lighting, compiled = bench.family("dots:4").lighting, [compiled_kernels().seconds]
+    plan = make_plan(bench, lighting, 1e-2, 1)
+    compiled.append(compiled_kernels().seconds)
+    taken = []
+    for seed in (2, 3):
+        started = time.perf_counter()
+        trace_light(bench, plan, lighting, seed, Sampling(by_pixel=False))
+        taken.append(time.perf_counter() - started)
+        compiled.append(compiled_kernels().seconds)
+    predicted = plan.predicted["transport"]
+    of_plan, of_light = compiled[1] - compiled[0], compiled[2] - compiled[1]
+    return (
+        f"| {Path(scene).parent.name or scene}, {side or 'as it is'} | {predicted:.2f} | {taken[1]:.2f} | "
+        f"{predicted / taken[1]:.2f} | {taken[0]:.2f} | {of_plan:.1f}, {of_light:.1f} |"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["photograph", "colour_chart", "resolution_target:dots:5"])
     parser.add_argument("--psnr", nargs="+", type=float, default=[30.0, 40.0])
     parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--seconds", nargs="+", metavar="SCENE")
+    parser.add_argument("--sensor", nargs="+", type=int, default=[None])
+    parser.add_argument("--projector")
     asked = parser.parse_args()
+    if asked.seconds:
+        print("| scene, pixels | predicted [s] | later run [s] | ratio | first run [s] | compiling: plan, light [s] |")
+        print("|---|---|---|---|---|---|")
+        for scene in asked.seconds:
+            for side in asked.sensor:
+                print(transport(scene, side, asked.projector), flush=True)
+        return
     print(HEAD.format(seeds=asked.seeds), flush=True)
     rows: list[dict[str, Any]] = []
     for name in asked.scenes:

@@ -23,7 +23,7 @@ from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import PatternFamily, Shot
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.memory import frames_at_once
-from mitsim.light.settings import GROUPS, Estimate
+from mitsim.light.settings import Estimate
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import add_speckle
@@ -292,7 +292,7 @@ class Totals:
     def of(cls, expected: ExpectedFrames) -> Totals:
         """Those of all ``expected`` frames, which are formed for it."""
         peak = energy = variance = removed = heaviest = 0.0
-        parts = np.zeros(GROUPS)
+        parts = np.zeros((1, 1))
         for chunk in in_chunks((frame,) for frame in expected):
             for (frame,), (brightest, squares) in zip(chunk, in_threads(_peak_and_energy, chunk), strict=True):
                 removed = max(removed, frame.removed)
@@ -300,7 +300,7 @@ class Totals:
                 energy += squares
                 variance += frame.variance * frame.irradiance.size
                 heaviest += frame.heaviest * frame.variance * frame.irradiance.size
-                parts += np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
+                parts = parts + frame.by_group * frame.irradiance.size
         mc_error = float(np.sqrt(variance / energy)) if energy else 0.0
         return cls(peak, mc_error, removed, heaviest / variance if variance else 0.0, bound_of(parts, energy))
 

@@ -24,6 +24,7 @@ from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.memory import first_shadow, frames_cost
+from mitsim.optics.frames import monte_carlo_bound
 from mitsim.planner.explain import unseen_lamps
 from mitsim.planner.planner import make_plan
 
@@ -50,8 +51,9 @@ class Rendered:
     mean, error
         (m, m', channels) irradiance, and its standard error.
     facts
-        estimator, spp (None: factored), seconds, variant, seed, and notes: what the scene's objects were changed in,
-        and which effects of the bench the reference leaves out.
+        estimator, spp (None: factored), seconds, variant, seed, notes (what the scene's objects were changed in, and
+        which effects of the bench the reference leaves out), and mc_error_bound: 95 % bound of the factored estimator's
+        relative Monte Carlo error.
     warnings
         why the frame is flagged.
     """
@@ -247,7 +249,7 @@ def render(
     job = job or Job()
     spp = _samples(bench, estimator, spp)
     check_accuracy(accuracy)
-    warnings, notes = tuple[str, ...](), bench.loaded.notes
+    warnings, notes, bound = tuple[str, ...](), bench.loaded.notes, None
     started = time.perf_counter()
     if estimator == REFERENCE:
         notes += _of_the_factored(bench)
@@ -263,8 +265,9 @@ def render(
         job.clock.predict({"transport": plan.predicted["transport"]})
         with job.clock.stage("transport"):
             light = trace_light(bench, plan, uniform, seed, Sampling(by_pixel=False), job.progress)
-        warnings = light.warnings
+        warnings = (*light.warnings, *light.unreached)
         frame = next(iter(light.frames(uniform, seed)))
+        bound = monte_carlo_bound([frame])
         mean = frame.irradiance[..., None]
         error = np.full_like(mean, math.sqrt(frame.variance))
     if not mean.any():
@@ -276,6 +279,7 @@ def render(
         "variant": bench.variant,
         "seed": seed,
         "notes": notes,
+        "mc_error_bound": bound,
     }
     return Rendered(mean, error, facts, warnings)
 

@@ -339,10 +339,11 @@ class MosaicLight(SampledLight):
             counted[list(response.planes), number] = 1 / scale
         shape = self.bench.geometry.frame_shape
         irradiance = np.einsum("fij,fij->ij", behind(counted, shape), np.stack([each.irradiance for each in frames]))
-        parts = np.square(counted).mean(axis=0) @ np.array([each.by_group for each in frames])  # no pixel has two
-        variance = float(parts.sum())
+        # No pixel has two.
+        parts = np.tensordot(np.square(counted).mean(axis=0), [each.by_group for each in frames], axes=1)
+        variance = float(np.trace(parts))
         heaviest = float(parts.max()) / variance if variance else 0.0
-        return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, tuple(parts))
+        return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, parts)
 
     def speckle(self, family: PatternFamily | None = None) -> float:
         """None, of any ``family``: a projector with speckle is refused."""
@@ -354,7 +355,7 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
     counted_lamps = light.bench.counted_lamps
     assert counted_lamps is not None, "asked before"
     accumulated = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(counted_lamps.bands), bands)
-    return ExpectedFrames(accumulated, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed)
+    return ExpectedFrames(accumulated, Lighting(np.zeros(1, np.int64), np.ones((1, 1))), seed, restated=light.restated)
 
 
 def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
@@ -412,7 +413,11 @@ class MosaicFrames(ExpectedFrames):
     @property
     def projector_off(self) -> Frame:
         """The frame of lamps alone, dark where there are none; its Monte Carlo error is that of all frames."""
-        return self._lines[0].projector_off if self._lamps is None else replace(self._lamps, variance=0.0, by_group=())
+        return (
+            self._lines[0].projector_off
+            if self._lamps is None
+            else replace(self._lamps, variance=0.0, by_group=np.zeros((1, 1)))
+        )
 
     def __iter__(self) -> Iterator[Frame]:
         always = () if self._lamps is None else (self._lamps,)
@@ -420,17 +425,22 @@ class MosaicFrames(ExpectedFrames):
             light = np.einsum("lij,lij->ij", self._passed, np.stack([frame.irradiance for frame in shot]))
             if self._lamps is not None:
                 light += self._lamps.irradiance
-            groups = zip(*(frame.by_group or (frame.variance,) for frame in (*shot, *always)), strict=True)
-            parts = tuple(self._sum_of_variances(each) for each in groups)
-            variance, removed = sum(parts), max(frame.removed for frame in (*shot, *always))
-            heaviest = max(parts) / variance if variance else 0.0
-            yield Frame(light, variance, removed, heaviest, parts if shot[0].by_group else ())
+            parts = self._sum_of_products(np.array([frame.by_group for frame in (*shot, *always)]))
+            variance, removed = float(np.trace(parts)), max(frame.removed for frame in (*shot, *always))
+            heaviest = float(parts.max()) / variance if variance else 0.0
+            yield Frame(light, variance, removed, heaviest, parts)
 
-    def _sum_of_variances(self, variances: Sequence[float]) -> float:
-        """Variance of the sum of all lines' light and lamps', from a group's of each."""
-        lines, lamps = variances[: len(self._lines)], sum(variances[len(self._lines) :])
-        own = float(self._spread @ np.sqrt(lines))
-        return own**2 + lamps if self._independent else (own + math.sqrt(lamps)) ** 2
+    def _sum_of_products(self, products: FloatArray) -> FloatArray:
+        """Return the (G, G) inner products of groups' noise in the sum of the lines' light and lamps', from (lights, G,
+        G) those of each. Noise that goes together is taken for multiples of the same frames."""
+        roots = np.sign(products) * np.sqrt(np.abs(products))
+        own, lamps = (
+            np.tensordot(self._spread, roots[: len(self._lines)], axes=1),
+            roots[len(self._lines) :].sum(axis=0),
+        )
+        if self._independent:
+            return np.asarray(own * np.abs(own) + lamps * np.abs(lamps))
+        return np.asarray((own + lamps) * np.abs(own + lamps))
 
 
 def _truth_of_all(lights: Sequence[SampledLight], counted: FloatArray) -> Truth:

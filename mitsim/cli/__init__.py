@@ -530,9 +530,10 @@ def render(
             frame = bench.render(method, estimating.spp, accuracy, seed, effects, job)
             payload = {**frame.summary(), "output": str(frame.save(place))}
     payload["notes"] = [*payload["notes"], *ignored]
+    bound = payload["mc_error_bound"]
     lines = [
-        f"{method}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}, "
-        f"{payload['seconds']:.2f} s: {payload['output']}",
+        f"{method}: mean irradiance {payload['mean']:.4e} W/m^2, relative noise {payload['mc_error']:.1e}"
+        f"{'' if bound is None else f' (below {bound:.1e} at 95 %)'}, {payload['seconds']:.2f} s: {payload['output']}",
         *payload["notes"],
     ]
     shown = frame.mean[..., 0] if frame.mean.shape[2] == 1 else frame.mean

@@ -22,11 +22,11 @@ from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.light.cost_model import CHECKED_SHOTS, MOST_CHECKED, tells_all
 from mitsim.light.grids import LightEstimate
 from mitsim.light.plan import Plan
-from mitsim.light.sampling import Group, first_samples, next_samples, trace_groups
+from mitsim.light.sampling import Group, error_left, first_samples, next_samples, trace_groups
 from mitsim.light.settings import GROUPS, MOST_PATHS, Estimate, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.light.truth import Truth, trace_truth
-from mitsim.optics.forming import bound_of, shares_of_bound
+from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames
 
 Target = Callable[[ExpectedFrames], float]
@@ -130,6 +130,9 @@ class SampledLight:
         what the last look at its error found.
     known_truth
         :attr:`apparent`, where it was traced with that of other lines.
+    restated
+        factor of the Monte Carlo error over that by the differences of the groups. Sampling stops where these happen to
+        be small; so what an earlier look predicted, whose differences did not end it, counts as much where it is more.
     """
 
     groups: tuple[LightEstimate, ...]
@@ -145,6 +148,7 @@ class SampledLight:
     samples: Mapping[str, int] = field(default_factory=dict)
     looked: FrameCheck | None = None
     known_truth: Truth | None = None
+    restated: float = 1.0
 
     def __repr__(self) -> str:
         return f"SampledLight({self.paths:.2g} paths, relative error {self.sampling_error:.1e}, of {self.bench!r})"
@@ -207,7 +211,7 @@ class SampledLight:
         """
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
-        return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed)
+        return expected_of([(self.simulation, self.groups)], rows, lighting, seed, leaking, probed, self.restated)
 
     @check_arguments
     def rows_of(self, lighting: Lighting) -> Labels:
@@ -325,13 +329,13 @@ def trace_lines(
     labels = np.arange(bench.n**2) if sampling.by_pixel else lighting.labels
     followed = any(not each.row.even for each in simulation.passes.values())
     groups = Group.all_of(simulation, labels, seed, sampling.purpose, len(benches))
-    samples, reached = first_samples(simulation), 0.0
+    samples, reached, predicted = first_samples(simulation), 0.0, dict[int, float]()
     while True:
         trace_groups(groups, samples, partial(_report, progress, reached))
         lines = [_line_of(groups, line, each, plan, seed) for line, each in enumerate(own)]
         last = lines[0].paths >= MOST_PATHS
         enough = math.inf if last or sampling.excess or sampling.target else plan.sampling_target
-        checks = _checks(lines, partial(_parts, groups), lighting, followed, enough)
+        checks = _checks(lines, partial(_parts, groups), lighting, followed, enough, predicted)
         lights, near, worst, excess = dict[int, SampledLight](), 1.0, 0, 0.0
         more = sampling.excess([checks[line].light for line in sorted(checks)]) if sampling.excess else 1.0
         for line, check in checks.items():
@@ -343,13 +347,20 @@ def trace_lines(
                 target = plan.sampling_target
             seen = more * (error if sampling.target else check.bound)
             lights[line] = replace(light, reached=seen <= target)
-            if seen > target and (beyond := _excess(seen, more * error, target)) > excess:
+            # Of direct light no path is heavy.
+            beyond = _excess(seen, more * error, target) if followed else seen / target
+            if seen > target and beyond > excess:
                 worst, excess = line, beyond
             near = min(near, (target / seen) ** 2 if seen > 0 else 1.0)
         progress("transport", near)
         if last or all(light.reached for light in lights.values()):
             return [lights[line] for line in range(len(own))]
-        samples, reached = next_samples(simulation, samples, checks[worst].variances, excess), near
+        done, samples = samples, next_samples(simulation, samples, checks[worst].variances, excess)
+        reached = near
+        predicted = {
+            line: check.light.sampling_error * error_left(done, samples, check.variances)
+            for line, check in checks.items()
+        }
         # What the next round replaces is not held beside it: new memory is dear.
         del lines, checks, check, lights, light
 
@@ -407,8 +418,8 @@ def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArr
 
 @dataclass(frozen=True)
 class _Check:
-    """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and what each part of the light
-    brings to the square of the latter, by the name of the pass, up to one factor."""
+    """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and the variance that each part
+    of the light brings, by the name of the pass, up to one factor."""
 
     light: SampledLight
     bound: float
@@ -425,20 +436,26 @@ def _parts(groups: Sequence[Group], line: int) -> Parts:
 
 
 def _checks(
-    lines: Sequence[SampledLight], parts: Callable[[int], Parts], lighting: Lighting, followed: bool, enough: float
+    lines: Sequence[SampledLight],
+    parts: Callable[[int], Parts],
+    lighting: Lighting,
+    followed: bool,
+    enough: float,
+    predicted: Mapping[int, float],
 ) -> dict[int, _Check]:
     """What :func:`_check` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
-    of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is."""
+    of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is. No
+    error counts without what the look before has ``predicted``."""
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
-        checks[line] = _check(lines[line], parts(line), lighting, followed)
+        checks[line] = _check(lines[line], parts(line), lighting, followed, predicted.get(line, 0.0))
         if checks[line].bound > enough:
             break
     return checks
 
 
-def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool) -> _Check:
+def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool, predicted: float) -> _Check:
     """A look at the frames of a light.
 
     Parameters
@@ -447,6 +464,8 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
         whose frames of which shots.
     followed
         whether it is light over several surfaces.
+    predicted
+        error by the look before; where it is larger, the error is the root mean square of both.
     """
     shots, classes = lighting.weights.shape
     whole = tells_all(classes, shots, light.bench.geometry.frame_side)
@@ -456,15 +475,16 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
     expected = expected_of(each, light.rows_of(seen), seen, light.seed, leaking=False)
     more = _error_growth(light, lighting, seen)
     error, bound = (ratio * of_seen for ratio, of_seen in zip(more, expected.sampling_error(), strict=True))
-    light = replace(light, sampling_error=error)
+    restated = math.sqrt((1 + max(predicted / error, 1.0) ** 2) / 2) if error else 1.0
+    light, bound = replace(light, sampling_error=restated * error, restated=restated), restated * bound
     if whole and expected.probed is not None:
         found = FrameCheck(light.groups, light.simulation, light.rows_of(lighting), expected.probed)
         light = replace(light, looked=found)
-    by_part = np.concatenate([noise.reshape(len(parts), -1, len(light.groups)) for noise in expected.noise], axis=1)
-    variances = dict(zip(parts, shares_of_bound(by_part.sum(axis=1)).tolist(), strict=True))
+    by_part = np.concatenate([each.reshape(len(parts), -1, GROUPS, GROUPS) for each in expected.noise], axis=1)
+    variances = dict(zip(parts, np.einsum("plgg->p", by_part).tolist(), strict=True))
     if not whole:
         for name, groups in parts.items():
-            _, more_of_part = _error_growth(replace(light, groups=tuple(groups)), lighting, seen)
+            more_of_part, _ = _error_growth(replace(light, groups=tuple(groups)), lighting, seen)
             variances[name] *= more_of_part**2
     return _Check(light, bound, variances)
 
@@ -493,10 +513,11 @@ def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) ->
         [np.bincount(rows, group.totals[: len(rows)], lighting.weights.shape[1]) for group in light.groups]
     )
     totals -= totals.mean(axis=0)
-    every, some = (np.square(totals @ shots.weights.T).mean(axis=1) for shots in (lighting, checked))
+    of_shots = [totals @ shots.weights.T for shots in (lighting, checked)]
+    every, some = (np.einsum("gs,hs->gh", each, each) / each.shape[1] for each in of_shots)
     if not some.any():
         return 1.0, 1.0
-    ratios = every.sum() / some.sum(), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
+    ratios = np.trace(every) / np.trace(some), (bound_of(every, 1.0) / bound_of(some, 1.0)) ** 2
     error, bound = (math.sqrt(max(ratio / _BY_CHANCE, 1.0)) for ratio in ratios)
     return error, bound
 

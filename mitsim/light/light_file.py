@@ -85,7 +85,8 @@ def write_light(path: Path, light: SampledLight) -> None:
 
 def _keep(group: h5py.Group, light: SampledLight) -> None:
     """What a bench needs to expose a ``light`` again, in a ``group``."""
-    group.attrs.update({"paths": light.paths, "reached": light.reached, "samples": json.dumps(dict(light.samples))})
+    facts = {name: getattr(light, name) for name in ("paths", "reached", "restated")}
+    group.attrs.update({**facts, "samples": json.dumps(dict(light.samples))})
     for name in ("flux", "flux_error"):
         group.create_dataset(name, data=getattr(light, name), **_PACKED)
     for name in ("received", "outside"):
@@ -139,6 +140,7 @@ def read_light(path: Path, bench: Apparatus) -> SampledLight:
             tuple(groups), simulation, plan, int(file.attrs["seed"]), np.arange(count), flux, flux_error,
             int(kept.attrs["paths"]), float(file.attrs["mc_error"]), bool(kept.attrs["reached"]),
             {str(name): int(samples) for name, samples in json.loads(kept.attrs["samples"]).items()},
+            restated=float(kept.attrs["restated"]),
         )  # fmt: skip
 
 

@@ -182,7 +182,7 @@ def next_samples(
     done
         samples so far.
     variances
-        of the frames by each light, or what it brings to their bound, up to one factor.
+        of the frames by each light, up to one factor.
     excess
         by how much the error is to be lowered, as a ratio.
     """
@@ -191,6 +191,20 @@ def next_samples(
     # A target that was set very low would overflow the square.
     less = max(_BEYOND * min(excess, _MOST_LESS) ** 2, _LEAST_LESS)
     return cheapest_samples(lights, sum(variances.values()) / min(less, _MOST_LESS))
+
+
+def error_left(done: Mapping[str, int], samples: Mapping[str, int], variances: Mapping[str, float]) -> float:
+    """Return the relative error that more samples leave of that which fewer left.
+
+    Parameters
+    ----------
+    done, samples
+        of a group before and after, by the name of the pass.
+    variances
+        that those done left, up to one factor.
+    """
+    left = [SampledPass(name, done[name], variances[name], 1.0).variance_left(samples[name]) for name in done]
+    return math.sqrt(sum(left) / (sum(variances.values()) or 1.0))
 
 
 @dataclass(frozen=True)

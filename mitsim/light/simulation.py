@@ -257,6 +257,7 @@ def expected_of(
     seed: int,
     leaking: bool = True,
     probed: FloatArray | None = None,
+    restated: float = 1.0,
 ) -> ExpectedFrames:
     """Expected frames of light in several parts.
 
@@ -273,14 +274,15 @@ def expected_of(
         of the probes that tell the Monte Carlo error.
     leaking
         whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
-    probed
-        what the frames of other shots say of the same classes, as :class:`ExpectedFrames` takes it.
+    probed, restated
+        what the frames of other shots say of the same classes, and the factor of the Monte Carlo error, as
+        :class:`ExpectedFrames` takes them.
     """
     light = emission(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
     lights, ambient = ([each for part in formed for each in part[kind]] for kind in (0, 1))
     specular = parts[-1][0].specular_frames(lighting.labels)
-    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, specular, probed)
+    return ExpectedFrames(lights, Lighting(rows, light), seed, ambient, specular, probed, restated)
 
 
 def emission(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:

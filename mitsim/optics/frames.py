@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -59,14 +59,14 @@ class Frame:
         largest part of the variance that one group of the light brings: with one heavy path among G groups,
         (G - 1) / G.
     by_group
-        (G,) parts of the variance that each group of the light brings.
+        (G, G) inner products of what each group of the light brings to the variance, which is their trace.
     """
 
     irradiance: FloatArray
     variance: float
     removed: float
     heaviest: float
-    by_group: tuple[float, ...] = ()
+    by_group: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +155,8 @@ class ExpectedFrames:
         frames to be added to those of some classes.
     probed
         :attr:`probed` of other shots of the same lights, classes and seed.
+    restated
+        factor of the Monte Carlo error over that by the groups' differences.
     """
 
     def __init__(
@@ -165,7 +167,9 @@ class ExpectedFrames:
         ambient: Sequence[AccumulatedLight] = (),
         specular: ClassFrames | None = None,
         probed: FloatArray | None = None,
+        restated: float = 1.0,
     ) -> None:
+        self._restated = restated
         self._lights, self._ambient, self._specular = tuple(lights), tuple(ambient), specular
         self._seed, self._weights = seed, lighting.weights
         (shots, classes), rows = lighting.weights.shape, lighting.labels.size
@@ -230,21 +234,21 @@ class ExpectedFrames:
         :func:`monte_carlo_bound` to a few percent, in a fraction of the time.
         """
         parts, energy, _ = self._energies
-        return (float(np.sqrt(parts.sum() / energy)), bound_of(parts, energy)) if energy else (0.0, 0.0)
+        return (float(np.sqrt(np.trace(parts) / energy)), bound_of(parts, energy)) if energy else (0.0, 0.0)
 
     @property
     def noise(self) -> tuple[FloatArray, FloatArray]:
-        """(lights, groups) and (ambient, groups) parts of the Monte Carlo variance of all frames, up to one factor, as
+        """(lights, G, G) and (ambient, G, G) parts of the Monte Carlo variance of all frames, up to one factor, as
         :meth:`sampling_error` tells that of all; 0 of what was probed before."""
         of_lights = self._energies[2]
         return of_lights[: len(self._lights)], of_lights[len(self._lights) :]
 
     @cached_property
     def _energies(self) -> tuple[FloatArray, float, FloatArray]:
-        """(groups,) parts of the frames' variance, the frames' energy, and (lights + ambient, groups) squared norms of
+        """(G, G) parts of the frames' variance, the frames' energy, and (lights + ambient, G, G) inner products of
         noise, not to scale."""
         count, energy = self._groups, 0.0
-        parts, noise = np.zeros(count), np.zeros((len(self._lights) + len(self._ambient), count))
+        parts, noise = np.zeros((count, count)), np.zeros((len(self._lights) + len(self._ambient), count, count))
         if count < 2:
             return parts, energy, noise
         for start in range(0, len(self), _AT_ONCE):
@@ -253,7 +257,7 @@ class ExpectedFrames:
             for probed in shots:
                 energy += float(np.square(probed.reshape(self._shape[0], count, -1).mean(axis=1)).sum())
                 parts += noise_of_groups(probed, self._shape[0], count)
-        return parts / (count * (count - 1)), energy, noise
+        return parts * (self._restated**2 / (count * (count - 1))), energy, noise
 
     @property
     def probed(self) -> FloatArray | None:
@@ -266,13 +270,14 @@ class ExpectedFrames:
         return self._probed
 
     def _shots_probed(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(shots, m * groups * probes) frames of single groups times the probes, and (lights + ambient, groups) squared
-        norms of their noise."""
+        """(shots, m * groups * probes) frames of single groups times the probes, and (lights + ambient, G, G) inner
+        products of their noise."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
             probed = np.stack(self._of_classes.shots(classes, start, stop))
-            of_classes = np.zeros((1, len(self._lights), self._groups)) if self._noise is None else self._noise
-            noise = (np.square(weights).sum(axis=0)[:, None, None] * of_classes).sum(axis=0)
+            unknown = np.zeros((1, len(self._lights), self._groups, self._groups))
+            of_classes = unknown if self._noise is None else self._noise
+            noise = (np.square(weights).sum(axis=0)[:, None, None, None] * of_classes).sum(axis=0)
         else:
             probed, of_shots = probe_frames(self._lights, self._basis[start:stop], self._probes)
             noise = of_shots.sum(axis=0)
@@ -368,11 +373,11 @@ class ExpectedFrames:
             if ambient is not None:
                 frame = np.add(frame, ambient[0][0], out=frame if owned else None)
                 probed = probed + ambient[1][0]
-            squared = noise_of_groups(probed, self._shape[0], count) if pairs else np.zeros(1)
-            spread = float(squared.sum())
-            variance = spread / pairs / frame.size if pairs else 0.0
-            heaviest = float(squared.max()) / spread if spread else 0.0
-            parts = tuple(float(part) / pairs / frame.size for part in squared) if pairs else ()
+            products = noise_of_groups(probed, self._shape[0], count) if pairs else np.zeros((1, 1))
+            spread = float(np.trace(products))
+            scale = self._restated**2 / max(pairs, 1) / frame.size
+            variance, parts = spread * scale, products * scale
+            heaviest = float(products.max()) / spread if spread else 0.0
             if frame.min() >= 0:
                 frame.flags.writeable = False  # of those that are held, which nobody may change
                 return Frame(frame, variance, 0.0, heaviest, parts)
@@ -399,8 +404,8 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
 
 def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
     """What the Monte Carlo error of all ``frames`` is below, at 95 %; see :func:`bound_of`."""
-    parts, energy = np.zeros(1), 0.0
+    parts, energy = np.zeros((1, 1)), 0.0
     for frame in frames:
-        parts = parts + np.asarray(frame.by_group or (0.0,)) * frame.irradiance.size
+        parts = parts + frame.by_group * frame.irradiance.size
         energy += float(np.square(frame.irradiance).sum())
     return bound_of(parts, energy)

@@ -15,7 +15,7 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, tracing_seconds, unit_costs_of
+from mitsim.light.cost_model import FIXED, ROUNDS, tracing_seconds, unit_costs_of
 from mitsim.light.memory import frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
@@ -52,8 +52,6 @@ most: noise decides how many are planned, a unit cost only what is said of their
 _MOSTLY = 0.75
 """Part of the tracing that is timed, at fixed unit costs: unit costs of the rest are off by 2 at most, which moves what
 is said of all by less than predictions are good to."""
-_UNTIMED = 0.15
-"""Part of the run that may be untimed tracing: off by 2 at most, it moves what is said of all by so much."""
 _USUAL = 1.5
 """Times as long as at fixed unit costs that a launch takes at most where it neither compiles a kernel nor is disturbed;
 one of few paths takes longer for itself, and is cheap to repeat."""
@@ -192,8 +190,7 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> P
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
         pilot_result, chosen = _with_heavy_paths(runs, accuracy, chosen, switches)
     simulation = Simulation(bench, chosen.settings)
-    untimed = _UNTIMED * (OPENING_S + chosen.work)
-    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed, untimed)
+    timed = _time_paths(pilot_result, simulation, runs.lighting.labels, runs.seed)
     plan = explain_plan(accuracy, timed, SceneFacts.of(bench, switches), switches, chosen)
     plan = replace(plan, predicted_range=_range(timed, plan))
     if simulation.physics.mirrors:
@@ -262,9 +259,7 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
     return time.perf_counter() - started
 
 
-def _time_paths(
-    pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int, untimed: float
-) -> PilotResult:
+def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
     """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
     choice: timed of the passes that take most, and as much slower or faster than the fixed ones of the others.
 
@@ -274,15 +269,13 @@ def _time_paths(
         what was found, and what was chosen.
     labels, seed
         how light is accumulated, and the root of its random numbers.
-    untimed
-        seconds of tracing at fixed unit costs that are not worth timing.
     """
     own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
     fixed = {name: 0.0 for name in simulation.passes} | tracing_seconds(pilot_result, simulation.settings, FIXED)
     timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
     for name in sorted(simulation.passes, key=lambda name: -fixed[name]):
         rest = sum(seconds for other, seconds in fixed.items() if other not in timed)
-        if rest < untimed or (timed and rest <= (1 - _MOSTLY) * sum(fixed.values())):
+        if timed and rest <= (1 - _MOSTLY) * sum(fixed.values()):
             break
         # A path of shared light counts for several.
         paths = pilot_result.sample_costs[name].paths if name == "indirect" else _paths_of(simulation, name)
@@ -342,5 +335,5 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
         longest = once(samples)
         least = min(least, longest / samples)
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
-    launches = math.ceil(planned / max(1, at_once // paths_per_sample))
+    launches = ROUNDS * math.ceil(planned / max(1, at_once // paths_per_sample))
     return slope + max(launch - slope, 0.0) * launches / planned, slope

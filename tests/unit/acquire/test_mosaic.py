@@ -63,11 +63,12 @@ def test_a_pixel_counts_each_line_by_its_filter() -> None:
 def test_errors_of_lines_on_one_path_add_up() -> None:
     """Both lines off by the same part in every group: the sum is off by the sum; and as many parts are told."""
     rng, spread = np.random.default_rng(2), np.sqrt(np.square(WEIGHTS).mean(axis=0))
-    parts = rng.random(8)
-    lines = [Frame(rng.random((4, 4)), scale**2 * parts.sum(), 0.0, 0.0, tuple(scale**2 * parts)) for scale in (1, 3)]
+    off = rng.random(8) - 0.5
+    products, parts = np.outer(off, off), off**2
+    lines = [Frame(rng.random((4, 4)), scale**2 * parts.sum(), 0.0, 0.0, scale**2 * products) for scale in (1, 3)]
     (seen,) = MosaicFrames([Frames([line]) for line in lines], behind(WEIGHTS, (4, 4)))  # type: ignore[list-item]
     assert seen.variance == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts.sum())
-    assert seen.by_group == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * parts)
+    assert seen.by_group == pytest.approx((spread[0] + 3 * spread[1]) ** 2 * products)
     assert seen.heaviest == pytest.approx(parts.max() / parts.sum())
 
 
@@ -75,17 +76,18 @@ def test_errors_of_lines_on_one_path_add_up() -> None:
 def test_lamps_are_in_every_frame_and_alone_in_the_dark_one(apart: bool) -> None:
     """Their error is its own, or goes together with the lines'. (Planted: lamps in no frame; errors in squares.)"""
     rng, spread = np.random.default_rng(3), np.sqrt(np.square(WEIGHTS).mean(axis=0))
-    own, theirs = rng.random(8), rng.random(8)
-    lines = [Frame(rng.random((4, 4)), own.sum(), 0.0, 0.0, tuple(own)) for _ in range(2)]
-    lamps = Frame(rng.random((4, 4)), theirs.sum(), 0.0, 0.0, tuple(theirs))
+    own, theirs = (np.outer(*[rng.random(8) - 0.5] * 2) for _ in range(2))
+    lines = [Frame(rng.random((4, 4)), np.trace(own), 0.0, 0.0, own) for _ in range(2)]
+    lamps = Frame(rng.random((4, 4)), np.trace(theirs), 0.0, 0.0, theirs)
     passed, given = behind(WEIGHTS, (4, 4)), [Frames([line]) for line in lines]
     frames = MosaicFrames(given, passed, lamps, apart)  # type: ignore[arg-type]
     (dark,) = MosaicFrames(given, passed)  # type: ignore[arg-type]
     (lit,) = frames
     assert frames.has_ambient and frames.projector_off.irradiance is lamps.irradiance
     assert lit.irradiance == pytest.approx(dark.irradiance + lamps.irradiance)
-    both = np.array(dark.by_group) + theirs, np.square(spread.sum() * np.sqrt(own) + np.sqrt(theirs))
-    assert lit.by_group == pytest.approx(both[0 if apart else 1])
+    root = spread.sum() * np.sign(own) * np.sqrt(abs(own)) + np.sign(theirs) * np.sqrt(abs(theirs))
+    assert lit.by_group == pytest.approx(dark.by_group + theirs if apart else root * abs(root))
+    assert lit.variance == pytest.approx(np.trace(lit.by_group))
 
 
 def test_sampling_looks_at_lamps_behind_each_filter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,8 +21,14 @@ from mitsim.light.settings import (
     Settings,
     SharpPixels,
 )
-from mitsim.optics.forming import bound_over_error
-from mitsim.planner.choose import Candidates, cheapest, counts_of, predicted_candidate, value_of_refining
+from mitsim.planner.choose import (
+    _UNEVEN_GROUPS,
+    Candidates,
+    cheapest,
+    counts_of,
+    predicted_candidate,
+    value_of_refining,
+)
 from mitsim.planner.pilot import run_of
 from tests.unit.planner.invented_pilot_result import (
     ACCURACIES,
@@ -333,7 +339,7 @@ def test_noise_of_few_heavy_paths_takes_samples_until_its_bound_is_the_target() 
     found = cheapest(1e-2, uneven, parse_switches("+interreflection"))
     spread = 60.0 * 2 / found.settings.samples["indirect"]
     assert 0.05 < spread < 0.2
-    assert found.noise * bound_over_error(spread, GROUPS) == pytest.approx(found.target, rel=2e-3)
+    assert found.noise * math.sqrt(1 + _UNEVEN_GROUPS * math.sqrt(spread)) == pytest.approx(found.target, rel=2e-3)
 
 
 def test_the_value_of_refining_coarse_cells_names_them() -> None:

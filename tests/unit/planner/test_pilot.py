@@ -513,12 +513,13 @@ def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
 
 
 def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callable[..., Path]) -> None:
-    """No ray is traced for what can be no other; nor where the nearest surface is no nearer than all light."""
+    """No ray is traced for what can be no other; nor where the nearest surface is no nearer than all light. Four
+    replicates tell either noise to some 40 %; over gloss they would differ by a factor. (Planted: rays for any scene.)
+    """
     flat = pilot.PilotRuns(open_bench(small_scene()), parse_patterns("dots:4", N).lighting, 1e-2, 0)
-    assert flat.fine.spread(1.0) == flat.fine.sample_cost(1.0)
-    assert flat.fine._sample_cost(flat.fine._spread_noise, 1.0).noise.error == pytest.approx(
-        flat.fine.sample_cost(1.0).noise.error, rel=0.1
-    )
+    assert flat.fine.spread(1.0) == flat.fine.sample_cost(1.0) and "_spread_noise" not in vars(flat.fine)
+    over = flat.fine._sample_cost(flat.fine._spread_noise, 1.0).noise.error
+    assert 0.5 < over / flat.fine.sample_cost(1.0).noise.error < 2
 
 
 @pytest.mark.usefixtures("soon_dark")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED
+from mitsim.light.cost_model import FIXED, ROUNDS
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Approximation, Noise, SampleCost
 from mitsim.optics.forming import bound_of
@@ -196,15 +196,16 @@ class Machine:
 def test_unit_costs_are_those_of_launches_as_the_run_has_them(
     monkeypatch: pytest.MonkeyPatch, paths_per_sample: int, planned: int, disturbed: int
 ) -> None:
-    """Within 1.5 times of what all launches of the run take together, one slow moment or none, where that is more than
-    a second. (Planted: the pace of the first launch alone, 4 times too slow; the slower of two launches.)"""
+    """Within 1.5 times of what all launches of the run take together, in one round and a half, one slow moment or none,
+    where that is more than a second. (Planted: one round; the pace of the first launch alone, 4
+    times too slow; the slower of two launches.)"""
     at_once, machine = 2**21, Machine(disturbed)
     monkeypatch.setattr(planner, "_seconds", machine.seconds)
     each = SimpleNamespace(tracer=SimpleNamespace(paths_per_sample=paths_per_sample), whole=planned)
     simulation: Any = SimpleNamespace(passes={"direct": each}, paths_at_once=at_once)
     pace, longest = planner._pace(simulation, "direct", None, SEED)  # type: ignore[arg-type]
     launches = math.ceil(planned / (at_once // paths_per_sample))
-    taken = GROUPS * (launches * LAUNCH_S + planned * paths_per_sample * PATH_S)
+    taken = GROUPS * (ROUNDS * launches * LAUNCH_S + planned * paths_per_sample * PATH_S)
     if disturbed < 0 or taken > 1.0:
         assert GROUPS * planned * pace == pytest.approx(taken, rel=0.15 if disturbed < 0 and planned > 3 else 0.5)
         assert longest == pytest.approx(PATH_S * paths_per_sample, rel=0.5) or planned * paths_per_sample < 1e6
@@ -295,15 +296,18 @@ def test_a_run_of_heavy_paths_has_a_range_of_seconds() -> None:
 
 
 def test_bounds_of_few_heavy_paths_take_more_samples() -> None:
-    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, half of the
-    bounds do with so many samples. (Planted: samples for the error alone, 9 % of the bounds.)"""
+    """Sampling stops where a bound meets the target: of groups that some equal heavy paths meet by chance, in pixels
+    of their own, half of the bounds do with so many samples. (Planted: samples for the error alone, 9 % of the
+    bounds.)"""
     rate, per_look = 2.0, 50  # heavy paths in a look of so many samples
     # Each brings an energy of 1 in its own pixels: variance of a sample, and of a look's energy over its square.
     noise, target = Noise(math.sqrt(rate) / per_look, per_look, 0.5, 1 / rate), 1e-2
     samples = float(_samples_for(SampleCost(noise, 1), target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR))
     rng = np.random.default_rng(5)
     met = rng.poisson(rate * samples / per_look, (4000, GROUPS)).astype(np.float64)
-    bounds = np.array([bound_of(each / (samples * GROUPS) ** 2, 1.0) for each in met])
+    centre = np.eye(GROUPS) - 1 / GROUPS
+    products = [centre @ np.diag(each) @ centre for each in met]
+    bounds = np.array([bound_of(each / (samples * GROUPS) ** 2 * GROUPS / (GROUPS - 1), 1.0) for each in products])
     assert 0.35 < float((bounds < target).mean()) < 0.75
 
 
