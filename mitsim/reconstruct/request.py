@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.core.errors import ArgumentError, MitsimError
@@ -21,8 +22,13 @@ MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
-IMAGE_FILE = "image.exr"
-"""By which a folder is known to hold an image."""
+IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
+"""Files of an image: its numbers, what people look at, and what is stated of it."""
+
+
+def holds_image(folder: Path) -> bool:
+    """Return True if a ``folder`` holds an image, finished or not."""
+    return (folder / IMAGE_FILE).is_file() or (folder / RESULT_FILE).is_file()
 
 
 @dataclass(frozen=True)

@@ -77,9 +77,9 @@ def test_tables_become_steps_in_order_with_folders_of_their_own(write: Callable[
 def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
     """(Planted: a text with a quote in it that is not escaped.)"""
     found = read_session(write(WHOLE), {"scene.camera": 'a "b"\\c.toml', "capture.effects": {"diffraction": False}})
-    again = read_session(write(found.text))
+    again = read_session(write(session_text(found.tables)))
     assert (again.scene, again.steps) == (found.scene, found.steps)
-    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, "a note") == (
+    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, None, "a note") == (
         '# a note\n\n[scene]\nscene = "x"\n"odd name" = 0.001\n'
     )
 
