@@ -129,7 +129,9 @@ def numbers(folder: Path) -> dict[str, Any]:
             found |= {f"{name}:{channel}": values for channel, values in read_frame(path)[0].items()}
         elif path.suffix == ".h5":
             with h5py.File(path) as file:
-                file.visititems(lambda key, item: found.update({f"h5:{key}": _of(item)}))
+                keys: list[str] = []
+                file.visit(keys.append)
+                found |= {f"h5:{key}": _of(file[key]) for key in keys}
         elif path.suffix == ".png" and "pictures" not in path.parts:
             found[name] = path.read_bytes()
     return {name: value for name, value in found.items() if value is not None}

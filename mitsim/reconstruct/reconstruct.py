@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, options_of
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
@@ -61,6 +61,7 @@ POINT_SPREAD = "psf"
 """Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction(Solution):
     """An image and how far to trust it: reflectance, 1 = the calibration's board; by a point spread function
