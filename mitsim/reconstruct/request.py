@@ -80,7 +80,7 @@ class ImageRequest:
         if lam != "auto" and not isinstance(self.method, str):
             raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
         if lam != "auto" and (isinstance(lam, str) or not 0 <= lam <= _MOST):
-            raise ArgumentError("lam", f"{shown(lam)}: give a finite number of at least 0, at most {_MOST:g}, or auto")
+            raise ArgumentError("lam", f"{shown(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}")
         if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus <= _MOST):
             raise ArgumentError("focus", f"{shown(focus)}: give a depth above 0 mm, auto or map")
         if self.depth_range is not None:

@@ -38,7 +38,10 @@ def taken(tables: dict[str, Any], output: str = "out", **options: Any) -> list[b
 
 def test_arguments_are_not_changed(place: Path) -> None:
     """Neither tables nor values, by `run`, `open_bench` and requests. (Planted: tables that are not copied.)"""
-    tables: dict[str, Any] = {"reconstruct": [{**IMAGE}], "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}]}
+    tables: dict[str, Any] = {
+        "reconstruct": [{**IMAGE}],
+        "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}],
+    }
     values = {"reconstruct.0.lambda": 10.0, "reconstruct.0.bounds": [0.0, 1.0], "reconstruct.0.method": "nonnegative"}
     before = copy.deepcopy((tables, values))
     ms.run(tables, "one", values, pictures=False)
