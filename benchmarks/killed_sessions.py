@@ -108,7 +108,7 @@ def _serve(arguments: Sequence[str], said: Path, counted: Path, at: int | None, 
         with counted.open("w") as file:
             file.write(str(count))
 
-    os.replace = replace
+    os.replace = replace  # type: ignore[assignment]
     for number in (1, 2):
         os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND), number)
     sys.argv, status = ["mitsim", *arguments], 70

@@ -202,7 +202,7 @@ def _of_class(name: str) -> Kind:
 def _is_number(value: object) -> bool:
     """Return True if a ``value`` is a number that a float can be."""
     try:
-        return isinstance(value, Real) and not isinstance(value, bool) and float(value) is not None
+        return not isinstance(value, bool) and isinstance(value, Real) and float(value) is not None
     except OverflowError:
         return False
 

@@ -15,14 +15,7 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import (
-    Channels,
-    Metadata,
-    Value,
-    checksum,
-    read_frame,
-    write_frame,
-)
+from mitsim.core.exr import Channels, Metadata, Value, checksum, read_frame, write_frame
 from mitsim.core.files import output_folder, remove_page
 from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
 

@@ -11,17 +11,7 @@ from pydantic import Field, model_validator
 from mitsim.core.configuration import CAMERA, LIST, Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import ArgumentError, MitsimError, checked_fields
 from mitsim.core.files import check_plain
-from mitsim.core.imagelist import (
-    ALL,
-    BARE,
-    CORRECTIONS,
-    Crop,
-    Preparation,
-    Raw,
-    Wanted,
-    check_channel,
-    image_files,
-)
+from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours

@@ -378,18 +378,10 @@ def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any])
         the grid's place, as :func:`draw` gives it.
     """
     shots = [
-        {
-            "file": name,
-            "pattern": picture_name(index),
-            **shot.model_dump(include={"row", "column", "sign"}),
-        }
+        {"file": name, "pattern": picture_name(index), **shot.model_dump(include={"row", "column", "sign"})}
         for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
     ]
-    return {
-        "projector": where,
-        **patterns.model_dump(include={"family", "n", "P_L", "P_R"}),
-        "shots": shots,
-    }
+    return {"projector": where, **patterns.model_dump(include={"family", "n", "P_L", "P_R"}), "shots": shots}
 
 
 # ---- One PNG file ----

@@ -20,15 +20,7 @@ from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture, load_run
-from mitsim.core.spectral_manifests import (
-    CALIBRATION,
-    COLOUR,
-    RUN,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
-)
+from mitsim.core.spectral_manifests import CALIBRATION, COLOUR, RUN, is_coloured, is_mosaic, read_colours, read_mosaic
 from mitsim.metrics import truth_for
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, UNCERTAINTY_FILE, read_result

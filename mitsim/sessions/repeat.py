@@ -177,11 +177,7 @@ class _Found:
         self._compare(conf, {scene.scene: scene.scene_sha256, **scene.scene_files}, devices, coloured)
 
     def _compare(
-        self,
-        conf: Mapping[str, Any],
-        sums: Mapping[str, str | None],
-        devices: Mapping[str, str | None],
-        coloured: bool,
+        self, conf: Mapping[str, Any], sums: Mapping[str, str | None], devices: Mapping[str, str | None], coloured: bool
     ) -> None:
         """Note files that are others than a manifest's ``conf`` and its ``sums`` of the scene's files say."""
         for name, known in sums.items():

@@ -197,19 +197,14 @@ def run(
         steps.check_bench()
         own = [folder / name for name in (SUMMARY, SESSION_FILE)]
         before = {path: path.read_bytes() if path.is_file() else None for path in own}
-        head = {
-            "kind": KIND,
-            "session": portable(read.tables, folder),
-            "versions": deciding_versions(),
-            "status": "incomplete",
-        }
-        results: list[StepResult] = []
-        text = session_text(read.tables, folder)
+        head = {"kind": KIND, "session": portable(read.tables, folder), "versions": deciding_versions()}
+        results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note() -> None:
             """Keep what is done, and what is at work, so that a killed session goes on."""
             kept = {**steps.earlier.by_output, **{each.output: each for each in results}}
-            write_json(folder / SUMMARY, {**head, "steps": [*map(asdict, kept.values())], "made": steps.made})
+            told = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
+            write_json(folder / SUMMARY, {**head, **told})
 
         try:
             for step, task in prepared:
@@ -222,6 +217,8 @@ def run(
             if all(each.left_alone for each in results):  # nothing was made: it is the session that it was
                 for path, data in before.items():
                     path.unlink(missing_ok=True) if data is None else write_bytes(path, data)
+            else:
+                note()
             raise
         remove_page(folder)
         page = _write_page(folder, text, results, job) if asked.pictures else None
@@ -391,9 +388,10 @@ class _Steps:
         later steps need of it is then read by its ``task``."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
-            return capture is not None and self.is_finished(capture, task)
+            known = step.output in self.earlier.by_output
+            return known and capture is not None and self.is_finished(capture, task)
         made = self.made.get(step.output)
-        if task.goes_on or made is None or not made.files:
+        if task.goes_on or made is None or not made.files or step.output not in self.earlier.by_output:
             return False
         there = _checksums(self.folder / step.output)
         same = made.inputs == self.inputs(step) and all(there.get(name) == each for name, each in made.files.items())
@@ -421,15 +419,16 @@ class _Steps:
             return
         others = _checksums(place).keys() - self.before.files.keys() if self.before.files else ()
         if others or place.is_symlink():
-            raise MitsimError(
-                f"output {place}: is made anew, and {min(others, default='it')} is not the session's; move that away"
-            )
+            self.made[step.output] = self.before
+            other = min(others, default="it")
+            raise MitsimError(f"output {place}: is made anew, and {other} is not the session's; move that away")
         os.replace(place, aside)
         try:
             yield
         except BaseException:
             _remove(place)
             os.replace(aside, place)
+            self.made[step.output] = self.before
             raise
         _remove(aside)
 
@@ -708,8 +707,8 @@ def _checksums(place: Path) -> dict[str, str]:
 
 
 @lru_cache(maxsize=1 << 16)
-def _checksum(path: Path, size: int, written_ns: int) -> str:
-    """Return the SHA-256 of a file, computed once while its ``size`` and time of writing stay."""
+def _checksum(path: Path, *_: int) -> str:
+    """Return the SHA-256 of a file, computed once while its size and time of writing stay."""
     from mitsim.core.exr import checksum
 
     return checksum(path)

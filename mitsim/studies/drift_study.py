@@ -33,15 +33,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import (
-    DRIFT_UNITS,
-    DRIFT_WORDS,
-    SIDES,
-    Drift,
-    SessionRecipe,
-    amount_in_words,
-    load_recipe,
-)
+from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, SIDES, Drift, SessionRecipe, amount_in_words, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames

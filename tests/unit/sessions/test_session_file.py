@@ -111,7 +111,7 @@ def test_a_note_begins_no_table(write: Callable[[str], Path]) -> None:
      "pictures/", ".mitsim.lock", ".hidden", "..", "run", "RUN", "a/b", "/tmp/x", "Se\u017f\u017fion.toml"],
 )  # fmt: skip
 def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) -> None:
-    """Those that the session writes itself, and another step's, in any spelling that a disk may take for the same.
+    """Those that the session writes itself, and another step's, in any spelling that a disk may confuse.
     (Planted: names that are compared as they are written.)"""
     with pytest.raises(ms.MitsimError) as refused:
         read_session(write(f"{SCENE}[capture]\n[calibrate]\noutput = {output!r}\n"))
