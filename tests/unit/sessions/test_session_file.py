@@ -107,7 +107,7 @@ def test_a_note_begins_no_table(write: Callable[[str], Path]) -> None:
 
 @pytest.mark.parametrize(
     "output",
-    ["report.html", "pictures", "session.toml", "session.json", "Pictures", "REPORT.HTML", "./pictures", "x/../pictures",
+    ["report.html", "pictures", "session.toml", "session.json", "Pictures", "REPORT.HTML", "./pictures", "x/../a.html",
      "pictures/", ".mitsim.lock", ".hidden", "..", "run", "RUN", "a/b", "/tmp/x", "Se\u017f\u017fion.toml"],
 )  # fmt: skip
 def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) -> None:
