@@ -43,9 +43,12 @@ from hostile_texts import (
     manifests,
     masks,
     places,
+    repeats,
+    resumed,
     runs,
     scenes,
     sessions,
+    steps,
     studies,
 )
 
@@ -75,7 +78,19 @@ class Outcome:
     said: str = ""
 
 
-BEFOREHAND = "core", "devices", "sensor", "scene", "bench", "acquire", "reconstruct", "report", "studies", "exchange"
+BEFOREHAND = (
+    "core",
+    "devices",
+    "sensor",
+    "scene",
+    "bench",
+    "acquire",
+    "reconstruct",
+    "report",
+    "studies",
+    "exchange",
+    "sessions",
+)
 """Rooms whose modules commands import where they use them: all before the first input, which then takes no second."""
 KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
     "pictures": (11, [pictures]),
@@ -92,6 +107,9 @@ KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
     "runs": (5, [runs]),
     "manifests": (8, [manifests]),
     "sessions": (6, [sessions]),
+    "folders that are repeated": (6, [repeats]),
+    "sessions that go on": (6, [resumed]),
+    "sessions with a bad step": (6, [steps]),
     "cameras": (4, [cameras]),
     "devices": (8, [devices]),
     "masks": (2, [masks]),

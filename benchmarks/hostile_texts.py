@@ -652,3 +652,146 @@ def places(good: Good) -> Make:
         )
 
     return make
+
+
+SIMULATED = {
+    "scene": "photograph",
+    "scene_sha256": "0",
+    "scene_files": {"a.png": "0"},
+    "defines": {"sheet_z": "390", "albedo": "x"},
+    "variant": "llvm_ad_mono",
+    "patterns": "dots:4",
+    "accuracy": 0.01,
+    "seed": 0,
+    "effects": {"diffraction": False},
+    "light": {"patterns": "dots:4", "seed": 0},
+    "recipe": {"board_reflectance": 0.5},
+    "sensor": {"bits": 12},
+    "projector_model": {},
+    "versions": {"mitsim": "0"},
+}
+"""What the configuration of a simulated run and of its calibration states."""
+SMUGGLED = (
+    "\n[export]\nformat = 'hdf5'\n",
+    "x\r[demo]",
+    "\x00",
+    "\ud800",
+    "\U0001f600",
+    "camera",
+    "allow_outside_files",
+    3,
+)
+
+
+def _done(good: Good, folder: Path) -> None:
+    """A finished session of an image and an export in ``folder``, made once."""
+    kept = good.folder / "kept"
+    if not kept.exists():
+        import mitsim
+
+        kept.mkdir()
+        shutil.copytree(good.bench.run, kept / "run")
+        shutil.copytree(good.bench.calibration, kept / "cal")
+        image = {"run": str(kept / "run"), "calibration": str(kept / "cal"), "lambda": 0.1}
+        export = {"format": "hdf5", "run": str(kept / "run"), "output": "all.h5"}
+        pictures = {"format": "png", "run": str(kept / "run"), "output": "pngs", "projector": "mp_cl1"}
+        mitsim.run({"reconstruct": [image], "export": [export, pictures]}, kept / "out", pictures=False)
+    for name in ("run", "cal", "out"):
+        shutil.copytree(kept / name, folder / name)
+
+
+def repeats(good: Good) -> Make:
+    """Folders whose manifests and results lie, and the session file that repeats them."""
+
+    def make(chance: random.Random, folder: Path) -> Sequence[str]:
+        _done(good, folder)
+        for name in ("run", "cal"):
+            path = folder / name / "manifest.json"
+            held = json.loads(path.read_text())
+            held |= {"configuration": dict(SIMULATED), "opened": {"camera": None, "projector": "mp_cl1"}}
+            if chance.random() < 0.5:
+                part = chance.choice(("configuration", "opened", "configuration"))
+                held[part] = json_changed(held[part], chance)
+                if isinstance(held[part], dict) and chance.random() < 0.3:
+                    odd: Any = chance.choice(SMUGGLED)
+                    changed = dict(held["configuration"].get("defines") or {}) if part == "configuration" else {}
+                    held[part] |= {"defines": {**changed, str(odd): odd}} if changed else {str(odd): odd}
+            elif chance.random() < 0.5:
+                held = json_changed(held, chance)
+            path.write_text(json.dumps(held))
+        result = folder / "out" / "image" / "result.json"
+        held = json.loads(result.read_text())
+        held["made_of"] = {"run": str(folder / "run"), "calibration": str(folder / "cal")}
+        result.write_text(json.dumps(json_changed(held, chance) if chance.random() < 0.5 else held))
+        source = folder / chance.choice(("run", "cal", "out/image", "out/image", "out"))
+        to = ("-o", str(folder / "out" / "again.toml")) if chance.random() < 0.7 else ()
+        return ("run", "--from", str(source), *to)
+
+    return make
+
+
+def resumed(good: Good) -> Make:
+    """Sessions whose files were changed, cut, exchanged or lost, and then go on or are shown."""
+
+    def make(chance: random.Random, folder: Path) -> Sequence[str]:
+        _done(good, folder)
+        out = folder / "out"
+        files = [*sorted(path for path in out.rglob("*") if path.is_file()), *[out / "session.json"] * 9]
+        path = chance.choice(files)
+        which = chance.randrange(4)
+        if which == 0:
+            misplace(path, chance)
+        elif which == 1:
+            path.write_bytes(bytes_changed(path.read_bytes(), chance))
+        elif path.suffix == ".json":
+            path.write_text(json.dumps(json_changed(json.loads(path.read_text()), chance)))
+        else:
+            path.unlink()
+        if chance.random() < 0.3:
+            return ("report", str(chance.choice((out / "image", out, folder / "run"))))
+        if chance.random() < 0.3:
+            return ("run", str(out / "session.toml"), "-o", str(folder / "again"), "--no-pictures")
+        return ("run", str(out / "session.toml"), "-o", str(out), "--resume", "--no-pictures")
+
+    return make
+
+
+def steps(good: Good) -> Make:
+    """Sessions whose first steps are good, and a later one not."""
+
+    def make(chance: random.Random, folder: Path) -> Sequence[str]:
+        _done(good, folder)
+        shutil.rmtree(folder / "out")
+        image: dict[str, Any] = {"run": "run", "calibration": "cal", "lambda": 0.1}
+        export: dict[str, Any] = {"format": "hdf5", "run": "run", "output": "a.h5"}
+        odd: dict[str, Any] = {
+            "focus": chance.choice((1e-9, 1e300, "map", "auto", 10**400, "x", -1)),
+            "margin": chance.choice((1, 999, -1, 10**30)),
+            "method": chance.choice(("tv", "markov", "none", "a.pt", "")),
+            "bounds": chance.choice(([1, 0], [0, 1], [float("nan"), 1], [float("-inf"), 1e300], [1])),
+            "lambda": chance.choice((0, -1, 1e200, float("inf"), 10**400, "auto", "x")),
+            "iterations": chance.choice((0, 3, 1.5)),
+            "depth_range": chance.choice(([1, 2], [0, 1], [1e300, 1e301])),
+            "output": chance.choice(("image", "Report.HTML", "./pictures", "\x1b[2J", "a\nb", "\U0001f600", "x" * 300)),
+            "run": chance.choice(("cal", "nosuch", ".", "run/manifest.json", "run\u0000")),
+            "calibration": chance.choice(("run", "nosuch", "")),
+            "format": chance.choice(("png", "mat", "flatcam", "torch", "deepinv", "xyz", "hdf5")),
+            "projector": chance.choice(("mp_cl1", "nosuch", "run", "")),
+            "chart": chance.choice(("nosuch", "colour_chart")),
+        }
+        name = chance.choice(sorted(odd))
+        table = (
+            "export"
+            if name in ("format", "projector") or (name in ("run", "output") and chance.random() < 0.5)
+            else "reconstruct"
+        )
+        last = {**(export if table == "export" else image), "output": "last", name: odd[name]}
+        if chance.random() < 0.3:
+            misplace(chance.choice(sorted((folder / chance.choice(("run", "cal"))).iterdir())), chance)
+        tables = {"reconstruct": [image], "export": [export], table: [image if table != "export" else export, last]}
+        import tomli_w
+
+        (folder / "session.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+        return ("run", str(folder / "session.toml"), "-o", str(folder / "out"), "--no-pictures")
+
+    return make

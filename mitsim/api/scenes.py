@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.errors import ArgumentError, check_arguments
+from mitsim.core.errors import ArgumentError, check_arguments, is_masked
 
 _LIT_MM = 120.0
 """Side of what the projector lights of a sheet 400 mm away, as all flat scenes have it: 128 pixels of 0.9375 mm."""
@@ -84,8 +84,16 @@ def _write_array(picture: object) -> Path:
         values = np.asarray(picture)
     except ValueError as error:
         raise ArgumentError("picture", f"{error}; {_ALLOWED}") from None
-    if values.dtype.kind not in "buf" or values.ndim not in (2, 3) or values.shape[2:] not in ((), (1,), (3,)):
-        raise ArgumentError("picture", f"got numbers of type {values.dtype} and shape {values.shape}; {_ALLOWED}")
+    if (
+        is_masked(picture)
+        or values.dtype.kind not in "buf"
+        or values.ndim not in (2, 3)
+        or values.shape[2:] not in ((), (1,), (3,))
+    ):
+        raise ArgumentError(
+            "picture",
+            f"got {'masked ' * is_masked(picture)}numbers of type {values.dtype} and shape {values.shape}; {_ALLOWED}",
+        )
     most = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     values = values.astype(np.float64) / most
     values = values.mean(axis=2) if values.ndim == 3 else values

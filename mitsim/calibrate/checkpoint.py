@@ -28,7 +28,7 @@ from scipy import sparse
 
 from mitsim.calibrate.board_session import Session
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_page, sweep, whole_file, write_json
+from mitsim.core.files import PARTS, output_folder, plain, read_json, remove_page, whole_file, write_json
 from mitsim.core.manifests import MANIFEST, Digital, resumable
 from mitsim.devices.framelist import LISTS, DarkFile, FrameList, StripeFile
 from mitsim.devices.session import SIDES, Side
@@ -53,9 +53,8 @@ class Checkpoint:
         self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
 
     def begin(self) -> None:
-        """Mark the folder as an unfinished session, and clear what a killed process left half-written."""
+        """Mark the folder as an unfinished session."""
         if self.folder is not None:
-            sweep(self.folder)
             remove_page(self.folder)
             head = {"kind": KIND, "status": "incomplete", "configuration": plain(self.configuration)}
             write_json(self.folder / MANIFEST, head)

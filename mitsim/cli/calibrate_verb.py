@@ -368,7 +368,7 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
 
 def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, limited: LimitedPictured) -> int:
     from mitsim.bench.request import Exposure, Request, check_psnr
-    from mitsim.core.files import output_file, prepare_output, whole_file
+    from mitsim.core.files import output_file, prepare_output, write_text
     from mitsim.devices.session import load_recipe, recipe_text
 
     request, recipe, output = session.request, load_recipe(session.recipe), session.output
@@ -399,8 +399,7 @@ def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, lim
             found = plan_calibration(bench, psnr, patterns, recipe, **request, job=job)
             lines = found.lines()
             if output is not None:
-                with whole_file(output) as part:
-                    part.write_text(recipe_text(found.recipe), encoding="utf-8")
+                write_text(output, recipe_text(found.recipe))
                 lines.append(f"Recipe: {output}")
     payload = {**found.payload(), "output": None if output is None else str(output)}
     return finish(limited.as_json, payload, lines, found.warnings)

@@ -80,10 +80,7 @@ class Solving:
         metavar="LOW:HIGH",
     )
     iterations: int | None = option(
-        None,
-        "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given",
-        min=1,
-        metavar="N",
+        None, "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given", min=1, metavar="N"
     )
     margin: int = option(
         0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
@@ -168,7 +165,7 @@ def reconstruct(
     """
     from mitsim.core.files import check_output
     from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest, check_parallax
+    from mitsim.reconstruct.request import ImageRequest, check_parallax, holds_image
 
     options = solving.read()
     output = output or run / "reconstruction"
@@ -199,7 +196,7 @@ def reconstruct(
     manifest = read_manifest(calibration, CalibrationManifest)
     if solving.focus is not None or solving.margin:
         check_parallax(manifest.parallax, str(calibration))
-    check_output(output, overwrite=(output / IMAGE_FILE).is_file())
+    check_output(output, overwrite=holds_image(output))
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.report.quality import reconstruct as reconstruct_folder
 
@@ -239,7 +236,7 @@ def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dic
     """The image of a ``run`` by a point spread function, solved with ``options``."""
     from mitsim.core.files import check_output
     from mitsim.core.manifests import RunManifest, read_manifest
-    from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest
+    from mitsim.reconstruct.request import ImageRequest, holds_image
 
     # Refused before the solver is imported.
     if is_coloured(run):
@@ -250,7 +247,7 @@ def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dic
     if point.psf is None or not point.psf.is_file():
         raise MitsimError(f"--psf {point.psf}: is no file; give a picture of the light of a scene point")
     read_manifest(run, RunManifest)
-    check_output(output, overwrite=(output / IMAGE_FILE).is_file())
+    check_output(output, overwrite=holds_image(output))
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.report.quality import reconstruct_psf
 

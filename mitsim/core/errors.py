@@ -105,15 +105,15 @@ _KINDS: dict[str, Kind] = {
     "None": ("None", lambda value: value is None),
     "bool": ("True or False", lambda value: type(value).__name__ in ("bool", "bool_")),
     "int": ("a whole number", lambda value: isinstance(value, Integral) and not isinstance(value, bool)),
-    "float": ("a number", lambda value: isinstance(value, Real) and not isinstance(value, bool)),
+    "float": ("a number", lambda value: _is_number(value)),
     "str": ("text", lambda value: isinstance(value, str)),
-    "Path": ("a path", lambda value: isinstance(value, (str, os.PathLike)) and is_path(os.fspath(value))),
+    "Path": ("a path", lambda value: is_path(value)),
     "Mapping": ("a mapping", lambda value: isinstance(value, Mapping)),
     "tuple": ("a tuple", lambda value: isinstance(value, tuple)),
     "Iterable": ("several values", lambda value: isinstance(value, Iterable)),
     "Sequence": ("a list", lambda value: isinstance(value, (list, tuple))),
     "Progress": ("a function", callable),
-    "FloatArray": ("an array of real numbers", lambda value: _is_real_array(value)),
+    "FloatArray": ("an array of real numbers, none of them masked", lambda value: _is_real_array(value)),
 }
 
 
@@ -132,8 +132,7 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             allowed = kinds.get(name, rest)
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                shown = os.fsdecode(value) if isinstance(value, os.PathLike) else repr(value)
-                raise ArgumentError(name, f"{cut(shown)}: give {words}")
+                raise ArgumentError(name, f"{shown(value)}: give {words}")
         plain = {name: _plain(value) for name, value in named.items()}
         return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
 
@@ -200,14 +199,41 @@ def _of_class(name: str) -> Kind:
     return f"a {name}", lambda value: name in (each.__name__ for each in type(value).__mro__)
 
 
+def _is_number(value: object) -> bool:
+    """Return True if a ``value`` is a number that a float can be."""
+    try:
+        return not isinstance(value, bool) and isinstance(value, Real) and float(value) is not None
+    except OverflowError:
+        return False
+
+
 def _is_real_array(value: object) -> bool:
-    """Whether a ``value`` is an array of numbers as NumPy has them, which is not imported, of bits, whole or real."""
-    return getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf") and getattr(value, "ndim", 0) > 0
+    """Return True if a ``value`` is an array of bits, whole or real numbers as NumPy has them, which is not imported.
+    A masked array is none, because work would go on with the numbers under its mask."""
+    real = getattr(getattr(value, "dtype", None), "kind", "") in tuple("biuf")
+    return real and not is_masked(value) and getattr(value, "ndim", 0) > 0
 
 
-def is_path(text: str | bytes) -> bool:
-    """Whether a ``text`` can be a path: an empty one would be the working folder, and of a longer one the operating
-    system has an error of its own."""
-    data = os.fsencode(text)
+def is_masked(value: object) -> bool:
+    """Return True if a ``value`` is a masked array of NumPy, which is not imported."""
+    return "MaskedArray" in (each.__name__ for each in type(value).__mro__)
+
+
+def shown(value: object) -> str:
+    """Return a refused ``value`` on a short line; of a number of thousands of digits its kind."""
+    try:
+        return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else repr(value))
+    except (TypeError, ValueError):
+        return f"a {type(value).__name__}"
+
+
+def is_path(value: object) -> bool:
+    """Return True if text, or an object that stands for some, can be a path: an empty one would be the working folder,
+    and of a longer one the operating system has an error of its own."""
+    try:
+        text = os.fspath(value)  # type: ignore[call-overload]
+        data = os.fsencode(text) if isinstance(text, str) else b""
+    except (TypeError, UnicodeEncodeError):
+        return False
     short = len(data) <= _LONGEST_PATH and all(len(name) <= _LONGEST_NAME for name in data.split(os.sep.encode()))
     return bool(data) and b"\0" not in data and short

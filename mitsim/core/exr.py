@@ -28,7 +28,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError, cut, reason_of
+from mitsim.core.errors import MitsimError, cut, is_path, reason_of
 from mitsim.core.files import (
     FRAME_LIMITS,
     MOST_SIDE,
@@ -144,6 +144,22 @@ def verify(folder: Path, name: str, checksums: Mapping[str, str], remedy: str) -
     expected = checksums.get(name)
     if expected is not None and checksum(folder / name) != expected:
         raise MitsimError(f"{folder / name}: not the file that was written (its checksum differs); {remedy}")
+
+
+def verify_files(folder: Path, stated: object, remedy: str) -> None:
+    """Check that all files of a ``folder`` whose checksums were noted are there, and those that were written.
+
+    Parameters
+    ----------
+    folder, remedy
+        as for :func:`verify`.
+    stated
+        SHA-256 by name, as a file in the folder holds them; anything else states none.
+    """
+    for name, value in stated.items() if isinstance(stated, dict) else ():
+        if not is_path(name):
+            raise MitsimError(f"{folder}: notes a checksum of {cut(name)!r}, which names no file; {remedy}")
+        verify(folder, name, {name: str(value)}, remedy)
 
 
 def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:

@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any, get_args
 
+import tomli_w
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
@@ -74,14 +75,10 @@ def allowed_text(rules: Mapping[str, Any]) -> str:
 
 
 def toml_value(value: object) -> str:
-    """Text, a number, a truth or a list, as a TOML file has the ``value``."""
-    if isinstance(value, str):
-        return '"{}"'.format(value.replace("\\", "\\\\").replace('"', '\\"'))
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{name} = {toml_value(each)}' for name, each in value.items())}}}"
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+    """Return text, a number, a truth, a list or a table as a TOML file has the ``value``, on one line."""
+    # In a list with a number a table is inline. Line ends are those of lists, because texts have theirs escaped.
+    text = tomli_w.dumps({"": [value, 0]}).partition("\n")[2].rpartition(",\n    0,")[0].strip()
+    return re.sub(r",\n\s*", ", ", re.sub(r"(?<=\[)\n\s*|,\n\s*(?=\])", "", text))
 
 
 def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:

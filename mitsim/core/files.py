@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -57,10 +58,20 @@ def whole_file(path: Path | str) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def write_bytes(path: Path | str, data: bytes) -> str:
+    """Write ``data`` to ``path``, all or nothing; return their SHA-256. MitsimError when they cannot be written."""
+    with whole_file(path) as part:
+        part.write_bytes(data)
+    return hashlib.sha256(data).hexdigest()
+
+
 def write_text(path: Path | str, text: str) -> None:
     """Write ``text`` to ``path`` in UTF-8, all or nothing. MitsimError when it cannot be written."""
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    try:
+        data = text.encode()
+    except UnicodeEncodeError as error:
+        raise MitsimError(f"file {path}: {error.object[error.start]!r} is no character of UTF-8; remove it") from None
+    write_bytes(path, data)
 
 
 PAGE, PICTURES = "report.html", "pictures"
@@ -76,9 +87,13 @@ def remove_page(folder: Path) -> None:
         (folder / PICTURES).rmdir()
 
 
+_PART = ".*.part"
+"""What files are called while they are written; a killed process leaves them behind."""
+
+
 def sweep(folder: Path) -> None:
     """Remove what killed processes left half-written in a ``folder`` that this one holds."""
-    for part in folder.glob(".*.part"):
+    for part in folder.glob(_PART):
         part.unlink(missing_ok=True)
 
 
@@ -153,6 +168,7 @@ def output_folder(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     try:
         with _lock(folder, folder / LOCK):
             prepare_output(path, overwrite)  # nobody finished a work there between the first look and the lock
+            sweep(folder)
             yield folder
     except BaseException:
         if new:
@@ -259,7 +275,7 @@ def _prepare_folder(path: Path, overwrite: bool) -> None:
         raise MitsimError(f"output {path}: is a file, but a folder is needed; choose another name")
     try:
         path.mkdir(exist_ok=True)
-        occupied = any(item.name != LOCK for item in path.iterdir())
+        occupied = any(item.name != LOCK and not item.match(_PART) for item in path.iterdir())
     except OSError as error:
         raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
     if occupied and not overwrite:

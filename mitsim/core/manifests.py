@@ -330,7 +330,7 @@ class RunManifest(RunHead):
     """SHA-256 by file name, where known."""
     plan: Plain | None = None
     """The effect plan, see Plan."""
-    mc_error: float | None = None
+    mc_error: NonNegative | None = None
     """Relative Monte Carlo error of the expected frames."""
     total_error: float | None = None
     """Relative error of the expected frames, all in all: the plan's systematic error and that."""
@@ -345,9 +345,9 @@ class RunManifest(RunHead):
     heaviest_group: float | None = None
     """Largest part of the Monte Carlo variance in one of the groups of the light; above 0.72 a few heavy paths make
     it."""
-    truth_error: float | None = None
+    truth_error: NonNegative | None = None
     """Standard error of truth.exr, rms over the image; 1 is the board's reflectance."""
-    light_error: float | None = None
+    light_error: NonNegative | None = None
     """Standard error of single projector pixels' light in the frames, rms; 1 is the board's."""
     paths: int | None = None
     """Connections and paths traced."""

@@ -15,15 +15,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import (
-    Channels,
-    Metadata,
-    Value,
-    checksum,
-    read_frame,
-    write_frame,
-)
-from mitsim.core.files import output_folder, remove_page, sweep
+from mitsim.core.exr import Channels, Metadata, Value, checksum, read_frame, write_frame
+from mitsim.core.files import output_folder, remove_page
 from mitsim.core.manifests import MANIFEST, RunHead, RunManifest, read_head, read_manifest, write_manifest
 
 TRUTH, AMBIENT, CLOSING = "truth.exr", "ambient.exr", "closing.exr"
@@ -128,8 +121,7 @@ class RunFolder(Recorder):
         self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
 
     def begin(self) -> None:
-        """Mark the folder as an unfinished run of this configuration, and clear what a killed process left."""
-        sweep(self.folder)
+        """Mark the folder as an unfinished run of this configuration."""
         remove_page(self.folder)
         configuration, digest = self.head.configuration, self.head.configuration_sha256
         head = RunHead(status="incomplete", configuration=configuration, configuration_sha256=digest)

@@ -457,7 +457,7 @@ def sensor_table(path: Path | str) -> Table:
                 f"file {path}: {BASE}: got {base!r}, no such camera; {near_name(base, known)}shipped are "
                 f"{', '.join(known)}"
             )
-        path = beside if is_beside else locate(base, "calibration", ".toml")
+        path = beside if is_beside else locate(base, "calibration", ".toml", CAMERA)
         if path.resolve() in read or len(read) > _MOST_BASES:
             raise MitsimError(f"file {path}: {BASE}: its bases come back to it, or are over {_MOST_BASES}; remove some")
         read.append(path.resolve())

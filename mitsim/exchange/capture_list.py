@@ -8,20 +8,10 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, locate, read_table, validate
+from mitsim.core.configuration import CAMERA, LIST, Configuration, Positive, locate, read_table, validate
 from mitsim.core.errors import ArgumentError, MitsimError, checked_fields
 from mitsim.core.files import check_plain
-from mitsim.core.imagelist import (
-    ALL,
-    BARE,
-    CORRECTIONS,
-    Crop,
-    Preparation,
-    Raw,
-    Wanted,
-    check_channel,
-    image_files,
-)
+from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
@@ -93,7 +83,7 @@ def load_capture_list(name: Path | str) -> CaptureList:
 
     MitsimError when there is none, or it breaks a rule.
     """
-    path = locate(name, "calibration", ".toml")
+    path = locate(name, "calibration", ".toml", LIST)
     data = read_table(path, "list")
     for name_of_field, kind in _OTHERS.items():
         if name_of_field in data:
@@ -200,7 +190,7 @@ class RealCapture:
         if self.camera is not None:
             if self.exposure_s is None:
                 raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
-            sensor = load_sensor(locate(self.camera, "calibration", ".toml"))
+            sensor = load_sensor(locate(self.camera, "calibration", ".toml", CAMERA))
             digital, name, largest = digital_of(sensor, check_exposure(self.exposure_s)), sensor.name, sensor.largest_dn
             if prepare.mosaic is None and prepare.channel is not None and sensor.mosaic is not None:
                 prepare = prepare.model_copy(update={"mosaic": sensor.mosaic})

@@ -124,17 +124,8 @@ def export(
         called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
         format cannot hold.
     """
-    chosen = check_format(format, output, calibration, projector)
+    chosen = check_export(run, format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    lines = _lines(folder, factors)
-    if is_mosaic(folder) and not chosen.filters:
-        able = ", ".join(name for name, other in FORMATS.items() if other.filters)
-        raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
-    for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
-        if factors is not None:
-            read_manifest(factors / line, CalibrationManifest)
-    check_apart(place, [folder, *([factors] if factors else [])])
     with output_file(place, overwrite) if chosen.kind == "file" else nullcontext():
         from mitsim.exchange.packed import calibration_content, run_content
 
@@ -148,6 +139,38 @@ def export(
         "notes": list(notes),
         "output": str(place),
     }
+
+
+def check_export(
+    run: Path | str,
+    format: str,
+    output: Path | str,
+    calibration: Path | str | None = None,
+    projector: str | None = None,
+) -> Format:
+    """Return the format of an :func:`export`; what that refuses before it writes is refused here.
+
+    Parameters
+    ----------
+    run, format, output, calibration, projector
+        as there.
+    """
+    chosen = check_format(format, output, calibration, projector)
+    folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
+    lines = _lines(folder, factors)
+    if is_mosaic(folder) and not chosen.filters:
+        able = ", ".join(name for name, other in FORMATS.items() if other.filters)
+        raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
+    for line in lines or ("",):  # refused before numpy is imported
+        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
+        if factors is not None:
+            read_manifest(factors / line, CalibrationManifest)
+    check_apart(place, [folder, *([factors] if factors else [])])
+    if projector is not None:
+        from mitsim.exchange.png_files import Raster
+
+        Raster.of(projector)
+    return chosen
 
 
 def check_format(

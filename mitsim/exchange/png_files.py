@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.configuration import load_model, locate, validate
+from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
 from mitsim.core.job import Cost, Limits
@@ -61,7 +61,9 @@ class Raster:
     @classmethod
     def of(cls, projector: str) -> Raster:
         """Of the ``projector``, a name or TOML file. MitsimError where it does not say its rows and columns."""
-        return cls.of_projector(load_model(locate(projector, "calibration", ".toml"), ProjectorModel).model_dump())
+        return cls.of_projector(
+            load_model(locate(projector, "calibration", ".toml", PROJECTOR), ProjectorModel).model_dump()
+        )
 
     @classmethod
     def of_projector(cls, model: Mapping[str, Any]) -> Raster:
@@ -177,7 +179,7 @@ def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> F
     MitsimError
         for values that cannot be.
     """
-    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     digital = digital_of(sensor, check_exposure(exposure_s)).model_dump(exclude_none=True)
     stated = {"camera": {"name": sensor.name}, "n": n, "signed_capture": signed_capture, "digital": digital}
     return validate(FrameList, stated, "stripes")
@@ -376,18 +378,10 @@ def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any])
         the grid's place, as :func:`draw` gives it.
     """
     shots = [
-        {
-            "file": name,
-            "pattern": picture_name(index),
-            **shot.model_dump(include={"row", "column", "sign"}),
-        }
+        {"file": name, "pattern": picture_name(index), **shot.model_dump(include={"row", "column", "sign"})}
         for index, (name, shot) in enumerate(zip(names, patterns.captures, strict=True))
     ]
-    return {
-        "projector": where,
-        **patterns.model_dump(include={"family", "n", "P_L", "P_R"}),
-        "shots": shots,
-    }
+    return {"projector": where, **patterns.model_dump(include={"family", "n", "P_L", "P_R"}), "shots": shots}
 
 
 # ---- One PNG file ----

@@ -27,7 +27,7 @@ from mitsim.bench.request import Exposure, Task
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError
-from mitsim.core.files import PAIRS, output_folder, plain, sweep
+from mitsim.core.files import PAIRS, output_folder, plain
 from mitsim.core.job import Cost, Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.core.seeds import integer
@@ -374,7 +374,6 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairS
         cost = maker.cost(left)
         cost.check(f"{asked.count} pairs", job.limits, folder)
         job.clock.predict({"pairs": cost.seconds})
-        sweep(folder)
         begun = maker.begin(configuration, shards)
         write_pairs_manifest(folder, begun)
         for shard in left:

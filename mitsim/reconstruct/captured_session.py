@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import locate
+from mitsim.core.configuration import CAMERA, locate
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, verify
@@ -133,7 +133,7 @@ def calibrate_planes(
 
 def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
     """The ``session`` with what its list does not state taken from the ``camera``, and where both contradict."""
-    sensor = load_sensor(locate(camera, "calibration", ".toml"))
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
     absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
     doubts = []

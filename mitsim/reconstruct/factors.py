@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, SeparableTerm
-from mitsim.core.errors import MitsimError, check_arguments, cut
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
 from mitsim.core.images import card, from_above, normalise, span
@@ -34,6 +34,7 @@ _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
 """Parts of an identity that manifests of 0.4.0 do not state; where one of two states none, its light may be any."""
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False)
 class Factors:
     """A camera's factors, as a CAL folder holds them: a frame under pattern P is Phi_L (P o X) Phi_R^T.
@@ -63,6 +64,11 @@ class Factors:
     name: str = "in memory"
     estimate: Estimate | None = None
     lacking: tuple[SeparableTerm, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, side in self._sides():
+            if side.ndim != 2:
+                raise ArgumentError(name, f"has {side.ndim} dimensions; give (sensor, projector) pixels")
 
     @classmethod
     @check_arguments

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, options_of
-from mitsim.core.exr import write_frame
-from mitsim.core.files import output_folder, plain, read_json, remove_page, whole_file, write_json
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
+from mitsim.core.exr import verify_files, write_frame
+from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
@@ -27,7 +27,17 @@ from mitsim.reconstruct.depth_map import DepthMap, depth_map
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import move_factors
 from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
-from mitsim.reconstruct.request import IMAGE_FILE, TIKHONOV, ImageCost, ImageRequest, predict_cost
+from mitsim.reconstruct.request import (
+    IMAGE_FILE,
+    PICTURE_FILE,
+    RESULT_FILE,
+    TIKHONOV,
+    ImageCost,
+    ImageRequest,
+    check_parallax,
+    holds_image,
+    predict_cost,
+)
 from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.subpixel import print_energy
@@ -42,13 +52,15 @@ if TYPE_CHECKING:
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
-RESULT_FILE = "result.json"
+_INCOMPLETE = "incomplete"
+"""Status in result.json of an image whose files are being written."""
 MADE_OF = "made_of"
 """Key of the folders that an image was made of: whoever shows it finds its truth there."""
 POINT_SPREAD = "psf"
 """Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
 
 
+@checked_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction(Solution):
     """An image and how far to trust it: reflectance, 1 = the calibration's board; by a point spread function
@@ -181,18 +193,19 @@ class Reconstruction(Solution):
         _check_stored(more)
         folder = Path(folder)
         remove_page(folder)
-        write_frame(
-            folder / IMAGE_FILE, {"reflectance": self.image.astype(np.float32)}, {"method": self.inputs["method"]}
-        )
-        (folder / UNCERTAINTY_FILE).unlink(missing_ok=True)
-        if self.uncertainties:
-            write_frame(folder / UNCERTAINTY_FILE, self.uncertainties.channels(), {"method": self.inputs["method"]})
-        (folder / DEPTH_FILE).unlink(missing_ok=True)
-        if self.depths:
-            write_frame(folder / DEPTH_FILE, self.depths.channels(), {"method": self.inputs["method"]})
-        with whole_file(folder / "image.png") as part:
-            part.write_bytes(png(self.image / self.white))
-        write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), "inputs": self.inputs})
+        # First of all, so that an image which a killed process left is known to be of these inputs, and unfinished.
+        write_json(folder / RESULT_FILE, {"status": _INCOMPLETE, "inputs": self.inputs})
+        channels: dict[str, Any] = {IMAGE_FILE: {"reflectance": self.image.astype(np.float32)}}
+        channels[UNCERTAINTY_FILE] = self.uncertainties and self.uncertainties.channels()
+        channels[DEPTH_FILE] = self.depths and self.depths.channels()
+        checksums = {}
+        for name, values in channels.items():
+            (folder / name).unlink(missing_ok=True)
+            if values:
+                checksums[name] = write_frame(folder / name, values, {"method": self.inputs["method"]})
+        checksums[PICTURE_FILE] = write_bytes(folder / PICTURE_FILE, png(self.image / self.white))
+        stated = {"inputs": self.inputs, "checksums": checksums}
+        write_json(folder / RESULT_FILE, {**(more or {}), **self.summary(), **stated})
         return folder
 
     @check_arguments
@@ -265,12 +278,23 @@ def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool)
     MitsimError
         when there is an image of other inputs, and ``overwrite`` is off.
     """
-    if not (folder / IMAGE_FILE).is_file():
+    if not holds_image(folder):
         return False
-    if overwrite:
-        return True
-    check_same_inputs(folder, read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}, asked)
+    if not overwrite:
+        check_same_inputs(folder, read_json(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else {}, asked)
     return True
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """Return what result.json of the finished image in ``folder`` states.
+
+    MitsimError where the image is unfinished, or its files are not those that were written.
+    """
+    result = read_json(folder / RESULT_FILE)
+    if not isinstance(result, dict) or result.get("status") == _INCOMPLETE:
+        raise MitsimError(f"{folder / RESULT_FILE}: holds no result of a finished image; reconstruct it again")
+    verify_files(folder, result.get("checksums"), "reconstruct it again")
+    return result
 
 
 def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | float]) -> None:
@@ -365,16 +389,10 @@ def reconstruct_request(
     job
         of whose work it is a part: its watch is told of the stages, and the image has their seconds.
     """
-    method, asked = request.method, request.inputs(shots, factors)
-    solver, lam, margin = SOLVERS[method] if isinstance(method, str) else method, request.lam, request.margin
-    factors.check_fit(shots)
-    beside = Margin(margin) if margin else None
-    if beside:
-        wider = beside.factors(factors)
-        shots, factors = beside.of(wider.of(shots)), wider.factors
+    method, asked, lam = request.method, request.inputs(shots, factors), request.lam
+    shots, factors, beside, solver = check_image(shots, factors, request)
     # Depths that are looked for, and total variation, take as long as the data ask for.
     cost = predict_cost(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
-    check_factorising(shots, factors, solver)
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     clock = (job or Job()).apart("").clock
@@ -413,6 +431,31 @@ def reconstruct_request(
         focus=depth,
         predicted=cost,
     )
+
+
+def check_image(
+    shots: Capture, factors: Factors, request: ImageRequest
+) -> tuple[Capture, Factors, Margin | None, Solver]:
+    """Return the part of shots, the factors, the margin and the solver that an image is solved with; refuse, before a
+    frame is read, what no image is made of.
+
+    Parameters
+    ----------
+    shots, factors, request
+        as for :func:`reconstruct_request`.
+    """
+    solver = SOLVERS[request.method] if isinstance(request.method, str) else request.method
+    factors.check_fit(shots)
+    if request.focus is not None:
+        check_parallax(factors.manifest.parallax, factors.name)
+    if isinstance(request.focus, (int, float)):
+        move_factors(factors, float(request.focus))
+    beside = Margin(request.margin) if request.margin else None
+    if beside:
+        wider = beside.factors(factors)
+        shots, factors = beside.of(wider.of(shots)), wider.factors
+    check_factorising(shots, factors, solver)
+    return shots, factors, beside, solver
 
 
 def _focus(

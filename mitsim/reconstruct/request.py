@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, shown
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
@@ -19,10 +20,17 @@ MODEL = ".pt"
 """Ending of a trained network's file, which may stand for the name of a method."""
 MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
+_MOST = 1e100
+"""Largest number of a request: far beyond any lambda, depth or reflectance, and its square is finite."""
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
-IMAGE_FILE = "image.exr"
-"""By which a folder is known to hold an image."""
+IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
+"""Files of an image: its numbers, what people look at, and what is stated of it."""
+
+
+def holds_image(folder: Path) -> bool:
+    """Return True if a ``folder`` holds an image, finished or not."""
+    return (folder / IMAGE_FILE).is_file() or (folder / RESULT_FILE).is_file()
 
 
 @dataclass(frozen=True)
@@ -71,24 +79,24 @@ class ImageRequest:
             )
         if lam != "auto" and not isinstance(self.method, str):
             raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
-        if lam != "auto" and (isinstance(lam, str) or not 0 <= lam < math.inf):
-            raise ArgumentError("lam", f"{lam}: give a finite number of at least 0, or auto")
-        if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus < math.inf):
-            raise ArgumentError("focus", f"{focus}: give a depth above 0 mm, auto or map")
+        if lam != "auto" and (isinstance(lam, str) or not 0 <= lam <= _MOST):
+            raise ArgumentError("lam", f"{shown(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}")
+        if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus <= _MOST):
+            raise ArgumentError("focus", f"{shown(focus)}: give a depth above 0 mm, auto or map")
         if self.depth_range is not None:
             self._check_range(self.depth_range)
         if self.bounds is not None:
             self._check_bounds(self.bounds)
         steps: Any = self.iterations
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
-            raise ArgumentError("iterations", f"{steps}: give a whole number, at least 1")
+            raise ArgumentError("iterations", f"{shown(steps)}: give a whole number, at least 1")
         for name, value in self.iterative.items():
             if method not in (NONNEGATIVE, TV):
                 raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
         if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
-            raise ArgumentError("margin", f"{margin}: give a whole number of cells, at least 0")
+            raise ArgumentError("margin", f"{shown(margin)}: give a whole number of cells, at least 0")
         if margin and (focus is not None or method != TIKHONOV):
             raise ArgumentError(
                 "margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus"
@@ -97,16 +105,17 @@ class ImageRequest:
     def _check_range(self, ends: Any) -> None:
         two = isinstance(ends, (tuple, list)) and len(ends) == 2
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        if not (real and 0 < ends[0] < ends[1] < math.inf):
-            raise ArgumentError("depth_range", f"{ends}: give two depths above 0 mm, the nearer one first")
+        if not (real and 0 < ends[0] < ends[1] <= _MOST):
+            raise ArgumentError("depth_range", f"{shown(ends)}: give two depths above 0 mm, the nearer one first")
         if not self.looks_for_depth:
             raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
 
     def _check_bounds(self, ends: Any) -> None:
         two = isinstance(ends, (tuple, list)) and len(ends) == 2
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        if not (real and ends[0] < ends[1] and ends[0] < math.inf and ends[1] > -math.inf):
-            raise ArgumentError("bounds", f"{ends}: give two numbers, the smaller one first")
+        within = real and all(abs(end) <= _MOST or abs(end) == math.inf for end in ends)
+        if not (real and ends[0] < ends[1] and ends[0] <= _MOST and ends[1] >= -_MOST and within):
+            raise ArgumentError("bounds", f"{shown(ends)}: give two numbers, the smaller one first")
 
     @property
     def iterative(self) -> dict[str, Any]:
@@ -176,8 +185,8 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 
 def check_joint(lam: float | str) -> None:
     """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
-    if lam != "auto" and (isinstance(lam, str) or not 0 < lam < math.inf):
-        raise ArgumentError("lam", f"{lam}: behind colour filters give a finite number above 0, or auto")
+    if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
+        raise ArgumentError("lam", f"{shown(lam)}: behind colour filters give a finite number above 0, or auto")
 
 
 # ---- What a Tikhonov image takes -------------------------------------------------------------------------------------

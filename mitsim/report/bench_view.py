@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import math
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ from mitsim.bench.request import check_view
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import check_arguments
-from mitsim.core.files import whole_file
+from mitsim.core.files import write_bytes
 from mitsim.core.images import lightness
 from mitsim.reconstruct.depth_map import SPARE
 from mitsim.report.pages import page_figure, render_page, typeset
@@ -198,13 +199,13 @@ class BenchView:
         for row, both in enumerate(draws):
             for column, draw in enumerate(both):
                 draw(figure.add_subplot(grid[row, column]))
-        figure.suptitle(f"{self._name}: the bench to scale", fontsize=13, fontweight="bold")
+        figure.suptitle(f"{_as_text(self._name)}: the bench to scale", fontsize=13, fontweight="bold")
         return figure
 
     def _words(self, axes: Axes) -> None:
         """All facts."""
         axes.set_axis_off()
-        lines = "\n".join(typeset(line) for line in self.lines())
+        lines = _as_text("\n".join(typeset(line) for line in self.lines()))
         axes.text(0, 0.95, lines, va="top", fontsize=_SMALL + 0.5, linespacing=1.6, transform=axes.transAxes)
 
     @property
@@ -266,7 +267,7 @@ class BenchView:
         axes.set(xlim=(start - 0.32 * length, end + 0.24 * length), ylim=(low - 0.12 * across, high + 0.16 * across))
         axes.set_aspect("equal", adjustable="box")
         title = "From above" if axis == 0 else "From the camera's right side"
-        axes.set_title(f"{title}{self._outside}", fontsize=_SMALL + 1.5, loc="left")
+        axes.set_title(f"{title}{_as_text(self._outside)}", fontsize=_SMALL + 1.5, loc="left")
         axes.set_xlabel("z, distance from the sensor [mm]", fontsize=_SMALL)
         axes.set_ylabel("x, to the left [mm]" if axis == 0 else "y, up [mm]", fontsize=_SMALL)
         _open(axes)
@@ -421,6 +422,8 @@ class BenchView:
             margin={"l": 0, "r": 0, "t": 0, "b": 0},
             height=560,
         )
+        for trace in figure.data:  # plotly reads HTML in its texts, and a scene's names are any text
+            trace.name = html.escape(trace.name)
         return figure
 
     # ---- As a file, and in a notebook ----
@@ -440,8 +443,7 @@ class BenchView:
             for another ending, and when the file cannot be written.
         """
         path = check_view(path)
-        with whole_file(path) as part:
-            part.write_bytes(self._repr_png_() if path.suffix.lower() == ".png" else self._page().encode())
+        write_bytes(path, self._repr_png_() if path.suffix.lower() == ".png" else self._page().encode())
         return path
 
     def _page(self) -> str:
@@ -511,6 +513,11 @@ def _fill_surfaces(axes: Axes, surfaces: Sequence[Surface], axis: int) -> None:
         faces = PolyCollection(np.concatenate(corners)[order], facecolors=shown, edgecolors=shown, lw=1.4)
         faces.set_rasterized(True)  # as shapes, those of a print of 128 x 128 pixels take 6 MB of a page
         axes.add_collection(faces)
+
+
+def _as_text(name: str) -> str:
+    """Return a name for matplotlib, which takes what stands between two dollar signs for a formula."""
+    return name.replace("$", r"\$")
 
 
 def _body(place: FloatArray, along: FloatArray, half: float) -> FloatArray:

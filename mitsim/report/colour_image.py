@@ -14,8 +14,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import validate
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.exr import finite_channel, read_frame, write_frame
-from mitsim.core.files import PAGE, output_folder, read_json, remove_page, whole_file
+from mitsim.core.exr import checksum, finite_channel, read_frame, verify_files, write_frame
+from mitsim.core.files import PAGE, output_folder, read_json, remove_page, write_bytes
 from mitsim.core.images import card, lightness, png
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.runs import load_mosaic
@@ -23,8 +23,8 @@ from mitsim.core.spectral_manifests import COLOUR, IMAGE, ColourManifest, checke
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
-from mitsim.reconstruct.reconstruct import MADE_OF, RESULT_FILE
-from mitsim.reconstruct.request import IMAGE_FILE
+from mitsim.reconstruct.reconstruct import MADE_OF
+from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
 from mitsim.reconstruct.solution import Status
 from mitsim.report.folder_page import truth_of, write_folder, write_page
 from mitsim.report.folder_pictures import LARGEST, REFLECTANCE, SMALLEST, Picture, Scale, shown_error
@@ -181,16 +181,17 @@ class ColourImage:
             sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
         return sentences
 
-    def write(self, folder: Path) -> None:
-        """Write image.exr and image.png to a ``folder``. MitsimError when they cannot be written."""
+    def write(self, folder: Path) -> dict[str, str]:
+        """Write image.exr and image.png to a ``folder``; return their checksums by name. MitsimError when they cannot
+        be written."""
         rgb = linear_srgb(self.xyz)
         named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, self.xyz], axis=-1), -1, 0), strict=True))
         channels = {name: values.astype(np.float32) for name, values in named.items()}
-        write_frame(
+        image = write_frame(
             folder / IMAGE_FILE, channels, {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
         )
-        with whole_file(folder / "image.png") as part:
-            part.write_bytes(png(rgb))
+        picture = write_bytes(folder / PICTURE_FILE, png(rgb))
+        return {IMAGE_FILE: image, PICTURE_FILE: picture}
 
     def _repr_html_(self) -> str:
         pictures = {"in colour\nsRGB under D65": linear_srgb(self.xyz)}
@@ -341,13 +342,16 @@ class JudgedColours:
             further entries of colour.json.
         """
         remove_page(folder)
-        self.colours.write(folder)
+        checksums = self.colours.write(folder)
+        of_lines = (f"{name}/{IMAGE_FILE}" for name in self.colours.lines.names)
+        checksums |= {name: checksum(folder / name) for name in of_lines if (folder / name).is_file()}
         parts = {key: value for key, value in self.summary().items() if key != "channels"}
         lines = ColourManifest(kind="colour-image", channels=self.colours.lines.channels)
         made = {
             "facts": {**self.facts, **self.table},
             "board_reflectance": self.colours.board,
             "chart": self.colours.chart,
+            "checksums": checksums,
         }
         write_colours(folder, lines, **inputs, **parts, **made)
 
@@ -373,6 +377,7 @@ def report_colours(folder: Path) -> Path:
     """
     data = read_json(folder / COLOUR)
     lines = checked_colours(data, IMAGE, folder)
+    verify_files(folder, data.get("checksums"), "reconstruct it again")
     for name in lines.names:
         if (folder / name / RESULT_FILE).is_file():
             write_folder(folder / name)

@@ -19,13 +19,14 @@ from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.files import write_text
 from mitsim.core.images import data_uri, grey_png, lightness
 from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
-from mitsim.report.pages import DASH, Mean, figure_uri, reflectance, render_page, sentence, write_html
+from mitsim.report.pages import DASH, Mean, figure_uri, reflectance, render_page, sentence
 from mitsim.report.parts import PlanChart, stages_of, total_of
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
 
@@ -148,7 +149,8 @@ def build_report(report: ReportData, path: Path) -> Path:
 
     MitsimError when an image holds values that are not finite or the place cannot be written.
     """
-    return write_html(Path(path), render_html(report))
+    write_text(path, render_html(report))
+    return Path(path)
 
 
 def render_html(report: ReportData) -> str:

@@ -15,26 +15,18 @@ import numpy as np
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import finite_channel, read_frame
-from mitsim.core.files import PAGE, PICTURES, output_folder, prepare_output, read_json, remove_page
+from mitsim.core.files import PAGE, PICTURES, output_folder, prepare_output, read_json, remove_page, write_text
 from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
 from mitsim.core.recorders import TRUTH
 from mitsim.core.runs import Capture, load_run
-from mitsim.core.spectral_manifests import (
-    CALIBRATION,
-    COLOUR,
-    RUN,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
-)
+from mitsim.core.spectral_manifests import CALIBRATION, COLOUR, RUN, is_coloured, is_mosaic, read_colours, read_mosaic
 from mitsim.metrics import truth_for
 from mitsim.reconstruct.factors import load_calibration
-from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, RESULT_FILE, UNCERTAINTY_FILE
-from mitsim.reconstruct.request import IMAGE_FILE
+from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, UNCERTAINTY_FILE, read_result
+from mitsim.reconstruct.request import IMAGE_FILE, RESULT_FILE
 from mitsim.report.folder_pictures import REFLECTANCE, Picture, Scale, contact_sheet, error_picture
-from mitsim.report.pages import render_page, write_html
+from mitsim.report.pages import render_page
 from mitsim.report.parts import PlanChart, lines_of, plan_rows, stages_of, total_of
 
 _ELSEWHERE = {
@@ -129,7 +121,7 @@ def write_page(folder: Path, pictures: tuple[Picture, ...], template: str, **sho
             prepare_output(folder / PICTURES, overwrite=True)
         for picture in pictures:
             picture.write(folder / PICTURES)
-        write_html(folder / PAGE, text)
+        write_text(folder / PAGE, text)
     except BaseException:
         remove_page(folder)
         raise
@@ -290,9 +282,7 @@ def _by_stage(data: Any) -> dict[str, float]:
 
 
 def _of_image(folder: Path) -> Shown:
-    result = read_json(folder / RESULT_FILE)
-    if not isinstance(result, dict):
-        raise MitsimError(f"{folder / RESULT_FILE}: holds no result of an image; reconstruct it again")
+    result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
     truth, quality = truth_of(result), result.get("psnr")
     similar = result.get("ssim")

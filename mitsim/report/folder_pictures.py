@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.files import whole_file
+from mitsim.core.files import write_bytes
 from mitsim.core.images import data_uri, png
 from mitsim.core.parallel import in_threads
 
@@ -122,8 +122,7 @@ class Picture:
     def write(self, folder: Path) -> Path:
         """Write it to a ``folder``, whole or not at all; its path. MitsimError when it cannot be written."""
         path = folder / f"{self.name}.png"
-        with whole_file(path) as part:
-            part.write_bytes(self.data)
+        write_bytes(path, self.data)
         return path
 
 

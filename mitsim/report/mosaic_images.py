@@ -24,7 +24,7 @@ import numpy as np
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import write_frame
-from mitsim.core.files import output_folder, read_json, whole_file
+from mitsim.core.files import output_folder, read_json, write_bytes
 from mitsim.core.images import png
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import MosaicCapture, load_mosaic
@@ -37,7 +37,7 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import check_same_inputs
 from mitsim.reconstruct.regularisation import automatic_lambda
-from mitsim.reconstruct.request import IMAGE_FILE, check_joint
+from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, check_joint
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
@@ -136,8 +136,7 @@ def reconstruct_mosaic(
         for name, image in zip(shots.manifest.names, solved.images, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
-                with whole_file(place / "image.png") as part:
-                    part.write_bytes(png(image))
+                write_bytes(place / PICTURE_FILE, png(image))
         found.write(folder, inputs=inputs, **(origin or {}))
     return found
 

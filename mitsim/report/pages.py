@@ -62,31 +62,6 @@ def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environ
     return environment
 
 
-def write_html(path: Path, text: str) -> Path:
-    """Write a page, all or nothing.
-
-    Parameters
-    ----------
-    path
-        the file.
-    text
-        of the page.
-
-    Returns
-    -------
-    Path
-        of the file.
-
-    Raises
-    ------
-    MitsimError
-        when it cannot be written.
-    """
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return path
-
-
 def page_figure(figure: Figure) -> tuple[str, int]:
     """A figure for a page: an SVG, sharp at any size, of a third of a PNG's bytes; the same of the same figure.
 

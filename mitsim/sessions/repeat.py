@@ -8,41 +8,73 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from mitsim.bench.apparatus import check_devices, spelling
 from mitsim.bench.request import Request
-from mitsim.core.configuration import load_model, shipped_path
+from mitsim.core.configuration import load_model, shipped_path, validate
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions
-from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import checksum
-from mitsim.core.files import plain, read_json, read_text, write_text
+from mitsim.core.files import plain, read_json, write_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.spectral_manifests import COLOUR, IMAGE, MOSAIC, checked_colours, is_coloured, spectral_of
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
-from mitsim.reconstruct.reconstruct import MADE_OF, RESULT_FILE
-from mitsim.reconstruct.request import METHODS
-from mitsim.sessions.run_session import SESSION_FILE, SUMMARY
-from mitsim.sessions.session_file import session_text, value_of
+from mitsim.reconstruct.reconstruct import MADE_OF, read_result
+from mitsim.reconstruct.request import METHODS, RESULT_FILE
+from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, TABLES, read_session, session_text, value_of
 from mitsim.studies.framework.campaign import read_scope
 
 _PLANNED = "patterns", "accuracy", "seed", "effects"
 """Fields of a request that light hangs on."""
-_LONGEST = 1 << 16
-"""Bytes of a session file, as of all TOML that is read."""
+
+
+class _Opened(BaseModel):
+    """How a manifest names the files that opened its bench."""
+
+    camera: str | None = None
+    projector: str | None = None
+    allow_outside_files: bool = False
+
+
+class _Scene(BaseModel):
+    """What the configuration in a manifest states of the scene."""
+
+    scene: str
+    defines: dict[str, str]
+    variant: str
+    scene_sha256: str | None = None
+    scene_files: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """What repeats a folder: the ``text`` of a session file, and why it may come to something else."""
+    """What repeats a folder: the ``text`` of a session file, and why it may come to something else.
+
+    Attributes
+    ----------
+    text
+        with whole paths.
+    warnings
+        sentences.
+    tables, notes
+        of the file, and lines of comment before them.
+    """
 
     text: str
     warnings: tuple[str, ...] = ()
+    tables: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the session file to ``path``, which is replaced; returns it. MitsimError when it cannot be written."""
-        write_text(path, self.text)
+        """Write the session file to ``path``, which is replaced, with paths as seen from there; return the path.
+
+        MitsimError when it cannot be written.
+        """
+        write_text(path, session_text(self.tables, Path(path).absolute().parent, *self.notes))
         return Path(path)
 
 
@@ -68,7 +100,8 @@ def session_of(folder: Path | str) -> Repeat:
     """
     folder = Path(folder)
     if (folder / SUMMARY).is_file() and (folder / SESSION_FILE).is_file():
-        return Repeat(read_text(folder / SESSION_FILE, _LONGEST))
+        tables = read_session(folder / SESSION_FILE).tables
+        return Repeat(session_text(tables), (), tables)
     found = _Found(folder.absolute())
     data = read_json(folder / COLOUR) if is_coloured(folder) else {}
     if (folder / "demo.json").is_file():
@@ -79,8 +112,9 @@ def session_of(folder: Path | str) -> Repeat:
         found.run_or_calibration()
     else:
         found.study()
-    head = f"Repeats {folder.absolute()}: mitsim run FILE -o FOLDER", *found.warnings
-    return Repeat(session_text(found.tables, *head), tuple(found.warnings))
+    tables = read_session(found.tables).tables  # which refuses values that a damaged folder states
+    notes = f"Repeats {folder.absolute()}: mitsim run FILE -o FOLDER", *found.warnings
+    return Repeat(session_text(tables, None, *notes), tuple(found.warnings), tables, notes)
 
 
 @dataclass
@@ -125,23 +159,27 @@ class _Found:
             raise MitsimError(f"{folder}: is of a bench before a board, which only Python makes")
         if opened is None:
             self._warn(f"{folder} does not tell its devices' files: the usual ones are taken")
-            opened = {}
-        devices = {name: _short_name(opened.get(name), "calibration") for name in ("camera", "projector")}
+        where = f"{folder}/{MANIFEST}"
+        files, scene = validate(_Opened, dict(opened or {}), where), validate(_Scene, dict(conf), where)
+        if own := scene.defines.keys() & TABLES["scene"].model_fields.keys():
+            raise MitsimError(f"{where}: defines.{min(own)} is no parameter of a scene; remove it")
+        devices = {name: _short_name(getattr(files, name), "calibration") for name in ("camera", "projector")}
         usual = spectral_of(DEFAULT_VARIANT) if coloured else DEFAULT_VARIANT
         table = {
-            "scene": _short_name(conf["scene"], "scenes"),
+            "scene": _short_name(scene.scene, "scenes"),
             **{name: value for name, value in devices.items() if value is not None},
-            **({} if conf["variant"] == usual else {"variant": conf["variant"]}),
-            **({"allow_outside_files": True} if opened.get("allow_outside_files") else {}),
-            **{name: _value(text) for name, text in conf["defines"].items()},
+            **({} if scene.variant == usual else {"variant": scene.variant}),
+            **({"allow_outside_files": True} if files.allow_outside_files else {}),
+            **{name: _value(text) for name, text in scene.defines.items()},
         }
         if self.tables.setdefault("scene", table) != table:
             raise MitsimError(f"{folder}: is of another scene or of other devices than its frames")
-        self._compare(conf, devices, coloured)
+        self._compare(conf, {scene.scene: scene.scene_sha256, **scene.scene_files}, devices, coloured)
 
-    def _compare(self, conf: Mapping[str, Any], devices: Mapping[str, str | None], coloured: bool) -> None:
-        """Note files that are others than a manifest's ``conf`` says."""
-        sums = {conf["scene"]: conf.get("scene_sha256"), **(conf.get("scene_files") or {})}
+    def _compare(
+        self, conf: Mapping[str, Any], sums: Mapping[str, str | None], devices: Mapping[str, str | None], coloured: bool
+    ) -> None:
+        """Note files that are others than a manifest's ``conf`` and its ``sums`` of the scene's files say."""
         for name, known in sums.items():
             if not Path(name).is_file():
                 self._warn(f"{name} is not there")
@@ -226,15 +264,18 @@ class _Found:
         if "calibration" not in made_of:
             raise MitsimError(f"{folder}: does not tell the calibration that it is made of")
         first = self._first(folder) if is_coloured(folder) else folder
-        result = read_json(first / RESULT_FILE) if (first / RESULT_FILE).is_file() else {}
-        inputs = {name: value for name, value in result.get("inputs", {}).items() if name not in made_of}
+        stated = read_result(first).get("inputs") if (first / RESULT_FILE).is_file() else {}
+        inputs = {
+            name: value for name, value in (stated if isinstance(stated, dict) else {}).items() if name not in made_of
+        }
         if inputs.get("method", METHODS[0]) not in METHODS:
             raise MitsimError(
-                f"{folder}: was solved by {inputs['method']}, a trained network, whose file it does not tell"
+                f"{folder}: was solved by {cut(str(inputs['method']))}, a trained network, whose file it does not tell"
             )
-        if "bounds" in inputs:
-            low, high = inputs["bounds"]
-            inputs["bounds"] = [-math.inf if low is None else low, math.inf if high is None else high]
+        if isinstance(ends := inputs.get("bounds"), list):
+            inputs["bounds"] = [
+                end if end is not None else (-1) ** (place + 1) * math.inf for place, end in enumerate(ends)
+            ]
         for name, verb, take in (("run", "capture", self.run), ("calibration", "calibrate", self.calibration)):
             if self.taken.get(verb) == made_of[name]:
                 continue

@@ -5,48 +5,68 @@ Nothing is written before all steps have been checked. A folder of a finished st
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
+import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, Field
 
 from mitsim.bench.apparatus import check_devices
 from mitsim.bench.request import Exposure, Request
-from mitsim.core.configuration import load_model
+from mitsim.core.configuration import Configuration, load_model, validate
 from mitsim.core.environment import deciding_versions
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
-from mitsim.core.files import PAGE, check_plain, output_folder, plain, read_json, remove_page, write_json, write_text
+from mitsim.core.files import (
+    PAGE,
+    PICTURES,
+    check_output,
+    output_folder,
+    plain,
+    read_json,
+    remove_page,
+    write_bytes,
+    write_json,
+    write_text,
+)
 from mitsim.core.job import Job
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
+from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.spectral_manifests import bands_of, is_coloured, is_mosaic, spectral_of
 from mitsim.devices.sensor import load_sensor
-from mitsim.reconstruct.request import MODEL
+from mitsim.exchange.formats import check_export, check_format, export
+from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
     FOLDERS,
     OF_A_BENCH,
+    SESSION_FILE,
+    SUMMARY,
     Session,
     Step,
     calibration_for,
     image_request,
+    portable,
     read_session,
     recipe_of,
     request_of,
+    session_text,
     sweep_options,
     swept_values,
 )
 from mitsim.studies.framework.experiment import is_experiment
-from mitsim.verbs import WHOLE, Opening, demo, prepare_study
+from mitsim.verbs import WHOLE, Opening, prepare_study
 
 if TYPE_CHECKING:
     from mitsim.acquire.capture import Light
     from mitsim.api.bench import Bench
     from mitsim.light.plan import Plan
-
-SESSION_FILE, SUMMARY = "session.toml", "session.json"
-"""What a folder of a session says of itself: what was asked for, and what each step came to."""
 
 
 @checked_fields
@@ -70,6 +90,13 @@ class RunOptions:
     pictures: bool = True
     shard: str = WHOLE
     scheduler: str | None = None
+
+
+class _Made(Configuration):
+    """Files of a step: SHA-256 of its ``inputs``, and of each of its ``files`` by name; none of one that was begun."""
+
+    inputs: str
+    files: dict[str, str] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -160,35 +187,44 @@ def run(
     >>> ms.load_run("repeated/run").truth  # doctest: +SKIP
     """
     asked = RunOptions(**options_of(RunOptions, options, "run"))
-    read = read_session(session, values)
-    place = Path(output)
+    read, place = read_session(session, values), Path(output)
     again = (place / SUMMARY).is_file()
     if again and not asked.resume:
         raise MitsimError(f"output {place}: holds a session already; go on with resume=True, or choose another folder")
     with output_folder(place, overwrite=again) as folder:
-        earlier = _earlier(folder) if again else {}
-        steps = _Steps(read, folder, job or Job(), asked)
+        steps = _Steps(read, folder, job or Job(), asked, _earlier(folder) if again else _Earlier())
         prepared = [(step, steps.prepare(step)) for step in read.steps if steps.makes(step)]
-        if any(step.verb in OF_A_BENCH for step, _ in prepared):
-            steps.bench  # noqa: B018 - opened before anything is written, for it may be refused
-        told = {name: (folder / name).read_text(encoding="utf-8") for name in (SESSION_FILE, SUMMARY) if again}
-        head = {"kind": KIND, "session": read.tables, "versions": deciding_versions()}
-        results: list[StepResult] = []
+        steps.check_bench()
+        own = [folder / name for name in (SUMMARY, SESSION_FILE)]
+        before = {path: path.read_bytes() if path.is_file() else None for path in own}
+        head = {"kind": KIND, "session": portable(read.tables, folder), "versions": deciding_versions()}
+        results, text = list[StepResult](), session_text(read.tables, folder)
+
+        def note() -> None:
+            """Keep what is done, and what is at work, so that a killed session goes on."""
+            kept = {**steps.earlier.by_output, **{each.output: each for each in results}}
+            told = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
+            write_json(folder / SUMMARY, {**head, **told})
+
         try:
-            write_text(folder / SESSION_FILE, read.text)
             for step, task in prepared:
-                kept = {**earlier, **{each.output: asdict(each) for each in results}}
-                write_json(folder / SUMMARY, {**head, "status": "incomplete", "steps": [*kept.values()]})
-                results.append(_take(step, task, folder, earlier.get(step.output), asked.pictures))
+                if not (finished := steps.is_finished(step, task)):
+                    steps.begin(step)
+                note()
+                write_text(folder / SESSION_FILE, text)
+                results.append(_take(step, task, steps, finished))
         except MitsimError:
             if all(each.left_alone for each in results):  # nothing was made: it is the session that it was
-                for name, text in told.items():
-                    write_text(folder / name, text)
+                for path, data in before.items():
+                    path.unlink(missing_ok=True) if data is None else write_bytes(path, data)
+            else:
+                note()
             raise
         remove_page(folder)
-        page = _write_page(folder, read, results, job) if asked.pictures else None
+        page = _write_page(folder, text, results, job) if asked.pictures else None
         done = SessionResult(tuple(results), str(folder), page)
-        write_json(folder / SUMMARY, {**head, **done.payload(), "status": "complete", "command": job and job.command})
+        ended = {**done.payload(), "status": "complete", "command": job and job.command, "made": steps.made}
+        write_json(folder / SUMMARY, {**head, **ended})
     return done
 
 
@@ -196,25 +232,37 @@ KIND = "session"
 """What session.json says that the folder is."""
 
 
-def _earlier(folder: Path) -> dict[str, dict[str, Any]]:
-    """Steps of an earlier run in a ``folder``, by their output; MitsimError where it holds none of a session."""
+class _Earlier(BaseModel):
+    """What session.json states of an earlier run."""
+
+    kind: Literal["session"] = "session"
+    steps: tuple[StepResult, ...] = ()
+    made: dict[str, _Made] = Field(default_factory=dict)
+
+    @property
+    def by_output(self) -> dict[str, StepResult]:
+        """The steps by their outputs."""
+        return {step.output: step for step in self.steps}
+
+
+def _earlier(folder: Path) -> _Earlier:
+    """What an earlier run in a ``folder`` came to; MitsimError where it holds none of a session."""
     found = read_json(folder / SUMMARY)
     if not isinstance(found, dict) or found.get("kind") != KIND:
         raise MitsimError(f"resume=True: {folder / SUMMARY} is not that of a session; use another folder")
-    steps = found.get("steps")
-    told = {each.name for each in fields(StepResult)}
-    listed = steps if isinstance(steps, list) else []
-    return {str(each["output"]): each for each in listed if isinstance(each, dict) and each.keys() == told}
+    return validate(_Earlier, found, f"resume=True: {folder / SUMMARY}")
 
 
-def _take(step: Step, task: _Task, folder: Path, earlier: dict[str, Any] | None, pictures: bool) -> StepResult:
-    """What a ``step`` comes to by its ``task``, and its page in the session's ``folder``; where it is finished, what an
-    ``earlier`` run says of it."""
-    started, place = time.perf_counter(), folder / step.output
-    if earlier is not None and task.is_finished():
-        found = StepResult(**{**earlier, "warnings": tuple(earlier["warnings"]), "left_alone": True})
+def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
+    """Take a ``step`` by its ``task``, unless it is ``finished``, and write its page."""
+    started, folder, pictures = time.perf_counter(), steps.folder, steps.asked.pictures
+    place = folder / step.output
+    if finished:
+        found = replace(steps.earlier.by_output[step.output], left_alone=True)
     else:
-        says, warnings = task.work()
+        with steps.earlier_aside(step):
+            says, warnings = task.work()
+        steps.end(step)
         found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
     if pictures and step.verb in FOLDERS and not (found.left_alone and (place / PAGE).is_file()):
         from mitsim.report.folders import report_folder
@@ -225,15 +273,15 @@ def _take(step: Step, task: _Task, folder: Path, earlier: dict[str, Any] | None,
     return replace(found, page=page)
 
 
-def _write_page(folder: Path, session: Session, results: Sequence[StepResult], job: Job | None) -> str:
-    """Write the page of a ``session`` in its ``folder``, of its ``results``; its path."""
-    from mitsim.report.pages import render_page, write_html
+def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: Job | None) -> str:
+    """Write the page of a session, whose file has this text, in its ``folder``, of its ``results``; its path."""
+    from mitsim.report.pages import render_page
 
     images = [step.output for step in results if (folder / step.output / "image.png").is_file()]
     flagged = sum(bool(step.warnings) for step in results)
     count = f"{len(results)} step{'s' * (len(results) > 1)}"
     verdict = f"{count} done" + (f", {flagged} flagged" if flagged else "")
-    text = render_page(
+    page = render_page(
         "session.html",
         folder=folder.absolute(),
         verdict=verdict,
@@ -241,10 +289,11 @@ def _write_page(folder: Path, session: Session, results: Sequence[StepResult], j
         command=job and job.command,
         steps=results,
         images=images,
-        text=session.text,
+        text=session,
         file=SESSION_FILE,
     )
-    return str(write_html(folder / PAGE, text))
+    write_text(folder / PAGE, page)
+    return str(folder / PAGE)
 
 
 # ---- Steps -----------------------------------------------------------------------------------------------------------
@@ -255,10 +304,24 @@ Said = tuple[str, Sequence[str]]
 
 @dataclass(frozen=True)
 class _Task:
-    """What a step does, checked: its ``work``, and whether it ``is_finished``, as its folder is of the same request."""
+    """What a step does, checked.
+
+    Attributes
+    ----------
+    work
+        makes its files.
+    load
+        reads what later steps need, where it is finished.
+    check
+        refuses what only the opened scene shows, before anything is written.
+    goes_on
+        whether it looks itself into what an earlier run left, and is therefore never left alone.
+    """
 
     work: Callable[[], Said]
-    is_finished: Callable[[], bool] = lambda: False
+    load: Callable[[], object] = lambda: None
+    check: Callable[[], object] = lambda: None
+    goes_on: bool = False
 
 
 @dataclass
@@ -269,6 +332,10 @@ class _Steps:
     ----------
     session, folder, job, asked
         as of :func:`run`.
+    earlier
+        what an earlier run in the folder came to.
+    made
+        files of each step by its output, of the earlier run until a step begins again.
     plan, light
         that the capture is made by; None without a step that makes them.
     """
@@ -277,6 +344,10 @@ class _Steps:
     folder: Path
     job: Job
     asked: RunOptions
+    earlier: _Earlier
+    made: dict[str, _Made] = field(init=False)
+    before: _Made | None = field(default=None, init=False)
+    checks: list[Callable[[], object]] = field(default_factory=list, init=False)
     plan: Plan | None = field(default=None, init=False)
     light: Light | None = field(default=None, init=False)
 
@@ -290,9 +361,85 @@ class _Steps:
         for name, value in (("shard", self.asked.shard != WHOLE), ("scheduler", self.asked.scheduler is not None)):
             if value and not shared:
                 raise ArgumentError(name, f"has no effect on [{step.verb}], which has no points to share; leave it out")
-        return _TASKS[step.verb](self, step)
+        task = _TASKS[step.verb](self, step)
+        self.checks += [task.check] if step.verb in OF_A_BENCH else []
+        return task
+
+    # ---- what is there already ----
+
+    def __post_init__(self) -> None:
+        self.made = dict(self.earlier.made)
+
+    def inputs(self, step: Step) -> str:
+        """Return the SHA-256 of all that decides the files of a ``step``: values, files that it reads, steps before."""
+        read = "run", "calibration"
+        values = {name: _contents(value) for name, value in step.values.items() if name not in read}
+        asked: dict[str, Any] = {"versions": deciding_versions(), step.verb: values}
+        if step.verb in OF_A_BENCH:
+            above = [each.values for each in self.session.steps if each.verb in ("plan", "transport")]
+            asked |= {**self.bench.deciding, **self.bench.identity(), "above": above}
+        if step.verb in ("reconstruct", "export"):
+            places = [self._source(step, name) for name in read]
+            asked["read"] = [_checksums(place) for place in places if place.exists()]
+        return hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
+
+    def is_finished(self, step: Step, task: _Task) -> bool:
+        """Return True if an earlier run took a ``step`` with the same inputs and its files are what they were; what
+        later steps need of it is then read by its ``task``."""
+        if step.verb == "transport":  # whose light is in no file
+            capture = self.session.step("capture")
+            known = step.output in self.earlier.by_output
+            return known and capture is not None and self.is_finished(capture, task)
+        made = self.made.get(step.output)
+        if task.goes_on or made is None or not made.files or step.output not in self.earlier.by_output:
+            return False
+        there = _checksums(self.folder / step.output)
+        same = made.inputs == self.inputs(step) and all(there.get(name) == each for name, each in made.files.items())
+        if same:
+            task.load()
+        return same
+
+    def begin(self, step: Step) -> None:
+        """Note that a ``step`` is at work: its files are no longer those of before."""
+        self.before = self.made.get(step.output)
+        self.made[step.output] = _Made(inputs="")
+
+    def end(self, step: Step) -> None:
+        """Note the files of a ``step`` that was taken."""
+        self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(self.folder / step.output))
+
+    @contextmanager
+    def earlier_aside(self, step: Step) -> Iterator[None]:
+        """Keep what an image or an export was before beside it, until it is made anew; where that is refused it is
+        what it was. MitsimError where files of somebody else are among it."""
+        place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
+        _remove(aside)
+        if self.before is None or step.verb not in ("reconstruct", "export") or not place.exists():
+            yield
+            return
+        others = _checksums(place).keys() - self.before.files.keys() if self.before.files else ()
+        if others or place.is_symlink():
+            self.made[step.output] = self.before
+            other = min(others, default="it")
+            raise MitsimError(f"output {place}: is made anew, and {other} is not the session's; move that away")
+        os.replace(place, aside)
+        try:
+            yield
+        except BaseException:
+            _remove(place)
+            os.replace(aside, place)
+            self.made[step.output] = self.before
+            raise
+        _remove(aside)
 
     # ---- the bench ----
+
+    def check_bench(self) -> None:
+        """Open the scene, if a step needs it, and refuse what only that shows."""
+        if self.checks:
+            self.bench  # noqa: B018 - opens it
+        for check in self.checks:
+            check()
 
     @cached_property
     def opening(self) -> Opening:
@@ -323,42 +470,16 @@ class _Steps:
             (light if colour == "lines" else light.in_bands(bands_of(colour))).traced_lines  # noqa: B018 - checks itself
         self.opening.check(self.session.scene["scene"], patterns, None)
 
-    def _is_made(self, folder: Path, asked: Mapping[str, Any], more: Sequence[str] = ()) -> bool:
-        """Whether a ``folder`` has all files of finished work on this bench.
-
-        Parameters
-        ----------
-        folder
-            of a run or a calibration.
-        asked
-            entries of its configuration beside the bench's.
-        more
-            names of entries that it has only where they are asked for.
-        """
-        if not (folder / MANIFEST).is_file() or is_coloured(folder):
-            return False
-        found = read_json(folder / MANIFEST)
-        if not isinstance(found, dict) or found.get("status") != "complete":
-            return False
-        whole = {**self.bench.provenance(), **self.bench.identity(), **asked, "versions": deciding_versions()}
-        made: dict[str, Any] = found.get("configuration") or {}
-        same = all(made.get(name) == value for name, value in plain({**dict.fromkeys(more), **whole}).items())
-        return same and _has_files(folder, found.get("checksums") or {})
-
     # ---- a verb each ----
 
     def _plan(self, step: Step) -> _Task:
         asked, place = request_of(step), self.folder / step.output / "plan.json"
         self._check_bench(Request.of(**asked).patterns, None)
 
-        def is_finished() -> bool:
+        def load() -> None:
             from mitsim.light.plan import Plan
 
-            if not place.is_file() or (known := Plan.load(place)).known_request != Request.of(**asked):
-                return False
-            known.check_made_of(self.bench.deciding)
-            self.plan = known
-            return True
+            self.plan = Plan.load(place)
 
         def work() -> Said:
             self.plan = self.bench.plan(**asked)
@@ -369,21 +490,22 @@ class _Steps:
                 self.plan.warnings,
             )
 
-        return _Task(work, is_finished)
+        return _Task(work, load, self._fits(asked))
 
     def _transport(self, step: Step) -> _Task:
         asked = request_of(step)
         self._check_bench(Request.of(**asked).patterns, None)
 
-        def is_finished() -> bool:
-            capture = self.session.step("capture")
-            return capture is not None and self._capture(capture).is_finished()
-
         def work() -> Said:
             self.light = self.bench.light(job=self.job.apart("transport "), **asked)
             return f"{self.light.paths} paths of light by projector pixel", self.light.warnings
 
-        return _Task(work, is_finished)
+        return _Task(work, check=self._fits(asked))
+
+    def _fits(self, asked: Mapping[str, Any]) -> Callable[[], object]:
+        """Return a check that the patterns ``asked`` for fit the opened scene's projector."""
+        request = Request.of(**asked)
+        return lambda: self.bench.family(request.patterns, request.seed)
 
     def _capture(self, step: Step) -> _Task:
         own, colour, place = request_of(step), step.values.get("colour", "no"), self.folder / step.output
@@ -393,14 +515,6 @@ class _Steps:
             planned.with_values(**Request.of(**own).model_dump(exclude_unset=True)) if planned else Request.of(**own)
         )
         self._check_bench(request.patterns, request.timing, colour)
-
-        def is_finished() -> bool:
-            asked: dict[str, Any] = dict(request.deciding)
-            if planned and above and above.verb == "transport":
-                asked["light"] = {"patterns": planned.patterns, "seed": planned.seed}
-            elif planned and planned.seed != request.seed:
-                asked["plan_seed"] = planned.seed
-            return colour == "no" and self._is_made(place, asked, ("light", "plan_seed"))
 
         def work() -> Said:
             job, resume = self.job.apart("capture "), self.asked.resume
@@ -418,7 +532,7 @@ class _Steps:
             runs = _in_colour(self.bench, colour).capture_lines(request.patterns, place, resume, job, **more)
             return _of_lines({name: _of_run(run.summary()) for name, run in runs.items()})
 
-        return _Task(work, is_finished)
+        return _Task(work, check=self._fits({"patterns": request.patterns, "seed": request.seed}))
 
     def _calibrate(self, step: Step) -> _Task:
         values, place = step.values, self.folder / step.output
@@ -428,9 +542,11 @@ class _Steps:
             recipe.of_one_depth()
         self._check_bench("uniform", Exposure(None, recipe.exposure_fraction), colour)
 
-        def is_finished() -> bool:
-            model = recipe.model_dump(exclude_defaults=True, exclude={"depths"})
-            return colour == "no" and not recipe.depths and self._is_made(place, {**asked, "recipe": model})
+        def check() -> None:
+            from mitsim.calibrate.board_session import Session as BoardSession
+
+            if colour == "no" and not recipe.depths:
+                BoardSession(self.bench, recipe, asked["seed"]).check_mask(self.job)
 
         def work() -> Said:
             whole: dict[str, Any] = {**asked, "output": place, "resume": self.asked.resume}
@@ -445,17 +561,27 @@ class _Steps:
                 found = _in_colour(self.bench, colour).calibrate_lines(**whole)
             return _of_lines({str(name): _of_calibration(each.manifest.result) for name, each in found.items()})
 
-        return _Task(work, is_finished)
+        return _Task(work, check=check)
 
     def _reconstruct(self, step: Step) -> _Task:
         values, place, options = step.values, self.folder / step.output, image_request(step)
         run, calibration = (self._source(step, name) for name in ("run", "calibration"))
         capture = self.session.step("capture")
         coloured = is_coloured(run) if "run" in values else bool(capture and capture.values.get("colour", "no") != "no")
-        if "run" in values and not coloured:
-            read_manifest(run, RunManifest)
-        if "calibration" in values and not is_coloured(calibration):
-            read_manifest(calibration, CalibrationManifest)
+        mosaic = is_mosaic(run) if "run" in values else bool(capture and capture.values.get("colour") == "mosaic")
+        if str(options.get("method", "")).endswith(MODEL):
+            from mitsim.learn.verbs import load_network
+
+            options["method"] = load_network(options["method"])
+        if mosaic and (others := options.keys() - {"lam"}):
+            raise ArgumentError(min(others), "has no effect on frames behind colour filters; leave it out")
+        self._check_folders(step, coloured)
+        if not coloured and {"run", "calibration"} <= values.keys():
+            from mitsim.core.runs import load_run
+            from mitsim.reconstruct.factors import load_calibration
+            from mitsim.reconstruct.reconstruct import check_image
+
+            check_image(load_run(run), load_calibration(calibration), ImageRequest(**options))
         chart = None
         if "chart" in values:
             from mitsim.devices.chart import load_chart
@@ -463,42 +589,30 @@ class _Steps:
             if not coloured:
                 raise ArgumentError("chart", f"{values['chart']}: the frames are not coloured; leave it out")
             chart = load_chart(values["chart"])
-        if str(options.get("method", "")).endswith(MODEL):
-            check_plain(options["method"])
-
-        def solving() -> dict[str, Any]:
-            if str(options.get("method", "")).endswith(MODEL):
-                from mitsim.learn.verbs import load_network
-
-                return {**options, "method": load_network(options["method"])}
-            return options
-
-        def is_finished() -> bool:
-            from mitsim.core.runs import load_run
-            from mitsim.reconstruct.factors import load_calibration
-            from mitsim.reconstruct.reconstruct import RESULT_FILE
-            from mitsim.reconstruct.request import IMAGE_FILE, ImageRequest
-
-            if coloured or not ((place / IMAGE_FILE).is_file() and (place / RESULT_FILE).is_file()):
-                return False
-            inputs = ImageRequest(**solving()).inputs(load_run(run), load_calibration(calibration))
-            found = read_json(place / RESULT_FILE)
-            return isinstance(found, dict) and found.get("inputs") == plain(inputs)
 
         def work() -> Said:
             from mitsim.report import quality
 
             job = self.job.apart(f"{step.output} ")
             if coloured:
-                whole = {"lam": options.get("lam", "auto")} if is_mosaic(run) else solving()
-                colours = quality.reconstruct_colours(run, calibration, place, chart, job=job, page=False, **whole)
+                colours = quality.reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
                 known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
                 return f"an image of every line{known}", colours.warnings
-            judged = quality.reconstruct(run, calibration, place, job=job, **solving())
+            judged = quality.reconstruct(run, calibration, place, job=job, **options)
             image = judged.reconstruction
             return str(judged.quality or f"{image.status.sentence}."), judged.summary()["warnings"]
 
-        return _Task(work, is_finished)
+        return _Task(work)
+
+    def _check_folders(self, step: Step, coloured: bool) -> None:
+        """Refuse folders that a ``step`` reads and that are damaged, or of another kind."""
+        folders: dict[str, Any] = {"run": RunManifest, "calibration": CalibrationManifest}
+        for name, model in folders.items():
+            if name in step.values and not coloured and not is_coloured(folder := Path(step.values[name])):
+                from mitsim.core.exr import verify_files
+
+                remedy = "make it again, or copy it again"
+                verify_files(folder, read_manifest(folder, model).checksums, remedy)
 
     def _source(self, step: Step, name: str) -> Path:
         """Folder of the ``run`` or the ``calibration`` of a ``step``: the one that it names, or this session's."""
@@ -512,12 +626,12 @@ class _Steps:
         self._check_bench(request.patterns, request.timing)
 
         def work() -> Said:
-            scene, job = self.session.scene["scene"], self.job.apart("demo ")
-            opening = {name: getattr(self.opening, name) for name in (*_OPENING, "parameters")}
-            found = demo(scene, self.folder / step.output, **step.values, job=job, **opening)
+            from mitsim.studies.demo import demo
+
+            found = demo(self.bench, self.folder / step.output, request, self.job.apart("demo "))
             return found.verdict, found.warnings
 
-        return _Task(work)
+        return _Task(work, check=self._fits(request_of(step)))
 
     def _sweep(self, step: Step) -> _Task:
         scene = {name: getattr(self.opening, name) for name in (*_OPENING, "parameters")}
@@ -544,23 +658,25 @@ class _Steps:
             found = study()
             return found.lines()[0], found.warnings
 
-        return _Task(work)
+        return _Task(work, goes_on=True)
 
     def _export(self, step: Step) -> _Task:
         values = {name: value for name, value in step.values.items() if name in ("format", "projector")}
         run, calibration = self._source(step, "run"), None
         if "calibration" in step.values or calibration_for(self.session, step):
             calibration = self._source(step, "calibration")
+        chosen = check_format(values["format"], step.output, calibration, values.get("projector"))
+        if "run" in step.values and ("calibration" in step.values or calibration is None):
+            check_export(run, output=self.folder / step.output, calibration=calibration, **values)
+        self._check_folders(step, is_coloured(run))
+        if step.output not in self.made:
+            check_output(self.folder / step.output, kind=chosen.kind)
 
         def work() -> Said:
-            from mitsim.exchange.formats import export
-
-            file = self.folder / step.output
-            overwrite = self.asked.resume and file.is_file()
-            found = export(run, output=file, calibration=calibration, overwrite=overwrite, **values)
+            found = export(run, output=self.folder / step.output, calibration=calibration, **values)
             return f"{found['frames']} frames as {found['format']}", ()
 
-        return _Task(work, lambda: (self.folder / step.output).is_dir())
+        return _Task(work)
 
 
 _TASKS: Mapping[str, Callable[[_Steps, Step], _Task]] = {
@@ -578,12 +694,39 @@ _OPENING = "variant", "camera", "projector", "allow_outside_files"
 """Arguments that open a bench, beside the scene and its parameters."""
 
 
-def _has_files(folder: Path, checksums: Mapping[str, Any]) -> bool:
-    """Whether the files of a ``folder`` are whole, by their ``checksums``."""
+def _checksums(place: Path) -> dict[str, str]:
+    """Return the SHA-256 of a file, or of each file of a folder by name, without pages and what writing leaves."""
+    found = {}
+    for path in sorted(place.rglob("*")) if place.is_dir() else [place] if place.is_file() else []:
+        name = path.relative_to(place)
+        shown = path.suffix == ".html" or PICTURES in name.parts or any(part.startswith(".") for part in name.parts)
+        if path.is_file() and not (shown and path != place):
+            status = path.stat()
+            found[str(name)] = _checksum(path, status.st_size, status.st_mtime_ns)
+    return found
+
+
+@lru_cache(maxsize=1 << 16)
+def _checksum(path: Path, *_: int) -> str:
+    """Return the SHA-256 of a file, computed once while its size and time of writing stay."""
     from mitsim.core.exr import checksum
 
-    places = {folder / name: value for name, value in checksums.items()}
-    return bool(places) and all(place.is_file() and checksum(place) == value for place, value in places.items())
+    return checksum(path)
+
+
+def _contents(value: Any) -> Any:
+    """Return values of a step with the checksums of files in place of their whole paths."""
+    if isinstance(value, Mapping):
+        return {name: _contents(each) for name, each in value.items()}
+    return _checksums(Path(value)) or value if isinstance(value, str) and os.path.isabs(value) else value
+
+
+def _remove(place: Path) -> None:
+    """Remove a file, or a folder with all that is in it, if it is there."""
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink(missing_ok=True)
 
 
 def _in_colour(bench: Bench, colour: str) -> Bench:

@@ -7,22 +7,23 @@ read from there, so that each stands once.
 from __future__ import annotations
 
 import inspect
-import json
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import pydantic
+import tomli_w
 
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request, SessionRequest
 from mitsim.core.configuration import Configuration, locate, read_toml, shipped_path, validate
-from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name
+from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, shown
+from mitsim.core.files import PAGE, PICTURES, resolve
 from mitsim.core.mistakes import Mistake, Place, Table, mistakes, told_together
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import check_format, export
@@ -211,7 +212,7 @@ class Session:
     steps
         in the order in which they are taken.
     tables
-        as a file holds them, with whole paths.
+        as a file holds them, with whole paths; nothing of what the caller gave.
     where
         the file, for messages.
     """
@@ -225,42 +226,53 @@ class Session:
         """The first step of a ``verb``."""
         return next((step for step in self.steps if step.verb == verb), None)
 
-    @property
-    def text(self) -> str:
-        """As a session file holds it."""
-        return session_text(self.tables)
 
-
-def session_text(tables: Mapping[str, Any], *notes: str) -> str:
-    """A session file.
+def session_text(tables: Mapping[str, Any], base: Path | None = None, *notes: str) -> str:
+    """Return the text of a session file.
 
     Parameters
     ----------
     tables
-        names and values of each, or a list of such.
+        names and values of each, or a list of such, with whole paths.
+    base
+        folder of the file, from which paths are written, so that it can be moved with the files that it names; None:
+        paths stay whole.
     notes
-        lines of comment that it begins with.
+        lines of comment that it begins with; line ends and control characters in them become spaces.
     """
-    lines = [f"# {note}" for note in notes]
-    for name in (name for name in TABLES if name in tables):
-        several = isinstance(tables[name], Sequence)
-        for table in tables[name] if several else [tables[name]]:
-            lines += ["", f"[[{name}]]" if several else f"[{name}]"]
-            lines += [f"{_key(key)} = {_toml(value)}" for key, value in table.items() if value is not None]
-    return "\n".join(lines).lstrip("\n") + "\n"
+    held = portable(tables, base) if base else _copy(tables, unset=False)
+    parts = [" ".join(f"# {printable(note)}".split()) for note in notes]
+    parts = ["\n".join(parts) + "\n"] if parts else []
+    for name in (name for name in TABLES if name in held):
+        once = name not in SEVERAL
+        # The library writes several short tables as one list on a line, which people read less well.
+        each = [tomli_w.dumps({name: table}) for table in ([held[name]] if once else held[name])]
+        parts += each if once else [text.replace(f"[{name}]", f"[[{name}]]", 1) for text in each]
+    return "\n".join(parts)
 
 
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)
+def portable(tables: Mapping[str, Any], base: Path) -> dict[str, Any]:
+    """Return ``tables`` with whole paths as relative ones, as seen from the folder ``base``."""
+    held: dict[str, Any] = _copy(tables, unset=False)
+    _replace_paths(held, lambda path: _path_from(path, base) if os.path.isabs(path) else path)
+    return held
 
 
-def _toml(value: Any) -> str:
-    """A plain ``value`` as TOML has it, which spells numbers beyond the finite ones as Python does."""
+def _path_from(path: str, base: Path) -> str:
+    """Return a ``path`` as seen from the folder ``base``, spelled so that it names no shipped file; the path itself
+    where both have no folder in common."""
+    place = resolve(base)
+    if os.path.commonpath([place, path]) == os.path.sep:
+        return path
+    relative = os.path.relpath(path, place)
+    return relative if os.sep in relative else os.path.join(os.curdir, relative)
+
+
+def _copy(value: Any, unset: bool = True) -> Any:
+    """Return a copy of nested tables and lists; with ``unset`` off, without the fields that are None."""
     if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{_key(key)} = {_toml(each)}' for key, each in value.items())} }}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_toml, value))}]"
-    return repr(value) if isinstance(value, float) else json.dumps(value)
+        return {key: _copy(each, unset) for key, each in value.items() if unset or each is not None}
+    return [_copy(each, unset) for each in value] if isinstance(value, (list, tuple)) else value
 
 
 # ---- Reading ---------------------------------------------------------------------------------------------------------
@@ -298,11 +310,11 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
         have; and for a file that cannot be read.
     """
     if isinstance(source, Mapping):
-        path, data, base, where = None, Table(source), Path.cwd(), "session"
+        data, base, where = Table(_copy(source)), Path.cwd(), "session"
     else:
         path = locate(source, "sessions", ".toml")
-        data, base, where = read_toml(path), path.absolute().parent, f"file {path}"
-    _resolve(data, base)
+        data, base, where = read_toml(path), resolve(path.absolute().parent), f"file {path}"
+    _replace_paths(data, lambda path: os.path.normpath(base / path), base)
     changed = {_change(data, name, value, where) for name, value in (changes or {}).items()}
     lined = _Lined(data, changed)
     found = mistakes(_SESSION, lined)
@@ -317,6 +329,8 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
 
 def _change(data: Table, name: str, value: Any, where: str) -> Place:
     """Set the field of a dotted ``name`` to a ``value``; its place."""
+    if not isinstance(name, str):
+        raise MitsimError(f"values: {shown(name)}: give names of fields, such as capture.patterns")
     place: list[str | int] = [int(part) if part.isdecimal() else part for part in name.split(".")]
     if len(place) < 2 or place[0] not in TABLES:
         raise MitsimError(
@@ -334,8 +348,9 @@ def _change(data: Table, name: str, value: Any, where: str) -> Place:
     if not isinstance(holder, dict) or not isinstance(place[-1], str):
         some = f"{place[0]}.0.{place[-1]}"
         raise MitsimError(f"-D {cut(name)}: {where} has several [[{place[0]}]]; say which, as {some}, counted from 0")
-    holder[place[-1]] = value
-    _resolve(data, Path.cwd(), {(str(place[0]), place[-1])})
+    holder[place[-1]] = _copy(value)
+    here = Path.cwd()
+    _replace_paths(data, lambda path: os.path.normpath(here / path), here, {(str(place[0]), place[-1])})
     return tuple(place)
 
 
@@ -347,14 +362,31 @@ def value_of(text: str) -> Any:
         return text
 
 
-def _resolve(data: dict[str, Any], base: Path, only: set[tuple[str, str]] | None = None) -> None:
-    """Make relative paths in some tables whole, that count from the folder ``base``; ``only`` these fields."""
+def _replace_paths(
+    data: dict[str, Any],
+    replace: Callable[[str], str],
+    base: Path = Path(os.path.sep),
+    only: set[tuple[str, str]] | None = None,
+) -> None:
+    """Replace each path in some tables.
+
+    Parameters
+    ----------
+    data
+        tables, which are changed.
+    replace
+        makes the new path of the old one.
+    base
+        folder from which relative paths count.
+    only
+        table and name of the fields that are looked at; None: all.
+    """
     for name, each in data.items():
         for table in each if isinstance(each, list) else [each]:
             for key, value in table.items() if isinstance(table, dict) and name != "sweep" else ():
                 named = only is None or (name, key) in only
                 if named and isinstance(value, str) and value and _is_file(name, key, value, base):
-                    table[key] = os.path.normpath(base / value)
+                    table[key] = replace(value)
 
 
 def _is_file(table: str, key: str, value: str, base: Path) -> bool:
@@ -392,8 +424,12 @@ def _session_of(model: Any, where: str) -> Session:
 
 # ---- What a model of fields does not tell ----------------------------------------------------------------------------
 
-OF_A_BENCH = "plan", "transport", "capture", "calibrate"
-"""Verbs that open the scene here; the demo and a sweep do so themselves."""
+OF_A_BENCH = "plan", "transport", "capture", "calibrate", "demo"
+"""Verbs that open the scene here; a sweep does so itself."""
+SESSION_FILE, SUMMARY = "session.toml", "session.json"
+"""What a folder of a session says of itself: what was asked for, and what each step came to."""
+_RESERVED = PAGE, PICTURES, SESSION_FILE, SUMMARY
+"""Names in the session's folder that no step may write to."""
 
 
 @dataclass
@@ -431,15 +467,26 @@ def _mistakes_of_values(session: Session, data: _Lined) -> Iterator[Mistake]:
         place: Place = (step.verb, number) if step.verb in SEVERAL else (step.verb,)
         if step.verb in _CHECKS:
             _CHECKS[step.verb](session, step, place, found)
-        if Path(step.output).name != step.output or step.output in (".", ".."):
-            found.say((*place, "output"), f"{cut(repr(step.output))}: give a name without folders")
-        elif [other.output for other in session.steps].count(step.output) > 1:
-            found.say((*place, "output"), f"{step.output!r} is another step's too; give each a name of its own")
-        if step.verb in (*OF_A_BENCH, "demo", "sweep") and not session.scene:
+        if Path(step.output).name != step.output or step.output.startswith("."):
+            found.say((*place, "output"), f"{cut(repr(step.output))}: give a name without folders and no dot before it")
+        elif (name := _same_name(step.output)) in map(_same_name, _RESERVED):
+            found.say(
+                (*place, "output"), f"{step.output!r} is the session's own; give another than {', '.join(_RESERVED)}"
+            )
+        elif [_same_name(other.output) for other in session.steps].count(name) > 1:
+            found.say(
+                (*place, "output"), f"{cut(repr(step.output))} is another step's too; give each a name of its own"
+            )
+        if step.verb in (*OF_A_BENCH, "sweep") and not session.scene:
             found.say(place, 'is of a scene, and there is none; add a table [scene] with scene = "NAME"')
     if not session.steps:
         found.mistakes.append((0, f"asks for nothing; add a table, such as [capture]: {', '.join(TABLES)}"))
     yield from dict.fromkeys(found.mistakes)
+
+
+def _same_name(name: str) -> str:
+    """Return the spelling that names share which a file system may take for one: whatever their case and accents."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def request_of(step: Step) -> dict[str, Any]:

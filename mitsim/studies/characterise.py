@@ -20,7 +20,7 @@ from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
 from mitsim.devices.flatlist import FlatFrames
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.pages import write_html, written_figure
+from mitsim.report.pages import written_figure
 from mitsim.sensor import emva
 from mitsim.sensor.found_camera import FoundCamera, Stated, find_camera
 from mitsim.sensor.photon_transfer import Taken
@@ -144,7 +144,7 @@ def _write(measure: Callable[[str | None], Characterisation], output: Path | str
         pictures = {name: written_figure(figure, folder / name) for name, figure in figures.items()}
         titles = done.title, done.message
         page = build_findings("characterise", titles, done.where, done.parts, pictures, done.warnings)
-        write_html(folder / "characterise.html", page)
+        write_text(folder / "characterise.html", page)
         write_text(folder / CAMERA_FILE, done.found.toml())
         write_json(results, {**done.payload(), "kind": "characterise", "versions": versions()})
     return done

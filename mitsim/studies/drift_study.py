@@ -28,20 +28,12 @@ from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
 from mitsim.bench.apparatus import Apparatus
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import DEFAULT_CAMERA, locate, shipped_path
+from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, locate, shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, read_name, stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.sensor import load_sensor
-from mitsim.devices.session import (
-    DRIFT_UNITS,
-    DRIFT_WORDS,
-    SIDES,
-    Drift,
-    SessionRecipe,
-    amount_in_words,
-    load_recipe,
-)
+from mitsim.devices.session import DRIFT_UNITS, DRIFT_WORDS, SIDES, Drift, SessionRecipe, amount_in_words, load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames
@@ -502,7 +494,7 @@ def _points(scope: Scope) -> Sequence[Point]:
     if not amounts:
         raise MitsimError(f"study drift: the table [drift] of {scope.recipe} moves nothing; give amounts in it")
     if any(kind in _RIPPLES for kind in amounts):  # refused before any light is traced
-        load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml")).known_line_time_s()
+        load_sensor(locate(scope.setup.camera or DEFAULT_CAMERA, "calibration", ".toml", CAMERA)).known_line_time_s()
     found = [
         Point.of(
             _setup(scope, kind), recipe=scope.recipe, patterns=scope.patterns, kind=kind, unit=DRIFT_UNITS[kind],

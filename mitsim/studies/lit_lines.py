@@ -39,7 +39,7 @@ from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.calibrate.calibrate import calibrate_lines
 from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import load_model, locate
+from mitsim.core.configuration import CAMERA, load_model, locate
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
@@ -353,7 +353,7 @@ def expose_rates(
 
 def filter_weights(lines: Lines) -> FloatArray:
     """(4, lines) electrons behind each filter of :data:`ARRAY` over those of the ``lines``' camera without filters."""
-    curves = load_model(locate(FILTERS, "calibration", ".toml"), SensorModel)
+    curves = load_model(locate(FILTERS, "calibration", ".toml", CAMERA), SensorModel)
     sensor = lines[0].lit.bench.sensor
     return np.array(
         [

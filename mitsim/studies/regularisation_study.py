@@ -16,12 +16,12 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.solvers import solve_tv
 from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
-from mitsim.report.pages import Table
+from mitsim.report.pages import Table, Value
 from mitsim.report.plots import quality_bars
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio
+from mitsim.studies.framework.studio import Studio, reason_of
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
 _SHOWN = ("uniform", "dots:7")
@@ -52,19 +52,21 @@ def _measure(studio: Studio, point: Point) -> Found:
     model, sums = frames.data(frames.seconds(EQUAL_FRAME))
     truth, started = frames.lit.truth, time.perf_counter()
     if point["method"] == TIKHONOV:
-        image = model.solve(sums, "auto").image
+        solution = model.solve(sums, "auto")
         seconds, scale = time.perf_counter() - started, model.problem(sums).scale
         others = (model.solve(sums, scale * factor).image for factor in LAMBDAS)
     else:
         solution = solve_tv(model, sums, "auto")
-        image, seconds = solution.image, time.perf_counter() - started
+        seconds = time.perf_counter() - started
         others = (solve_tv(model, sums, solution.lam * weight).image for weight in _WEIGHTS)
+    image, reason = solution.image, reason_of(solution.status)
     tracemalloc.start()
     one = next(others)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     best = max(psnr(each, truth) for each in (image, one, *others))
-    measured = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds, "peak_mib": peak / 2**20}
+    measured: dict[str, Value] = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds}
+    measured |= {"peak_mib": peak / 2**20, "flagged": bool(reason), "reason": reason}
     return claims.finding(studio, point, image if point["patterns"] in _SHOWN else None, **measured)
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mitsim.core.environment import versions
-from mitsim.report.pages import page_figure, render_page, write_html
+from mitsim.core.files import write_text
+from mitsim.report.pages import page_figure, render_page
 from mitsim.studies.framework.claims import CONFIRMED, NOT_CONFIRMED
 from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
 
@@ -128,7 +129,8 @@ def build_page(sections: Sequence[Section], path: Path, title: str) -> Path:
     """
     message = sections[0].message if len(sections) == 1 else tally([claim for one in sections for claim in one.claims])
     page = render_page("study.html", title=title, message=message or title, sections=sections, versions=versions())
-    return write_html(path, page)
+    write_text(path, page)
+    return path
 
 
 def _options(scope: Scope) -> list[str]:

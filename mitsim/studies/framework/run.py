@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from mitsim.bench.request import Request
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_output, check_plain, output_folder, read_json, sweep, whole_file, write_json
+from mitsim.core.files import check_output, check_plain, output_folder, read_json, whole_file, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
 from mitsim.studies.framework.experiment import Found, Point, Results
@@ -188,8 +188,7 @@ def run_study(
             titles = findings.title, findings.message
             pictures = {file: page_figure(figure) for file, figure in figures.items()}
             page = build_findings(name, titles, where, findings.parts(), pictures, result.warnings)
-            with whole_file(folder / f"{name}.html") as part:
-                part.write_text(page, encoding="utf-8")
+            write_text(folder / f"{name}.html", page)
         for file, table in findings.tables().items():
             table.write(folder / file)
         return result
@@ -359,7 +358,6 @@ def study_folder(output: Path | str, name: str) -> Iterator[Path]:
     holds anything else, or cannot be written.
     """
     with output_folder(output, overwrite=_is_earlier(Path(output), name)) as folder:
-        sweep(folder)
         yield folder
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -142,6 +143,29 @@ def test_a_view_is_written_whole_or_not_at_all(
         seen.save(tmp_path / "bench.png")
     assert [path.name for path in tmp_path.iterdir()] == ["bench.png"]
     assert (tmp_path / "bench.png").read_bytes() == b"before"
+
+
+def test_names_of_a_scene_are_no_html(seen: BenchView) -> None:
+    """Plotly reads tags and entities in its texts; a name is shown as it is, and requests nothing. Dollar signs are no
+    formula in the drawing. (Planted: names as the scene has them; a name with dollar signs in the title.)"""
+    bad = "<b style=\"background:url(http://evil.example/x)\">s</b>&lt;img src='http://evil.example'&gt; $^{x$"
+    shapes = [replace(surface, name=bad) for surface in seen.layout.surfaces]
+    layout = replace(seen.layout, surfaces=shapes, lamps={bad: np.array([0.0, 9000, 300])})
+    view = replace(seen, layout=layout)
+    figure = json.loads(view.model().to_json())
+    texts: list[str] = []
+
+    def collect(value: object) -> None:
+        if isinstance(value, str):
+            texts.append(value)
+        for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            collect(each)
+
+    collect([figure["data"], {**figure["layout"], "template": None}])
+    named = [text for text in texts if "evil" in text]
+    assert len(named) == len(shapes) + 1
+    assert all("<" not in text and "&lt;b style" in text and "&amp;lt;img" in text for text in named)
+    drawn(view, 0).savefig(io.BytesIO())
 
 
 @pytest.mark.slow

@@ -77,11 +77,60 @@ def test_tables_become_steps_in_order_with_folders_of_their_own(write: Callable[
 def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
     """(Planted: a text with a quote in it that is not escaped.)"""
     found = read_session(write(WHOLE), {"scene.camera": 'a "b"\\c.toml', "capture.effects": {"diffraction": False}})
-    again = read_session(write(found.text))
+    again = read_session(write(session_text(found.tables)))
     assert (again.scene, again.steps) == (found.scene, found.steps)
-    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, "a note") == (
+    assert session_text({"scene": {"scene": "x", "odd name": 1e-3}}, None, "a note") == (
         '# a note\n\n[scene]\nscene = "x"\n"odd name" = 0.001\n'
     )
+
+
+@pytest.mark.parametrize(
+    "name", ["\U0001f600", "a\u0001\u007f\u0085b", "\u2028\u2029", "q\"'\\", "[capture]", "#", "\t", "\U0010ffff"]
+)
+def test_any_text_is_written_and_read_again(write: Callable[[str], Path], name: str) -> None:
+    """As a value, a key and a list item. (Planted: JSON's spelling, in which a smile is two surrogates.)"""
+    tables = {
+        "scene": {"scene": "x", name: name},
+        "study": [{"name": "sweep", "over": {name: [name, 1.5, True]}, "parameters": {name: -1e-300}}],
+    }
+    again = read_session(write(session_text(tables))).tables
+    assert again["scene"] == tables["scene"] and again["study"] == tables["study"]
+
+
+def test_a_note_begins_no_table(write: Callable[[str], Path]) -> None:
+    """What a manifest brings into a comment stays in it. (Planted: a note that is written with its line ends.)"""
+    notes = "a\n[export]\nformat = 'hdf5'", "b\r[demo]", "c\x00\x1b[2J\u2028[plan]", "d\x85[plan]"
+    text = session_text({"scene": {"scene": "x"}, "capture": {}}, None, *notes)
+    assert read_session(write(text)).tables.keys() == {"scene", "capture"}
+    assert all(line.startswith("#") and line.isprintable() for line in text.splitlines()[: len(notes)])
+
+
+@pytest.mark.parametrize(
+    "output",
+    ["report.html", "pictures", "session.toml", "session.json", "Pictures", "REPORT.HTML", "./pictures", "x/../a.html",
+     "pictures/", ".mitsim.lock", ".hidden", "..", "run", "RUN", "a/b", "/tmp/x", "Se\u017f\u017fion.toml"],
+)  # fmt: skip
+def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) -> None:
+    """Those that the session writes itself, and another step's, in any spelling that a disk may confuse.
+    (Planted: names that are compared as they are written.)"""
+    with pytest.raises(ms.MitsimError) as refused:
+        read_session(write(f"{SCENE}[capture]\n[calibrate]\noutput = {output!r}\n"))
+    assert "calibrate.output" in str(refused.value) and len(str(refused.value).splitlines()) <= 3
+
+
+def test_paths_are_written_as_seen_from_the_file(write: Callable[[str], Path], tmp_path: Path) -> None:
+    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`.)"""
+    (tmp_path / "s").mkdir()
+    for name in ("photograph", "s/camera.toml"):
+        (tmp_path / name).touch()
+    tables = {
+        "scene": {"scene": str(tmp_path / "s" / "photograph"), "camera": str(tmp_path / "s" / "camera.toml")},
+        "reconstruct": [{"run": str(tmp_path / "run"), "calibration": "/elsewhere/cal"}],
+    }
+    text = session_text(tables, tmp_path / "s")
+    assert 'scene = "./photograph"' in text and 'run = "../run"' in text and str(tmp_path) not in text
+    (tmp_path / "s" / "session.toml").write_text(text)
+    assert read_session(tmp_path / "s" / "session.toml").tables == tables
 
 
 def test_fields_are_those_of_the_calls() -> None:

@@ -1,0 +1,225 @@
+"""Folders of sessions and of images: what is left alone, made anew, refused and resumed, and where they can move."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mitsim as ms
+from mitsim.core.exr import read_frame, write_frame
+
+IMAGE: dict[str, Any] = {"run": "run", "calibration": "calibration"}
+
+
+@pytest.fixture
+def place(lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with copies of a run and of its calibration."""
+    for name in ("run", "calibration"):
+        lab.copy(name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def taken(tables: dict[str, Any], output: str = "out", **options: Any) -> list[bool]:
+    """Run a session; for each step whether it was finished before."""
+    done = ms.run(tables, output, pictures=False, **options)
+    return [step.left_alone for step in done.steps]
+
+
+def test_arguments_are_not_changed(place: Path) -> None:
+    """Neither tables nor values, by `run`, `open_bench` and requests. (Planted: tables that are not copied.)"""
+    tables: dict[str, Any] = {
+        "reconstruct": [{**IMAGE}],
+        "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}],
+    }
+    values = {"reconstruct.0.lambda": 10.0, "reconstruct.0.bounds": [0.0, 1.0], "reconstruct.0.method": "nonnegative"}
+    before = copy.deepcopy((tables, values))
+    ms.run(tables, "one", values, pictures=False)
+    assert (tables, values) == before
+    ms.run(tables, "two", pictures=False)
+    results = [json.loads((place / name / "image" / "result.json").read_text()) for name in ("one", "two")]
+    assert [each["inputs"]["lambda"] for each in results] == [10.0, "auto"]
+
+
+def test_mappings_of_public_functions_are_not_changed(place: Path) -> None:
+    """Every public call that takes mappings leaves them as they were. (Planted: `more` that takes checksums in.)"""
+    shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
+    image = ms.reconstruct(shots, factors)
+    stages, more, effects = {"read": 1.0, "total": 2.0}, {"note": {"a": [1]}}, {"diffraction": False}
+    options = {"lam": 10.0, "method": "tikhonov"}
+    given = stages, more, effects, options
+    before = copy.deepcopy(given)
+    ms.Clock().add(stages)
+    ms.Clock().predict(stages)
+    image.save("image", more=more)
+    ms.Request.of(effects=effects).with_values(effects=effects)
+    ms.reconstruct(shots, factors, **options)  # type: ignore[arg-type]
+    known = {"patterns": "uniform", "camera": "imx249", "exposure": 0.1, "projector_pixels": 4}
+    np.save("frame.npy", np.full((8, 10), 300, np.uint16))
+    ms.import_frames("frame.npy", "imported", **known)  # type: ignore[arg-type]
+    assert given == before and known["exposure"] == 0.1
+
+
+def test_an_export_is_made_anew_for_other_inputs_and_lost_files(place: Path) -> None:
+    """By the contents of the run, whatever its name, and by its files. (Planted: a folder that is there counts.)"""
+    tables = {"export": [{"format": "png", "run": "run", "output": "pngs", "projector": "mp_cl1"}]}
+    frame = place / "out" / "pngs" / "frames" / "frame_00000.png"
+    assert taken(tables) == [False] and taken(tables, resume=True) == [True]
+    first = frame.read_bytes()
+    frame.unlink()
+    assert taken(tables, resume=True) == [False] and frame.read_bytes() == first
+    channels, metadata = read_frame(place / "run" / "frame_00000.exr")
+    sums = json.loads((place / "run" / "manifest.json").read_text())
+    sums["checksums"]["frame_00000.exr"] = write_frame(
+        place / "run" / "frame_00000.exr", {**channels, "DN": channels["DN"] + np.uint32(1)}, metadata
+    )
+    (place / "run" / "manifest.json").write_text(json.dumps(sums))
+    assert taken(tables, resume=True) == [False] and frame.read_bytes() != first
+    (place / "out" / "pngs" / "mine.txt").write_text("not the session's")
+    frame.unlink()
+    for _ in range(2):  # a second refusal, after the first one, removes nothing either
+        with pytest.raises(ms.MitsimError, match=r"mine\.txt is not the session's"):
+            ms.run(tables, "out", resume=True)
+    assert (place / "out" / "pngs" / "mine.txt").is_file()
+
+
+def test_a_refusal_leaves_what_was_there(place: Path) -> None:
+    """An image that cannot be made anew stays, and so do the session's files. (Planted: removed before the work.)"""
+    tables: dict[str, Any] = {"reconstruct": [{**IMAGE}]}
+    ms.run(tables, "out", pictures=False)
+    before = {path: path.read_bytes() for path in (place / "out").rglob("*") if path.is_file()}
+    tables["reconstruct"][0]["focus"] = "map"  # refused as it works: these dots do not shift
+    with pytest.raises(ms.MitsimError):
+        ms.run(tables, "out", resume=True, pictures=False)
+    assert before == {path: path.read_bytes() for path in (place / "out").rglob("*") if path.is_file()}
+    with pytest.raises(ms.MitsimError):
+        ms.run(tables, "new", pictures=False)
+    assert not (place / "new").exists()
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "exchanged"])
+def test_a_damaged_image_is_noticed(place: Path, call: Callable[..., Any], how: str) -> None:
+    """By report, the file that repeats it, and a session that goes on. (Planted: no checksum in result.json.)"""
+    tables = {"reconstruct": [{**IMAGE}, {**IMAGE, "lambda": 10.0, "output": "other"}]}
+    ms.run(tables, "out", pictures=False)
+    file, right = place / "out" / "image" / "image.exr", (place / "out" / "image" / "image.exr").read_bytes()
+    damaged = {
+        "cut": right[:-40],
+        "flipped": right[:-9] + bytes([right[-9] ^ 1]) + right[-8:],
+        "exchanged": (place / "out" / "other" / "image.exr").read_bytes(),
+    }
+    file.write_bytes(damaged[how])
+    for verb in (("report", file.parent), ("run", "--from", file.parent)):
+        told = call(*verb)
+        assert told.code == 2 and "its checksum differs" in told.err and told.err.count("\n") == 1
+    assert taken(tables, resume=True) == [False, True] and file.read_bytes() == right
+
+
+def test_a_session_is_repeated_elsewhere(place: Path, lab: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By another user, from another folder, when all lies elsewhere. (Planted: whole paths in session.toml.)"""
+    ms.run({"reconstruct": [{**IMAGE}]}, "out", pictures=False)
+    ms.session_of("out/image").save("figure.toml")
+    right = (place / "out" / "image" / "image.exr").read_bytes()
+    away = place / "far" / "colleague"
+    shutil.copytree(place, away, ignore=shutil.ignore_patterns("far"))
+    for name in ("run", "calibration", "out", "figure.toml"):
+        (shutil.rmtree if (place / name).is_dir() else os.unlink)(place / name)
+    (place / "home").mkdir()
+    monkeypatch.setenv("HOME", str(place / "home"))
+    monkeypatch.chdir(place / "home")
+    assert str(place) not in (away / "out" / "session.toml").read_text()
+    ms.run(away / "out" / "session.toml", "again", pictures=False)
+    assert (place / "home" / "again" / "image" / "image.exr").read_bytes() == right
+    assert str(place) not in (away / "figure.toml").read_text().partition("[")[2]
+
+
+KILLED = """
+import os, sys
+from mitsim import cli
+name, rename = sys.argv[1], os.replace
+def replace(source, target):
+    rename(source, target)
+    if str(target).endswith(name):
+        os.kill(os.getpid(), 9)
+os.replace = replace
+sys.argv = ["mitsim", "run", "session.toml", "-o", "out", "--quiet", "--no-pictures"]
+cli.run()
+"""
+
+
+@pytest.mark.parametrize("file", ["image/image.exr", "image/image.png", "out/session.json"])
+def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: str) -> None:
+    """(Planted: a step that was begun does not count as the session's own.)"""
+    (place / "session.toml").write_text('[[reconstruct]]\nrun = "run"\ncalibration = "calibration"\n')
+    environment = {**os.environ, "PYTHONPATH": str(Path(ms.__file__).parents[1])}
+    killed = subprocess.run([sys.executable, "-c", KILLED, file], env=environment, capture_output=True, text=True)
+    assert killed.returncode == -9, killed.stderr
+    assert taken({"reconstruct": [{**IMAGE}]}, resume=True) == [False]
+    ms.run({"reconstruct": [{**IMAGE}]}, "whole", pictures=False)
+    assert (place / "out/image/image.exr").read_bytes() == (place / "whole/image/image.exr").read_bytes()
+    assert not [*(place / "out").rglob(".*")]
+
+
+def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
+    """Of the same inputs; others are refused, and the page of an unfinished image is. (Planted: no head before it.)"""
+    shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
+    image = ms.reconstruct(shots, factors)
+    image.save("image")
+    result = json.loads((place / "image" / "result.json").read_text())
+    (place / "image" / "result.json").write_text(json.dumps({"status": "incomplete", "inputs": result["inputs"]}))
+    with pytest.raises(ms.MitsimError, match="no result of a finished image"):
+        ms.report_folder("image")
+    with pytest.raises(ms.MitsimError, match="holds an image of other inputs"):
+        ms.reconstruct(shots, factors, 10.0).save("image")
+    image.save("image")
+    assert json.loads((place / "image" / "result.json").read_text())["checksums"].keys() >= {"image.exr", "image.png"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"warnings": 3},
+        {"seconds": "x"},
+        {"left_alone": {}},
+        {"output": None},
+    ],
+)
+def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change: dict[str, Any]) -> None:
+    """(Planted: entries that are taken as they are.)"""
+    tables = {"reconstruct": [{**IMAGE}]}
+    ms.run(tables, "out", pictures=False)
+    held = json.loads((place / "out" / "session.json").read_text())
+    for damaged in ({**held, "steps": [{**held["steps"][0], **change}]}, {**held, "made": change}):
+        (place / "out" / "session.json").write_text(json.dumps(damaged))
+        with pytest.raises(ms.MitsimError) as refused:
+            ms.run(tables, "out", resume=True)
+        assert len(str(refused.value).splitlines()) == 1 and "session.json" in str(refused.value)
+
+
+def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
+    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests alone.)"""
+    frame = place / "run" / "frame_00003.exr"
+    shutil.copytree(place / "run", place / "good")
+    frame.write_bytes(frame.read_bytes()[:-5])
+    good = {**IMAGE, "run": "good"}
+    for step, words in (
+        ({"reconstruct": [good, {**IMAGE, "output": "b"}]}, "checksum differs"),
+        ({"reconstruct": [good, {**good, "output": "b", "focus": 1e-3}]}, "focus"),
+        ({"reconstruct": [good, {**good, "output": "b", "margin": 900}]}, "margin"),
+        ({"reconstruct": [good], "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}]}, "checksum differs"),
+        ({"reconstruct": [good], "export": [{"format": "png", "run": "good", "output": "p", "projector": "no"}]}, "no"),
+        ({"reconstruct": [good], "study": [{"name": "no such"}]}, "no such"),
+    ):
+        with pytest.raises(ms.MitsimError) as refused:
+            ms.run(step, "out", pictures=False)
+        assert words in str(refused.value) and not (place / "out").exists(), step
