@@ -1,10 +1,11 @@
 """Specular chains: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors
-alone.
+alone, or over nothing.
 
-A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
-projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel.
-Four neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are
-divided until the map from the projector's window to the sensor is bilinear over each.
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it; nor does one find a
+projector in view, through a hole or beside a card. Such light is traced from the projector instead
+(:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel. Four neighbours that
+met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided until the map
+from the projector's window to the sensor is bilinear over each.
 :mod:`mitsim.optics.mirror_frames` turns beams into frames.
 
 Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
@@ -27,9 +28,10 @@ from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
+from mitsim.transport.connect import shines_in
 from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
-from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, SpecularRays, delta_bsdfs, grazing
+from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, SpecularRays, grazing
 
 _UNIT = 2**24
 """Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
@@ -45,6 +47,8 @@ _AT_ONCE = 2**18
 """Squares that are looked at together, some hundreds of MB."""
 _COARSE = 128
 """Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
+_ACROSS_SENSOR = 128
+"""Rays across a sensor that the projector shines on over no mirror: a hole that lights a 128th of it is seen."""
 _TOLERANCE = 0.02
 """Largest departure from a bilinear map, in sensor pixels: twice what float32 leaves of a place at the sensor."""
 _SHADES = 0.01
@@ -67,14 +71,9 @@ _MARGIN = 0.02
 """Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
 
-def has_mirrors(scene: mi.Scene) -> bool:
-    """Whether some surface of the ``scene`` reflects or refracts like a perfect mirror or lens."""
-    return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
-
-
 @keep_scenes()
 def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
-    """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
+    """All beams that leave the projector, meet perfect mirrors or lenses alone, or nothing, and reach the sensor.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
 
@@ -94,21 +93,29 @@ def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: Project
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
-    if not has_mirrors(scene):
-        return _join([], np.zeros(2))
+    seen = shines_in(scene, camera, projector.emitter)
     parts, left = [], np.zeros(2)
     for each in projector.per_wavelength:
-        beams, lost = _projector_beams(SpecularRays(scene, camera, each, max_depth), projector.n, camera.geometry)
+        tracer = SpecularRays(scene, camera, each, max_depth)
+        beams, lost = _projector_beams(tracer, projector.n, camera.geometry, seen)
         parts += beams
         left += lost
     return _join(parts, left)
 
 
-def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
-    """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
+def _projector_beams(
+    tracer: SpecularRays, n: int, geometry: CameraGeometry, seen: bool
+) -> tuple[list[Beams], FloatArray]:
+    """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance; the sensor
+    is looked for finely where it has ``seen`` the projector."""
+    if not (tracer.mirrors or seen):
+        return [], np.zeros(2)
     step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
     parts, left = [], np.array([close, 0.0])
+    if seen:
+        sides = np.array([geometry.half_width]), np.array([2 * geometry.half_width / _ACROSS_SENSOR])
+        arcs.append(_window_boxes(_Spots(tracer.camera_place[None], *sides), tracer.rays, _UNIT))
     for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS, arcs):
         for first in range(0, len(row), _AT_ONCE):
             chosen = slice(first, first + _AT_ONCE)

@@ -50,7 +50,7 @@ def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Rays that crossed the sensor plane from the front after at least one mirror; one ray may arrive several times.
+    """Rays that crossed the sensor plane from the front, over mirrors or none; one ray may arrive several times.
 
     Attributes
     ----------
@@ -161,14 +161,13 @@ class SpecularRays:
         reach = np.full(len(ahead), np.inf)
         np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
         arrived = ahead & (reach < distance)
-        turned = arrived & (rays.chain != 0)
-        o, d, r = origin[turned], direction[turned], reach[turned, None]
+        o, d, r = origin[arrived], direction[arrived], reach[arrived, None]
         crossing = Crossings(
-            rays.index[turned],
-            rays.chain[turned],
+            rays.index[arrived],
+            rays.chain[arrived],
             _rows_columns(o + d * r),
             _rows_columns(d / d[:, 2:]),
-            rays.spectrum[turned] @ self._colour,
+            rays.spectrum[arrived] @ self._colour,
         )
         return crossing, arrived
 
