@@ -147,7 +147,9 @@ class Hidden:
         """What lands on matt rectangles after a turn, by the rectangle's number: (2 sides, squares, squares)."""
         way = ways / np.linalg.norm(ways, axis=1, keepdims=True)
         found: dict[int, Array] = {}
-        batch = [(np.broadcast_to(origin, way.shape), way, weight, np.zeros(len(way), bool), np.full(len(way), weight.max()))]
+        batch = [
+            (np.broadcast_to(origin, way.shape), way, weight, np.zeros(len(way), bool), np.full(len(way), weight.max()))
+        ]
         for _ in range(DEPTH):
             following = []
             for at, to, light, turned, unit in batch:
@@ -176,7 +178,9 @@ class Hidden:
                     other = np.sqrt(np.maximum(inside, 0))
                     bent = d / eta[:, None] + (np.abs(cosine) / eta - other)[:, None] * facing
                     c = np.abs(cosine)
-                    part = (((c - eta * other) / (c + eta * other)) ** 2 + ((eta * c - other) / (eta * c + other)) ** 2) / 2
+                    part = (
+                        ((c - eta * other) / (c + eta * other)) ** 2 + ((eta * c - other) / (eta * c + other)) ** 2
+                    ) / 2
                     part = np.where(inside > 0, part, 1.0)
                     after = turned[own] | (shape.material == "glass")
                     following.append((place, mirror, light[own] * part, np.ones(own.sum(), bool), unit[own]))
@@ -206,16 +210,27 @@ def pane(z: float, half: float, thickness: float = 6.0) -> tuple[Shape, Shape]:
 WALL, SIDE = rectangle("matt", 0, 430, 130), rectangle("mirror", -40, 315, 100, 90.0)
 """A wall across the view, and a mirror along it, as in the unit tests of light that is left out."""
 SCENES = {
-    "own mirror": Hidden((rectangle("mirror", 25, 400, 30, 215), rectangle("matt", -50, 400, 60, 150)), (90, 0, 0), (25, 0, 400), 8),
+    "own mirror": Hidden(
+        (rectangle("mirror", 25, 400, 30, 215), rectangle("matt", -50, 400, 60, 150)), (90, 0, 0), (25, 0, 400), 8
+    ),
     "mirror along a wall": Hidden((WALL, SIDE)),
     "another mirror": Hidden((WALL, SIDE, rectangle("mirror", 70, 315, 100, -90.0))),
-    "mirror ball, in a mirror": Hidden((WALL, rectangle("mirror", 70, 315, 100, -90.0), ball("mirror", -20, 330, 20)), target=(-20, 0, 330), fov=6),
+    "mirror ball, in a mirror": Hidden(
+        (WALL, rectangle("mirror", 70, 315, 100, -90.0), ball("mirror", -20, 330, 20)), target=(-20, 0, 330), fov=6
+    ),
     "in a mirror ball": Hidden((WALL, SIDE, ball("mirror", 40, 330, 25))),
     "glass ball, in itself": Hidden((WALL, ball("glass", 0, 330, 30)), target=(0, 0, 330), fov=10),
-    "glass ball, in a mirror ball": Hidden((WALL, ball("glass", -20, 350, 20), ball("mirror", 40, 340, 20)), target=(-20, 0, 350), fov=8),
+    "glass ball, in a mirror ball": Hidden(
+        (WALL, ball("glass", -20, 350, 20), ball("mirror", 40, 340, 20)), target=(-20, 0, 350), fov=8
+    ),
     "through a glass ball": Hidden((WALL, SIDE, ball("glass", 0, 300, 25))),
-    "twice reflected": Hidden((WALL, rectangle("mirror", -60, 330, 60, 90.0), rectangle("mirror", 60, 330, 60, -90.0)), (0, 0, 0), (-60, 0, 250), 8),
+    "twice reflected": Hidden(
+        (WALL, rectangle("mirror", -60, 330, 60, 90.0), rectangle("mirror", 60, 330, 60, -90.0)),
+        (0, 0, 0),
+        (-60, 0, 250),
+        8,
+    ),
     "through a pane": Hidden((WALL, SIDE, rectangle("mirror", 70, 315, 100, -90.0), *pane(200, 160))),
     "in a small mirror": Hidden((WALL, SIDE, rectangle("mirror", 40, 330, 8, -97.0))),
-}  # fmt: skip
+}
 """By name: what is seen, and where."""
