@@ -97,12 +97,11 @@ def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
         )
     lens = bench.projector.aperture_radius_mm
     if lens and bench.loaded.in_view and not {"aperture", "mirrors"} & set(off):
-        camera = bench.loaded.camera.world_transform()
-        depth = math.dist(turn_and_origin(camera)[1], bench.projector_optics.canvas_map.origin)
+        camera = turn_and_origin(bench.loaded.camera.world_transform())[1]
+        blur = 2 * lens * geometry.mask_distance / math.dist(camera, bench.projector_optics.canvas_map.origin)
         yield (
-            f"the projector shines on the sensor itself as a pinhole, without its lens, which would blur the mask's "
-            f"shadow by {2 * lens * geometry.mask_distance / depth:.2g} mm; keep it out of the view, or set "
-            "aperture_radius_mm to 0"
+            "the projector shines on the sensor itself as a pinhole, without its lens, which would blur the mask's "
+            f"shadow by {blur:.2g} mm; keep it out of the view, or set aperture_radius_mm to 0"
         )
     if bench.field_stop_cuts:
         yield (

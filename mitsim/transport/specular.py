@@ -477,6 +477,7 @@ def first_squares(
     spots = [(low, high, np.maximum(step, _DIVISIONS)) for low, high, step in spots]
     none = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
     low, high, step = (np.concatenate(parts) for parts in zip(none, *spots, *more, strict=True))
+    low, high = (np.clip(ends, -1.0, n * _UNIT) for ends in (low, high))  # what is beside the window may be far
     while len(row):
         small = step < size
         low, high, step = low[small], high[small], step[small]

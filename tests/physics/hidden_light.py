@@ -189,7 +189,7 @@ class Hidden:
             for ray in following:
                 kept = ray[2] > FAINTEST * ray[4]
                 if kept.any():
-                    batch.append(tuple(part[kept] for part in ray))  # type: ignore[arg-type]
+                    batch.append(tuple(part[kept] for part in ray))
         return found
 
 

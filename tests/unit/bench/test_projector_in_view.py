@@ -1,4 +1,4 @@
-"""A projector that shines on the sensor itself is in the frame, or the run is flagged; so is a frame that nobody knows."""
+"""A projector that shines on the sensor itself is in the frame, or the run is flagged; so is a frame of one path."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,9 +15,13 @@ from mitsim.planner.explain import SceneFacts
 @pytest.fixture
 def facing(small_scene: Callable[..., Path]) -> Path:
     """A projector on the camera's axis, 800 mm away, that faces the sensor past a small sheet."""
-    path = small_scene(mask="open", projector_turn='<rotate y="1" angle="180"/><translate x="-60" z="800"/>', sheet_z=300)
+    path = small_scene(
+        mask="open", projector_turn='<rotate y="1" angle="180"/><translate x="-60" z="800"/>', sheet_z=300
+    )
     text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace('<scale x="64" y="64"/>', '<scale x="2" y="2"/> <translate x="20"/>'), encoding="utf-8")
+    path.write_text(
+        text.replace('<scale x="64" y="64"/>', '<scale x="2" y="2"/> <translate x="20"/>'), encoding="utf-8"
+    )
     return path
 
 
