@@ -30,7 +30,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
 from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
-from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, Rays, SpecularRays, grazing, joined
+from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, Rays, SpecularRays, grazing, join
 
 _UNIT = 2**24
 """Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
@@ -136,10 +136,10 @@ def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOp
         for size, row, column in first_squares(tracer.mirrors, tracer.rays, each.n, _TURNED):
             turned = list[Rays]()
             tracer.follow((np.stack([row, column], axis=1) + size / 2) / _UNIT, turned)
-            rays, area = joined(turned), tracer.rays.area * (size / _UNIT) ** 2
+            rays, area = join(turned), tracer.rays.area * (size / _UNIT) ** 2
             flux = _fluxes(tracer, row, column, size, each.n)[rays.index] * (rays.spectrum @ tracer.colour)
             parts.append(replace(rays, spectrum=np.stack([flux, flux / area], axis=1)))
-    return joined(parts)
+    return join(parts)
 
 
 def _search(

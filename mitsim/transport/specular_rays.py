@@ -99,7 +99,7 @@ class Rays:
 Some = TypeVar("Some", Crossings, Rays)
 
 
-def joined(parts: Sequence[Some]) -> Some:
+def join(parts: Sequence[Some]) -> Some:
     """All of one or more ``parts`` in one."""
     return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
@@ -164,8 +164,8 @@ class SpecularRays:
             onward = self._bounce(rays, si, met)
             if not onward:
                 break
-            rays = joined(onward)
-        return joined(crossings)
+            rays = join(onward)
+        return join(crossings)
 
     def _intersect(self, rays: Rays) -> mi.SurfaceInteraction3f:
         ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
