@@ -16,7 +16,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from io import FileIO
 from pathlib import Path
@@ -224,7 +224,7 @@ def checked_hdf5(
     """
     import h5py
 
-    allowed = h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32
+    allowed = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
     state, found, known = check_plain(path, what), 0, set() if known is None else known
     mark = path, state.st_ino, state.st_size, state.st_mtime_ns
 
@@ -240,29 +240,25 @@ def checked_hdf5(
             if isinstance(item, h5py.Group):
                 yield from look(item, depth + 1)
             elif isinstance(item, h5py.Dataset) and item.shape is not None:
-                if item.is_virtual or item.external:
-                    raise MitsimError(f"{place} lies in another file; write the data themselves into the file")
                 filters, chunk, kind = item.id.get_create_plist(), item.chunks, item.dtype
                 used = [filters.get_filter(index)[0] for index in range(filters.get_nfilters())]
-                if not {*used} <= {*allowed} or len({*used}) < len(used):
-                    raise MitsimError(f"{place} is packed by filters other than gzip, or twice; write it again")
+                pieces = math.prod(-(-side // part) for side, part in zip(item.shape, chunk or item.shape, strict=True))
                 # What was never stored is read as the fill value: black frames, of any size.
-                if chunk is None:
-                    stored = item.id.get_storage_size() >= item.nbytes
-                else:
-                    wanted = math.prod(-(-side // part) for side, part in zip(item.shape, chunk, strict=True))
-                    stored = item.id.get_num_chunks() == wanted
-                    if math.prod(chunk) * kind.itemsize > _MOST_CHUNK:
-                        raise MitsimError(f"{place} is stored in pieces of over 256 MiB; write it again")
-                if not stored:
-                    raise MitsimError(f"{place} claims {item.shape}, of which not all is stored; write it again")
+                stored = item.id.get_num_chunks() == pieces if chunk else item.id.get_storage_size() >= item.nbytes
+                wrong = {
+                    "lies in another file": item.is_virtual or item.external,
+                    "is packed by filters other than gzip, or twice": {*used} - allowed or len({*used}) < len(used),
+                    "is stored in pieces of over 256 MiB": math.prod(chunk or ()) * kind.itemsize > _MOST_CHUNK,
+                    f"claims {item.shape}, of which not all is stored": not stored,
+                }
+                for reason in filter(wrong.get, wrong):
+                    raise MitsimError(f"{place} {reason}; write the data themselves into the file")
                 # Each text of a dataset may be the whole file.
                 yield copies(item) * item.size * (state.st_size if kind.hasobject else kind.itemsize)
 
-    with hdf5_errors(path):
-        file = h5py.File(path, "r")
-    with file:
+    with ExitStack() as stack:
         with hdf5_errors(path):
+            file = stack.enter_context(h5py.File(path, "r"))
             if mark not in known:
                 Cost(memory_bytes=sum(look(file, 1))).check(f"{what} {path}", Limits())
                 known.add(mark)

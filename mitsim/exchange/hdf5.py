@@ -6,7 +6,7 @@ The layout stands in docs/exchange.md. Shots are chunks of their own, so that on
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -247,7 +247,7 @@ def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
                 stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **PACKED)
             stacks[name][index] = values
         metadata.append(json.dumps(dict(known)))
-    group.create_dataset("metadata", data=np.array(metadata, dtype=object), dtype=_strings())
+    group.create_dataset("metadata", data=metadata)
     group.create_dataset("pattern", data=np.array([(shot.row, shot.column, shot.sign) for shot in captures], np.int32))
     group["pattern"].attrs["columns"] = "column of P_L from 0, column of P_R from 0, sign"
     for name, matrix in zip(("P_L", "P_R"), run.manifest.patterns.matrices, strict=True):
@@ -257,13 +257,7 @@ def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
 def _write_frame(group: h5py.Group, channels: Channels, metadata: Metadata) -> None:
     for name, values in channels.items():
         group.create_dataset(name, data=values, **PACKED)
-    group.create_dataset("metadata", data=np.array([json.dumps(dict(metadata))], dtype=object), dtype=_strings())
-
-
-def _strings() -> Any:
-    import h5py
-
-    return h5py.string_dtype("utf-8")
+    group.create_dataset("metadata", data=[json.dumps(dict(metadata))])
 
 
 def _run_in(file: h5py.File, path: Path) -> Run:
@@ -366,16 +360,17 @@ def _metadata(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
     return known
 
 
-def _group(parent: h5py.Group, name: str, path: Path) -> h5py.Group:
-    import h5py
-
-    return _inside(parent, name, h5py.Group, path)
+def _group(parent: h5py.Group, name: str, path: Path, kind: str = "Group") -> Any:
+    """Return the item ``name`` of a group, of that ``kind``."""
+    item = parent.get(name)
+    if type(item).__name__ != kind:
+        what = "is missing" if item is None else f"is no {kind.lower()}"
+        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {what}; export it again")
+    return item
 
 
 def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
-    import h5py
-
-    dataset = _inside(parent, name, h5py.Dataset, path)
+    dataset = _group(parent, name, path, "Dataset")
     if dataset.shape is None:
         raise MitsimError(f"{path}: {dataset.name} is empty; export it again")
     if not fits_a_frame(dataset.shape[1:]):
@@ -387,13 +382,3 @@ def _whole(dataset: h5py.Dataset, path: Path) -> Any:
     """All of a ``dataset``; MitsimError where that takes more memory than is free."""
     Cost(memory_bytes=dataset.nbytes).check(f"{path}: {dataset.name}", Limits())
     return dataset[()]
-
-
-def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path) -> Any:
-    """Return the item ``name`` of a group, of that ``kind``."""
-    if name not in parent:
-        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} is missing; export it again")
-    item = parent[name]
-    if not isinstance(item, kind):  # type: ignore[arg-type]
-        raise MitsimError(f"{path}: {item.name} is a {type(item).__name__.lower()}; export it again")
-    return item

@@ -49,7 +49,8 @@ class LoadedScene:
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
     side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
-    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
+    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths; ``unread`` are
+    names of materials that meshes refer to, by the mesh's path.
     """
 
     path: Path
@@ -71,6 +72,7 @@ class LoadedScene:
     one_way: bool = False
     sensor_note: str | None = None
     own: Mapping[str, str] = field(default_factory=dict)
+    unread: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -167,6 +169,7 @@ def load_scene(
         _faces_one_way(scene),
         sensor_note,
         checked.own,
+        checked.unread,
     )
 
 
@@ -289,12 +292,13 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             held = str(parameters.properties[key][2])
             if mi.is_spectral and (last.endswith("_color") or ("raw = 0" in held and values.shape[-1] == 3)):
                 continue  # coefficients of smooth spectra in Mitsuba's model: of any, they lie within 0 and 1
-            file = re.search(r'name = "([^"]*)"', held) if last == "data" else None
+            file = re.search(r'name = "([^"]*)"', held)
+            named = file[1] if file else name
             # Mitsuba calls a texture by its parameter, and one that is referenced by a number.
-            limit = limits.get(file[1] if file else last) or limits.get(name.rpartition(".")[2], _ANY)
+            limit = limits.get(named if last == "data" else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place_of_wrong(key, values, wrong, file[1] if file else key)
+                place = _place_of_wrong(key, values, wrong, named)
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
 
@@ -302,9 +306,7 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
 def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
     """What holds the first wrong number, and where."""
     at = np.argwhere(wrong)[0]
-    name, _, last = key.rpartition(".")
     if values.ndim != 3:
-        return f"mesh {name}: number {at[0]} of its {last} is {values[tuple(at)]:g}"
-    texel = f"{name.rpartition('.')[2]} of the texel in row {at[0]}, column {at[1]}"
+        return f"mesh {file}: number {at[0]} of its {key.rpartition('.')[2]} is {values[tuple(at)]:g}"
     count = int(wrong.any(axis=2).sum())
-    return f"bitmap {file}: {texel} is {values[tuple(at)]:g} ({count} such texels)"
+    return f"bitmap {file}: the texel in row {at[0]}, column {at[1]} is {values[tuple(at)]:g} ({count} such texels)"
