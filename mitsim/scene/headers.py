@@ -38,9 +38,9 @@ _PLY_TYPES = {
 _CORNERS, _INDICES = "corner count", "corner indices"
 """A triangle's list as fields of an array: names with a blank, which no property has."""
 _LINE = re.compile(
-    rb"f\s+(?P<face>(?:[1-9][0-9]{0,8}(?:/[0-9]{0,9}){0,2}(?:\s+|$)){3,})(?:#.*)?|v\s+(?P<vertex>\S+\s+\S+\s+\S+)(?:\s[^\r]*)?|(?P<normal>vn)\s"
-    rb"[^\r]*|(?:mtllib|usemtl)\s+(?P<material>[^\r]*)|(?:g|l|o|p|s|vt|bevel|[cd]_interp|lod|maplib|mg|usemap|shadow_obj|"
-    rb"trace_obj)(?:\s[^\r]*)?|#[^\r]*|"
+    rb"f\s+(?P<face>(?:[1-9][0-9]{0,8}(?:/[0-9]{0,9}){0,2}(?:\s+|$)){3,})(?:#.*)?|"
+    rb"v\s+(?P<vertex>\S+\s+\S+\s+\S+)(?:\s[^\r]*)?|(?P<normal>vn)\s[^\r]*|(?:mtllib|usemtl)\s+(?P<material>[^\r]*)|#[^\r]*|"
+    rb"(?:g|l|o|p|s|vt|bevel|[cd]_interp|lod|maplib|mg|shadow_obj|trace_obj|usemap)(?:\s[^\r]*)?|"
 )
 """Lines of Wavefront files that are read, or do not change a mesh: faces of three or more corners, each the number of a
 vertex, of its place in textures and of its normal; but no free-form surfaces (Wavefront, "Object Files")."""
@@ -58,6 +58,8 @@ def check_image(path: Path) -> tuple[int, bool]:
         start = file.read(_HEADER)
     if start.startswith(exr.MAGIC):
         header = exr.read_header(path)
+        if header.types > 1:
+            raise ValueError("has channels of several types, which Mitsuba rounds to that of one; save all as float")
         width, height, grey = header.width, header.height, header.channels < 3
     elif start.startswith(b"#?"):
         # The first line that Mitsuba could take for the size.
