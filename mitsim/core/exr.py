@@ -225,12 +225,11 @@ _MOST_CHANNELS = 64
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """Size in pixels, number of channels and number of their types (half, float, uint) of a plain scan-line image."""
+    """Size in pixels and number of channels of a plain scan-line image."""
 
     width: int
     height: int
     channels: int
-    types: int
 
 
 def read_header(path: Path) -> ExrHeader:
@@ -282,4 +281,4 @@ def read_header(path: Path) -> ExrHeader:
         smallest = max(smallest - _SMALL, 0) // _LARGEST_RATIO
     if decoded > _MOST_BYTES or smallest >= size:
         raise ValueError(f"claims {width}x{height} pixels of {len(channels)} channels, more than its {size} bytes hold")
-    return ExrHeader(width, height, len(channels), len({channel.type() for channel in channels}))
+    return ExrHeader(width, height, len(channels))

@@ -58,8 +58,6 @@ def check_image(path: Path) -> tuple[int, bool]:
         start = file.read(_HEADER)
     if start.startswith(exr.MAGIC):
         header = exr.read_header(path)
-        if header.types > 1:
-            raise ValueError("has channels of several types, which Mitsuba rounds to that of one; save all as float")
         width, height, grey = header.width, header.height, header.channels < 3
     elif start.startswith(b"#?"):
         # The first line that Mitsuba could take for the size.
