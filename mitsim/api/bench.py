@@ -69,10 +69,8 @@ def open_bench(
         mask of the scene's where the camera file has one.
     """
     opened = open_apparatus(scene, variant, camera, projector, allow_outside_files, for_render, **parameters)
-    own = "are not read; it has the scene's material"
-    materials = (f"mesh {mesh}: its materials ({name}) {own}" for mesh, name in opened.loaded.unread.items() if name)
-    for note in filter(None, (opened.loaded.sensor_note, *materials)):
-        warnings.warn(note, stacklevel=3)  # of who called: check_arguments stands between
+    if opened.loaded.sensor_note:
+        warnings.warn(opened.loaded.sensor_note, stacklevel=3)  # of who called: check_arguments stands between
     return Bench(**vars(opened))
 
 

@@ -199,9 +199,7 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def checked_hdf5(
-    path: Path, what: str, copies: Callable[[h5py.Dataset], float], known: set[object] | None = None
-) -> Iterator[h5py.File]:
+def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading after all that it holds was checked; every HDF5 input is opened here.
 
     HDF5 follows links to other files, unpacks what claims to be a thousand times larger (a million times by two
@@ -209,10 +207,10 @@ def checked_hdf5(
 
     Parameters
     ----------
-    path, what
-        of the file, and its name in messages.
+    path
+        of the file.
     copies
-        bytes of memory that the caller takes for each byte of a dataset; 0 for one that it checks itself.
+        bytes of memory that the caller takes for each byte of an h5py.Dataset; 0 for one that it checks itself.
     known
         marks of files that were checked and have not changed since, which are not checked again; the file is added.
 
@@ -225,7 +223,7 @@ def checked_hdf5(
     import h5py
 
     allowed = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
-    state, found, known = check_plain(path, what), 0, set() if known is None else known
+    state, found, known = check_plain(path), 0, set() if known is None else known
     mark = path, state.st_ino, state.st_size, state.st_mtime_ns
 
     def look(group: h5py.Group, depth: int) -> Iterator[float]:
@@ -260,7 +258,7 @@ def checked_hdf5(
         with hdf5_errors(path):
             file = stack.enter_context(h5py.File(path, "r"))
             if mark not in known:
-                Cost(memory_bytes=sum(look(file, 1))).check(f"{what} {path}", Limits())
+                Cost(memory_bytes=sum(look(file, 1))).check(f"file {path}", Limits())
                 known.add(mark)
         yield file
 

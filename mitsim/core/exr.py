@@ -267,9 +267,8 @@ def read_header(path: Path) -> ExrHeader:
     if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
         raise ValueError(f"claims {width}x{height} pixels; 1 to {MOST_SIDE} a side are allowed")
     if (left, top) != (0, 0) or window != shown:
-        data, whole = ("{}, {} to {}, {}".format(*corners) for corners in (window, shown))
         raise ValueError(
-            f"its data window is {data}, its display window {whole}; save it with both from 0, 0 and equal"
+            f"its data window is {window}, its display window {shown}; save it with both from 0, 0 and equal"
         )
     if not 0 < len(channels) <= _MOST_CHANNELS:
         raise ValueError(f"has {len(channels)} channels; 1 to {_MOST_CHANNELS} are allowed")

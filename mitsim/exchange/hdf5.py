@@ -137,7 +137,7 @@ def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFil
 def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
     """The folders in the file ``path``, coloured or not, while the context lasts. MitsimError as :func:`open_hdf5`."""
     path = Path(path)
-    with checked_hdf5(path, "file", lambda _: 0.0) as file:  # _whole checks what is read at once
+    with checked_hdf5(path, lambda _: 0.0) as file:  # _whole checks what is read at once
         with hdf5_errors(path):
             layout = file.attrs.get("mitsim_exchange")
             if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
@@ -183,7 +183,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
         held = dataset.name.count("/") > 1 or dataset.dtype.kind not in "uif" or "MATLAB_empty" in dataset.attrs
         return "" if held else bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
 
-    with hdf5_errors(path), checked_hdf5(path, "file", lambda each: 2.0 * (kind(each) in _CLASSES)) as file:
+    with hdf5_errors(path), checked_hdf5(path, lambda each: 2.0 * (kind(each) in _CLASSES)) as file:
         for name in file:
             # Groups are structures, sparse matrices, or what cells refer to.
             if isinstance(file[name], h5py.Dataset) and (known := kind(file[name])) in _CLASSES:
@@ -340,9 +340,8 @@ def _text_in(group: h5py.Group, name: str, path: Path) -> str:
 
 
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
-    names = [name for name in group if name != "metadata"]
-    arrays = {name: _dataset(group, name, path) for name in names}
-    channels = {name: as_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()}
+    arrays = {name: _dataset(group, name, path) for name in group if name != "metadata"}
+    channels = {name: as_channel(_whole(array, path), array.name, path) for name, array in arrays.items()}
     return channels, _metadata(_dataset(group, "metadata", path), 0, path)
 
 

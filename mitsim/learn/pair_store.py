@@ -336,7 +336,7 @@ def is_shard(path: Path, digest: str, count: int) -> bool:
 def _open_shard(path: Path, known: set[object] | None = None) -> AbstractContextManager[h5py.File]:
     """Open the shard ``path``: its light is read as a whole, and of the pairs' pictures and frames one row."""
     rows = {"/picture", "/truth", "/expected", "/lamps"}
-    return checked_hdf5(path, "pairs", lambda each: 1 / max(each.shape[0], 1) if each.name in rows else 1.0, known)
+    return checked_hdf5(path, lambda each: 1 / max(each.shape[0], 1) if each.name in rows else 1.0, known)
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,7 +109,7 @@ def read_light(path: Path, bench: Apparatus) -> SampledLight:
     MitsimError
         for a file that cannot be read or is none of light, and light of another bench or version of mitsim.
     """
-    with hdf5_errors(path), checked_hdf5(path, "light", lambda _: _COPIES) as file:
+    with hdf5_errors(path), checked_hdf5(path, lambda _: _COPIES) as file:
         if _KEPT not in file:
             raise MitsimError(f"light {path}: is no file of this version's `mitsim transport`; trace it again")
         kept, count = file[_KEPT], bench.n**2

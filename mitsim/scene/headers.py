@@ -109,20 +109,19 @@ def check_obj(path: Path) -> tuple[bool, str]:
     """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
-    vertices, fans, normals, faces, material = list[list[bytes]](), array("q"), False, False, b""
+    vertices, fans, normals, material = list[list[bytes]](), array("q"), False, b""
     with open(path, "rb") as file:
         for number, line in enumerate(map(bytes.strip, file), 1):
             found = _LINE.fullmatch(line)
             if not found or line.endswith(b"\\"):
                 rule = "no line may end in a backslash, and faces have three or more corners, which count from 1"
-                raise ValueError(
-                    f"has a line that is not understood, {number} ({cut(line.decode('latin-1'))!r}); {rule}"
-                )
+                shown = cut(line.decode("latin-1"))
+                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}")
             if found["vertex"]:
                 vertices.append(found["vertex"].split())
             elif found["face"]:
-                corners, faces = [int(corner.partition(b"/")[0]) - 1 for corner in found["face"].split()], True
-                for after, before in pairwise(corners[1:] if len(corners) > 3 else ()):
+                corners = [int(corner.partition(b"/")[0]) - 1 for corner in found["face"].split()]
+                for after, before in pairwise(corners[1:]):
                     fans.extend((number, corners[0], after, before))
             normals, material = normals or bool(found["normal"]), material or found["material"] or b""
     try:
@@ -130,34 +129,22 @@ def check_obj(path: Path) -> tuple[bool, str]:
     except ValueError:
         raise ValueError("holds vertices that are not three numbers; export the mesh again") from None
     _check_points(points)
-    if not faces:
+    if not fans:
         raise ValueError("has no faces: it is a cloud of points; export a mesh")
-    _check_fans(points, np.frombuffer(fans, np.int64).reshape(-1, 4))
-    return normals, material.decode("utf-8", "replace")
-
-
-def _check_fans(points: npt.NDArray[np.float64], fans: npt.NDArray[np.int64]) -> None:
-    """Refuse faces that a fan of triangles does not cover as it is meant.
-
-    Parameters
-    ----------
-    points
-        (vertices, 3) coordinates [mm].
-    fans
-        (triangles, 4) line of the face, and its three corners.
-    """
-    if fans[:, 1:].max(initial=-1) >= len(points):
-        raise ValueError(f"has faces with vertex {fans[:, 1:].max() + 1}, but {len(points)} vertices; mend the mesh")
-    first, after, before = (points[corner] for corner in fans[:, 1:].T)
+    lines, *corner = np.frombuffer(fans, np.int64).reshape(-1, 4).T
+    if np.max(corner) >= len(points):
+        raise ValueError(f"has faces with vertex {np.max(corner) + 1}, but {len(points)} vertices; mend the mesh")
+    first, after, before = points[np.array(corner)]
     areas = np.cross(after - first, before - first)  # vectors, twice as long as a triangle is large
-    lines, face = np.unique(fans[:, 0], return_inverse=True)
+    lines, face = np.unique(lines, return_inverse=True)
     whole = np.stack([np.bincount(face, along, len(lines)) for along in areas.T], axis=1)
     size, sums = np.square(whole).sum(axis=1), np.bincount(face, np.linalg.norm(areas, axis=1), len(lines))
     turned = lines[face[(areas * whole[face]).sum(axis=1) < -_TURNED * size[face]]]
     bent = lines[sums > (1 + _BENT) * np.sqrt(size)]
     for wrong, why in ((turned, "is concave, or crosses itself"), (bent, "lies in no plane")):
         if wrong.size:
-            raise ValueError(f"has a face of over three corners that {why}, in line {wrong[0]}; triangulate the mesh")
+            raise ValueError(f"has a face that {why}, in line {wrong[0]}; triangulate the mesh")
+    return normals, material.decode("utf-8", "replace")
 
 
 def _check_points(points: npt.NDArray[np.float64]) -> None:

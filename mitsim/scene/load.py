@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -49,8 +50,7 @@ class LoadedScene:
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
     side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
-    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths; ``unread`` are
-    names of materials that meshes refer to, by the mesh's path.
+    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
     """
 
     path: Path
@@ -72,7 +72,6 @@ class LoadedScene:
     one_way: bool = False
     sensor_note: str | None = None
     own: Mapping[str, str] = field(default_factory=dict)
-    unread: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def pixels(self) -> ProjectorGrid:
@@ -125,6 +124,9 @@ def load_scene(
         notes = emit_by_faces(checked)  # before thin shapes are meshes, too
         with with_thin_shapes_as_meshes(checked.outline, checked.state):
             scene = mi.parser.instantiate(checked.config, checked.state)
+    for mesh, materials in checked.unread.items():
+        if materials:
+            warnings.warn(f"mesh {mesh}: its materials ({materials}) are not read; it has the scene's", stacklevel=2)
     check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)
     # After normals were added up: once Mitsuba's own had a NaN, which loading the same files again did not.
@@ -169,7 +171,6 @@ def load_scene(
         _faces_one_way(scene),
         sensor_note,
         checked.own,
-        checked.unread,
     )
 
 
@@ -298,15 +299,11 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             limit = limits.get(named if last == "data" else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place_of_wrong(key, values, wrong, named)
+                at, value, count = np.argwhere(wrong)[0], values[wrong][0], wrong.any(axis=-1).sum()
+                place = f"mesh {named}: number {at[0]} of its {last} is {value:g}"
+                if values.ndim == 3:
+                    place = (
+                        f"bitmap {named}: the texel in row {at[0]}, column {at[1]} is {value:g} ({count} such texels)"
+                    )
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
-
-
-def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
-    """What holds the first wrong number, and where."""
-    at = np.argwhere(wrong)[0]
-    if values.ndim != 3:
-        return f"mesh {file}: number {at[0]} of its {key.rpartition('.')[2]} is {values[tuple(at)]:g}"
-    count = int(wrong.any(axis=2).sum())
-    return f"bitmap {file}: the texel in row {at[0]}, column {at[1]} is {values[tuple(at)]:g} ({count} such texels)"

@@ -96,21 +96,21 @@ def test_what_would_not_fit_the_memory_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "texts.h5", "w") as file:
         file.create_group("g").create_dataset("x", data=["a" * 4096] * 1000, dtype=h5py.string_dtype())
     for name in ("zeros.h5", "texts.h5"):
-        with checked_hdf5(tmp_path / name, "file", lambda _: 1.0) as file:
+        with checked_hdf5(tmp_path / name, lambda _: 1.0) as file:
             assert file["g/x"].size in (1000, 1 << 24)
         with (
             pytest.raises(MitsimError, match=rf"file .*{name}: would take about .* of memory"),
-            checked_hdf5(tmp_path / name, "file", lambda _: 1e5),
+            checked_hdf5(tmp_path / name, lambda _: 1e5),
         ):
             pass
     known = set[object]()
-    with checked_hdf5(tmp_path / "zeros.h5", "file", lambda _: 0.0, known), h5py.File(tmp_path / "b.h5", "w"):
+    with checked_hdf5(tmp_path / "zeros.h5", lambda _: 0.0, known), h5py.File(tmp_path / "b.h5", "w"):
         pass
-    with checked_hdf5(tmp_path / "zeros.h5", "file", lambda _: 1e5, known):  # and a file that did not change is known
+    with checked_hdf5(tmp_path / "zeros.h5", lambda _: 1e5, known):  # and a file that did not change is known
         pass
     with h5py.File(tmp_path / "zeros.h5", "a") as file:
         file["y"] = h5py.SoftLink("/g/x")
-    with pytest.raises(MitsimError, match="/y is a link"), checked_hdf5(tmp_path / "zeros.h5", "file", len, known):
+    with pytest.raises(MitsimError, match="/y is a link"), checked_hdf5(tmp_path / "zeros.h5", len, known):
         pass
 
 
