@@ -164,7 +164,7 @@ def write_meshes(to: Writer) -> None:
     wedges = [f"3 {a} {b} {c} 6 0 0 1 0 0 1" for a, b, c in BOX_TRIANGLES]
     to.mesh("meshlab.ply", "as MeshLab", BOX, BOX_TRIANGLES, "\n".join([*scan, *rows, *wedges, ""]))
     plain = [line for line in scan if "texcoord" not in line]
-    bare = [wedge[: wedge.index(" 6")] for wedge in wedges]
+    bare = [wedge.removesuffix(" 6 0 0 1 0 0 1") for wedge in wedges]
     to.mesh("named_texture.ply", "as MeshLab", BOX, BOX_TRIANGLES, "\n".join([*plain, *rows, *bare, ""]))
 
 
