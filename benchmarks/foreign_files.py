@@ -178,21 +178,21 @@ def write_pictures(to: Writer) -> None:
             ("grey.png", GREY, 255, {}), ("colour.png", COLOUR, 255, {}), ("wide.png", wide, 65535, {}),
             ("bits.png", GREY > 99, 1, {}), ("grey.tif", GREY, 255, {}), ("packed.tif", GREY, 255, {"compression":
             "tiff_adobe_deflate"}), ("lzw.tif", wide, 65535, {"compression": "tiff_lzw"}), ("real.tif", REAL, 1, {}),
-            ("turned.jpg", np.rot90(COLOUR, -1), 255, {"exif": turned, "quality": 98}), ("real.pfm", REAL, 1, {}),
-            ("colour.jpg", COLOUR, 255, {"quality": 98}), ("grey.jpg", GREY.repeat(8, 0).repeat(8, 1), 255,
-            {"quality": 98}), ("grey.bmp", GREY, 255, {}), ("grey.webp", GREY, 255, {"lossless": True}),
+            ("turned.jpg", COLOUR, 255, {"exif": turned, "quality": 98, "subsampling": 0}), ("real.pfm", REAL, 1, {}),
+            ("colour.jpg", COLOUR, 255, {"quality": 98, "subsampling": 0}),
+            ("grey.jpg", GREY.repeat(8, 0).repeat(8, 1), 255, {"quality": 98}), ("grey.bmp", GREY, 255, {}), ("grey.webp", GREY, 255, {"lossless": True}),
         ):  # fmt: skip
-            shown = np.rot90(codes) if name == "turned.jpg" else codes
+            shown = np.rot90(codes, -1) if name == "turned.jpg" else codes
             off = 0.03 if name.endswith("jpg") else 0.0
-            save = image.fromarray(shown).save
-            to.picture(f"pillow_{name}", "Pillow", codes, lambda p, s=save, e=extra: s(p, **e), most, off)
+            save = image.fromarray(codes).save
+            to.picture(f"pillow_{name}", "Pillow", shown, lambda p, s=save, e=extra: s(p, **e), most, off)
         palette = image.fromarray(COLOUR).quantize(8)
         to.picture("pillow_palette.png", "Pillow", np.array(palette.convert("RGB")), palette.save, 255)
         see_through = np.dstack([COLOUR, np.full(COLOUR.shape[:2], 128, np.uint8)])
         to.picture("pillow_alpha.png", "Pillow", see_through, image.fromarray(see_through).save, 255)
         ink = image.fromarray(COLOUR).convert("CMYK")
         save = ink.save
-        to.picture("pillow_ink.jpg", "Pillow", COLOUR, lambda p: save(p, quality=98), 255, 0.03)
+        to.picture("pillow_ink.jpg", "Pillow", COLOUR, lambda p: save(p, quality=98, subsampling=0), 255, 0.03)
     with to.by("imageio.v3") as iio:
         for name, codes, most in (("grey.png", GREY, 255), ("wide.png", wide, 65535), ("colour.tif", COLOUR, 255),
                                   ("real.tif", REAL, 1), ("colour.png", COLOUR, 255)):  # fmt: skip

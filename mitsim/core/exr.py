@@ -260,7 +260,7 @@ def read_header(path: Path) -> ExrHeader:
         raise ValueError("its header is damaged") from None
     (header,) = parts if len(parts) == 1 else ({},)
     if header.get("type", OpenEXR.scanlineimage) != OpenEXR.scanlineimage or "tiles" in header or not header:
-        raise ValueError("the image is tiled, deep or of several parts; save it as one part of scan lines")
+        raise ValueError("is tiled, deep or of several parts; save it as one part of scan lines")
     window, shown = ([int(edge) for edge in np.ravel(header[name])] for name in ("dataWindow", "displayWindow"))
     left, top, right, bottom = window
     width, height, channels = right - left + 1, bottom - top + 1, header["channels"]
@@ -268,7 +268,7 @@ def read_header(path: Path) -> ExrHeader:
         raise ValueError(f"claims {width}x{height} pixels; 1 to {MOST_SIDE} a side are allowed")
     if (left, top) != (0, 0) or window != shown:
         raise ValueError(
-            f"its data window is {window}, its display window {shown}; save it with both from 0, 0 and equal"
+            f"has the data window {window} and the display window {shown}; save it with equal ones from 0, 0"
         )
     if not 0 < len(channels) <= _MOST_CHANNELS:
         raise ValueError(f"has {len(channels)} channels; 1 to {_MOST_CHANNELS} are allowed")

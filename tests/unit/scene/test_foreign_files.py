@@ -169,8 +169,19 @@ def test_windows_that_differ_are_refused(tmp_path: Path, what: str, reader: str)
     path = tmp_path / "a.exr"
     header = {"type": OpenEXR.scanlineimage, **WINDOWS[what]}
     OpenEXR.File(header, {"Y": np.ones((6, 8), np.float32)}).write(str(path))
-    with pytest.raises((MitsimError, ValueError), match=r"its data window is .*, its display window .*; save it with"):
+    with pytest.raises(
+        (MitsimError, ValueError), match=r"has the data window .* and the display window .*; save it with"
+    ):
         READERS[reader](path)
+
+
+def test_numbers_whose_white_nobody_knows_are_no_picture(tmp_path: Path) -> None:
+    """Codes of 8 bits in whole numbers of 32. (Seen failing: divided by 4294967295, a black picture.)"""
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.full((6, 8), 200, np.uint32)}).write(str(tmp_path / "a.exr"))
+    np.save(tmp_path / "a.npy", np.full((6, 8), 200, np.uint32))
+    for name in ("a.exr", "a.npy"):
+        with pytest.raises(MitsimError, match="its numbers reach from 200 to 200; give 0 to 1"):
+            read_reflectance(tmp_path / name)
 
 
 def test_a_texture_that_a_mesh_names_is_found(tmp_path: Path) -> None:
