@@ -180,7 +180,8 @@ def write_pictures(to: Writer) -> None:
             "tiff_adobe_deflate"}), ("lzw.tif", wide, 65535, {"compression": "tiff_lzw"}), ("real.tif", REAL, 1, {}),
             ("turned.jpg", COLOUR, 255, {"exif": turned, "quality": 98, "subsampling": 0}), ("real.pfm", REAL, 1, {}),
             ("colour.jpg", COLOUR, 255, {"quality": 98, "subsampling": 0}),
-            ("grey.jpg", GREY.repeat(8, 0).repeat(8, 1), 255, {"quality": 98}), ("grey.bmp", GREY, 255, {}), ("grey.webp", GREY, 255, {"lossless": True}),
+            ("grey.jpg", GREY.repeat(8, 0).repeat(8, 1), 255, {"quality": 98}),
+            ("grey.bmp", GREY, 255, {}), ("grey.webp", GREY, 255, {"lossless": True}),
         ):  # fmt: skip
             shown = np.rot90(codes, -1) if name == "turned.jpg" else codes
             off = 0.03 if name.endswith("jpg") else 0.0
