@@ -15,8 +15,8 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from io import FileIO
 from pathlib import Path
@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError, reason_of
-from mitsim.core.files import check_plain, whole_file
+from mitsim.core.files import MOST_PIXELS, check_plain, whole_file
 from mitsim.core.job import Cost, Limits
 
 if TYPE_CHECKING:
@@ -170,6 +170,14 @@ def read_npz(file: BinaryIO, name: Path | str) -> dict[str, npt.NDArray[Any]]:
 
 # -------- HDF5 files
 
+PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
+"""Filters that every HDF5 library has, and a checksum for each chunk. Higher levels of gzip take thrice the time for
+noise that does not get smaller."""
+_MOST_CHUNK = 4 * MOST_PIXELS
+"""Bytes that are unpacked at once: of the largest frame."""
+_MOST_ITEMS, _DEEPEST = 100_000, 16
+"""Groups and datasets of a file, and levels of groups within groups. Looking at so many takes some ten seconds."""
+
 
 @contextmanager
 def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
@@ -188,6 +196,71 @@ def whole_hdf5(path: Path | str) -> Iterator[h5py.File]:
             raise kept.error or error from None
         if kept.error is not None:
             raise kept.error
+
+
+@contextmanager
+def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] | None = None) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading after all that it holds was checked; every HDF5 input is opened here.
+
+    HDF5 follows links to other files, unpacks what claims to be a thousand times larger (a million times by two
+    filters), and reads what was never stored as zeros of any size.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    copies
+        bytes of memory that the caller takes for each byte of an h5py.Dataset; 0 for one that it checks itself.
+    known
+        marks of files that were checked and have not changed since, which are not checked again; the file is added.
+
+    Raises
+    ------
+    MitsimError
+        for a file that is missing or damaged; for links, data in other files or not wholly stored, filters other than
+        gzip, too many or too deep groups, and where reading takes more memory than is free.
+    """
+    import h5py
+
+    allowed = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+    state, found, known = check_plain(path), 0, set() if known is None else known
+    mark = path, state.st_ino, state.st_size, state.st_mtime_ns
+
+    def look(group: h5py.Group, depth: int) -> Iterator[float]:
+        nonlocal found
+        for name in group:
+            found, place = found + 1, f"{path}: {group.name.rstrip('/')}/{name}"
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise MitsimError(f"{place} is a link; write the data themselves into the file")
+            if found > _MOST_ITEMS or depth > _DEEPEST:
+                raise MitsimError(f"{path}: holds over {_MOST_ITEMS} items or {_DEEPEST} levels; keep the data alone")
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                yield from look(item, depth + 1)
+            elif isinstance(item, h5py.Dataset) and item.shape is not None:
+                filters, chunk, kind = item.id.get_create_plist(), item.chunks, item.dtype
+                used = [filters.get_filter(index)[0] for index in range(filters.get_nfilters())]
+                pieces = math.prod(-(-side // part) for side, part in zip(item.shape, chunk or item.shape, strict=True))
+                # What was never stored is read as the fill value: black frames, of any size.
+                stored = item.id.get_num_chunks() == pieces if chunk else item.id.get_storage_size() >= item.nbytes
+                wrong = {
+                    "lies in another file": item.is_virtual or item.external,
+                    "is packed by filters other than gzip, or twice": {*used} - allowed or len({*used}) < len(used),
+                    "is stored in pieces of over 256 MiB": math.prod(chunk or ()) * kind.itemsize > _MOST_CHUNK,
+                    f"claims {item.shape}, of which not all is stored": not stored,
+                }
+                for reason in filter(wrong.get, wrong):
+                    raise MitsimError(f"{place} {reason}; write the data themselves into the file")
+                # Each text of a dataset may be the whole file.
+                yield copies(item) * item.size * (state.st_size if kind.hasobject else kind.itemsize)
+
+    with ExitStack() as stack:
+        with hdf5_errors(path):
+            file = stack.enter_context(h5py.File(path, "r"))
+            if mark not in known:
+                Cost(memory_bytes=sum(look(file, 1))).check(f"file {path}", Limits())
+                known.add(mark)
+        yield file
 
 
 @contextmanager

@@ -241,12 +241,11 @@ _MOST_CHANNELS = 64
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """Size in pixels, number of channels and decoded size in bytes (float32 or uint32) of a plain scan-line image."""
+    """Size in pixels and number of channels of a plain scan-line image."""
 
     width: int
     height: int
     channels: int
-    decoded: int
 
 
 def read_header(path: Path) -> ExrHeader:
@@ -255,7 +254,8 @@ def read_header(path: Path) -> ExrHeader:
     Raises
     ------
     ValueError
-        when the file is no OpenEXR image of one part and of scan lines, or claims more than it can hold.
+        when the file is no OpenEXR image of one part and of scan lines, holds other pixels than those that are to be
+        shown, or claims more than it can hold. (Mitsuba crashes on data windows that begin below zero.)
     OSError
         when it cannot be read.
     """
@@ -276,11 +276,16 @@ def read_header(path: Path) -> ExrHeader:
         raise ValueError("its header is damaged") from None
     (header,) = parts if len(parts) == 1 else ({},)
     if header.get("type", OpenEXR.scanlineimage) != OpenEXR.scanlineimage or "tiles" in header or not header:
-        raise ValueError("the image is tiled, deep or of several parts; save it as one part of scan lines")
-    (left, top), (right, bottom) = ([int(edge) for edge in corner] for corner in header["dataWindow"])
+        raise ValueError("is tiled, deep or of several parts; save it as one part of scan lines")
+    window, shown = ([int(edge) for edge in np.ravel(header[name])] for name in ("dataWindow", "displayWindow"))
+    left, top, right, bottom = window
     width, height, channels = right - left + 1, bottom - top + 1, header["channels"]
     if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
         raise ValueError(f"claims {width}x{height} pixels; 1 to {MOST_SIDE} a side are allowed")
+    if (left, top) != (0, 0) or window != shown:
+        raise ValueError(
+            f"has the data window {window} and the display window {shown}; save it with equal ones from 0, 0"
+        )
     if not 0 < len(channels) <= _MOST_CHANNELS:
         raise ValueError(f"has {len(channels)} channels; 1 to {_MOST_CHANNELS} are allowed")
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):
@@ -291,4 +296,4 @@ def read_header(path: Path) -> ExrHeader:
         smallest = max(smallest - _SMALL, 0) // _LARGEST_RATIO
     if decoded > _MOST_BYTES or smallest >= size:
         raise ValueError(f"claims {width}x{height} pixels of {len(channels)} channels, more than its {size} bytes hold")
-    return ExrHeader(width, height, len(channels), decoded)
+    return ExrHeader(width, height, len(channels))

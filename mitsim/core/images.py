@@ -367,10 +367,7 @@ def _npy(path: Path, wanted: Wanted) -> _Header:
 
 
 def _exr(path: Path, wanted: Wanted) -> _Header:
-    from mitsim.core.exr import (
-        read_frame,
-        read_header,  # most work reads no picture of this kind
-    )
+    from mitsim.core.exr import read_frame, read_header  # most work reads no picture of this kind
 
     header = read_header(path)
 

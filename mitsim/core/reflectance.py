@@ -11,7 +11,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import JPEG, PRINTS, Wanted
-from mitsim.core.images import read_image
+from mitsim.core.images import own_end, read_image
 
 _JPEG_SIDE = 16384
 """Pixels a side of the largest JPEG that is read, as of other pictures."""
@@ -23,8 +23,8 @@ scene may have (:data:`mitsim.scene.headers.MOST_TEXELS`)."""
 def read_reflectance(path: Path) -> FloatArray:
     """Reflectances of a picture's pixels: its numbers as they are stored, without a gamma curve.
 
-    Whole numbers are divided by the largest that the file's type holds, 255 or 65 535; real ones are reflectances as
-    they are. Of colours the mean is taken. A JPEG is turned as it is to be shown.
+    Whole numbers of 8 or 16 bits are divided by 255 or 65 535; real ones, and whole ones of more bits, are reflectances
+    as they are. Of colours the mean is taken. A JPEG is turned as it is to be shown.
 
     Parameters
     ----------
@@ -44,8 +44,7 @@ def read_reflectance(path: Path) -> FloatArray:
     if suffix not in PRINTS:
         raise MitsimError(f"picture {path}: ends in {suffix or 'nothing'}; read are {', '.join(PRINTS)}")
     values = _read_jpeg(path) if suffix in JPEG else read_image(path, Wanted("picture", colour=True))
-    most = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
-    grey = np.asarray(values, dtype=np.float64) / most
+    grey = np.asarray(values, dtype=np.float64) / (own_end(values) or 1.0)
     if grey.ndim == 3:
         if (grey[..., 3:] < 1).any():
             raise MitsimError(f"picture {path}: has transparent pixels; lay it on a ground, and save it without")

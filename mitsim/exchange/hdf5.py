@@ -6,8 +6,7 @@ The layout stands in docs/exchange.md. Shots are chunks of their own, so that on
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.core.arrays import hdf5_errors, whole_hdf5
+from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channels, Metadata, Value
-from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, MOST_PIXELS, check_plain, fits_a_frame, parse_json
+from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, fits_a_frame, parse_json
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, RunManifest
 from mitsim.core.recorders import TRUTH
@@ -46,13 +45,8 @@ if TYPE_CHECKING:
 
 _LINES = "lines"
 """Group that has a group of each line."""
-_MOST_CHUNK = 4 * MOST_PIXELS
-"""Bytes that are unpacked at once: of the largest frame."""
 LAYOUT = 1
 """Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
-_PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
-"""Filters that every HDF5 library has; a checksum for each chunk. Higher levels of gzip take thrice the time for noise
-that does not get smaller."""
 
 
 def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> tuple[str, ...]:
@@ -142,13 +136,8 @@ def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFil
 @contextmanager
 def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
     """The folders in the file ``path``, coloured or not, while the context lasts. MitsimError as :func:`open_hdf5`."""
-    import h5py
-
     path = Path(path)
-    check_plain(path)
-    with hdf5_errors(path):
-        file = h5py.File(path, "r")
-    with file:
+    with checked_hdf5(path, lambda _: 0.0) as file:  # _whole checks what is read at once
         with hdf5_errors(path):
             layout = file.attrs.get("mitsim_exchange")
             if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
@@ -173,8 +162,6 @@ def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
 # -------- MATLAB files of version 7.3, which are HDF5
 
 
-_MOST_VARIABLES = 10_000
-"""Of a file, as of one of version 5."""
 _LETTERS = "char"
 """What MATLAB calls texts; they are stored as numbers of 16 bits."""
 _CLASSES = {_LETTERS, "single", "double", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
@@ -190,22 +177,19 @@ def read_matlab(path: Path) -> dict[str, Any]:
     import h5py
 
     found = dict[str, Any]()
-    with hdf5_errors(path), h5py.File(path, "r") as file:
-        if len(file) > _MOST_VARIABLES:
-            raise MitsimError(f"{path}: holds {len(file)} variables; at most {_MOST_VARIABLES} are read")
-        datasets = {}
+
+    def kind(dataset: h5py.Dataset) -> str:
+        """Class of an array of the file's own; of what structures and cells hold, ""."""
+        held = dataset.name.count("/") > 1 or dataset.dtype.kind not in "uif" or "MATLAB_empty" in dataset.attrs
+        return "" if held else bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
+
+    with hdf5_errors(path), checked_hdf5(path, lambda each: 2.0 * (kind(each) in _CLASSES)) as file:
         for name in file:
-            if isinstance(file.get(name, getlink=True), h5py.HardLink) and not isinstance(file[name], h5py.Dataset):
-                continue  # a structure, a sparse matrix, or what cells refer to
-            dataset = _inside(file, name, h5py.Dataset, path)
-            known = bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
-            if known in _CLASSES and dataset.dtype.kind in "uif" and "MATLAB_empty" not in dataset.attrs:
-                datasets[name] = _dataset(file, name, path), known
-        Cost(memory_bytes=2 * sum(each.nbytes for each, _ in datasets.values())).check(f"{path}", Limits())
-        for name, (dataset, known) in datasets.items():
-            values = dataset[()].T  # MATLAB stores columns first
-            text = known == _LETTERS
-            found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
+            # Groups are structures, sparse matrices, or what cells refer to.
+            if isinstance(file[name], h5py.Dataset) and (known := kind(file[name])) in _CLASSES:
+                values = _dataset(file, name, path)[()].T  # MATLAB stores columns first
+                text = known == _LETTERS
+                found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
     return found
 
 
@@ -249,7 +233,7 @@ def _begin(place: h5py.Group, name: str, packed: Packed[Any]) -> h5py.Group:
 
 def _write_text(group: h5py.Group, name: str, text: str) -> None:
     # Of bytes with their length: manifests outgrow an attribute, and an HDF5 text ends at its first zero.
-    group.create_dataset(name, data=np.frombuffer(text.encode(), dtype=np.uint8), **_PACKED)
+    group.create_dataset(name, data=np.frombuffer(text.encode(), dtype=np.uint8), **PACKED)
 
 
 def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
@@ -260,26 +244,20 @@ def _write_shots(group: h5py.Group, run: Packed[RunManifest]) -> None:
         for name, values in channels.items():
             if index == 0:
                 shape = len(captures), *values.shape
-                stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **_PACKED)
+                stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **PACKED)
             stacks[name][index] = values
         metadata.append(json.dumps(dict(known)))
-    group.create_dataset("metadata", data=np.array(metadata, dtype=object), dtype=_strings())
+    group.create_dataset("metadata", data=metadata)
     group.create_dataset("pattern", data=np.array([(shot.row, shot.column, shot.sign) for shot in captures], np.int32))
     group["pattern"].attrs["columns"] = "column of P_L from 0, column of P_R from 0, sign"
     for name, matrix in zip(("P_L", "P_R"), run.manifest.patterns.matrices, strict=True):
-        group.create_dataset(name, data=matrix, **_PACKED)
+        group.create_dataset(name, data=matrix, **PACKED)
 
 
 def _write_frame(group: h5py.Group, channels: Channels, metadata: Metadata) -> None:
     for name, values in channels.items():
-        group.create_dataset(name, data=values, **_PACKED)
-    group.create_dataset("metadata", data=np.array([json.dumps(dict(metadata))], dtype=object), dtype=_strings())
-
-
-def _strings() -> Any:
-    import h5py
-
-    return h5py.string_dtype("utf-8")
+        group.create_dataset(name, data=values, **PACKED)
+    group.create_dataset("metadata", data=[json.dumps(dict(metadata))])
 
 
 def _run_in(file: h5py.File, path: Path) -> Run:
@@ -362,9 +340,8 @@ def _text_in(group: h5py.Group, name: str, path: Path) -> str:
 
 
 def _frame(group: h5py.Group, path: Path) -> tuple[Channels, Metadata]:
-    names = [name for name in group if name != "metadata"]
-    arrays = {name: _dataset(group, name, path) for name in names}
-    channels = {name: as_channel(_whole(array, path), f"{group.name}/{name}", path) for name, array in arrays.items()}
+    arrays = {name: _dataset(group, name, path) for name in group if name != "metadata"}
+    channels = {name: as_channel(_whole(array, path), array.name, path) for name, array in arrays.items()}
     return channels, _metadata(_dataset(group, "metadata", path), 0, path)
 
 
@@ -382,36 +359,21 @@ def _metadata(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
     return known
 
 
-def _group(parent: h5py.Group, name: str, path: Path) -> h5py.Group:
-    import h5py
-
-    return _inside(parent, name, h5py.Group, path)
+def _group(parent: h5py.Group, name: str, path: Path, kind: str = "Group") -> Any:
+    """Return the item ``name`` of a group, of that ``kind``."""
+    item = parent.get(name)
+    if type(item).__name__ != kind:
+        what = "is missing" if item is None else f"is no {kind.lower()}"
+        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {what}; export it again")
+    return item
 
 
 def _dataset(parent: h5py.Group, name: str, path: Path) -> h5py.Dataset:
-    import h5py
-
-    dataset = _inside(parent, name, h5py.Dataset, path)
-    if dataset.is_virtual or dataset.external:
-        raise MitsimError(f"{path}: {dataset.name} lies in another file; export it again")
+    dataset = _group(parent, name, path, "Dataset")
     if dataset.shape is None:
         raise MitsimError(f"{path}: {dataset.name} is empty; export it again")
     if not fits_a_frame(dataset.shape[1:]):
         raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}; {FRAME_LIMITS} are allowed")
-    filters = dataset.id.get_create_plist()
-    used = {filters.get_filter(index)[0] for index in range(filters.get_nfilters())}
-    if not used <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}:
-        raise MitsimError(f"{path}: {dataset.name} is packed by filters other than gzip; export it again")
-    # What was never stored is read as the fill value: black frames, of any size.
-    if dataset.chunks is None:
-        stored = dataset.id.get_storage_size() >= dataset.nbytes
-    else:
-        wanted = math.prod(-(-side // chunk) for side, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-        stored = dataset.id.get_num_chunks() == wanted
-        if math.prod(dataset.chunks) * dataset.dtype.itemsize > _MOST_CHUNK:
-            raise MitsimError(f"{path}: {dataset.name} is stored in pieces of over 256 MiB; export it again")
-    if not stored:
-        raise MitsimError(f"{path}: {dataset.name} claims {dataset.shape}, of which not all is stored; export it again")
     return dataset
 
 
@@ -419,17 +381,3 @@ def _whole(dataset: h5py.Dataset, path: Path) -> Any:
     """All of a ``dataset``; MitsimError where that takes more memory than is free."""
     Cost(memory_bytes=dataset.nbytes).check(f"{path}: {dataset.name}", Limits())
     return dataset[()]
-
-
-def _inside(parent: h5py.Group, name: str, kind: Callable[..., Any], path: Path) -> Any:
-    """What stands under ``name`` in the file itself, of that ``kind``."""
-    import h5py
-
-    link = parent.get(name, getlink=True) if name in parent else None
-    if not isinstance(link, h5py.HardLink):
-        reason = "is missing" if link is None else "is a link"
-        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {reason}; export it again")
-    item = parent[name]
-    if not isinstance(item, kind):  # type: ignore[arg-type]
-        raise MitsimError(f"{path}: {item.name} is a {type(item).__name__.lower()}; export it again")
-    return item

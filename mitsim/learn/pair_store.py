@@ -15,7 +15,7 @@ import re
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +26,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import sparse
 
-from mitsim.core.arrays import FloatArray, Labels, hdf5_errors, whole_hdf5
+from mitsim.core.arrays import PACKED, FloatArray, Labels, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import PAIRS, read_json, write_json
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 """Version of the store's layout."""
-_PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
-"""Filters that every HDF5 library has, and a checksum for each chunk."""
 _LIGHTS_KEPT = 32
 """Lights of shards that are held in memory, some 10 MB each: as many as a network's batch meets."""
 Frames = npt.NDArray[np.float32]
@@ -217,16 +215,16 @@ class PrintLight:
 
     def write(self, group: h5py.Group) -> None:
         """Keep it in a ``group`` of a file."""
-        group.create_dataset("emission", data=self.emission, **_PACKED)
+        group.create_dataset("emission", data=self.emission, **PACKED)
         for number, part in enumerate(self.parts):
             place = group.create_group(f"part_{number}", track_order=True)
             assert part.optics.terms is not None, "light that is kept has few"
             (terms,) = part.optics.terms
             for axis, side in enumerate(("left", "right")):
-                place.create_dataset(side, data=np.stack([term[axis] for term in terms]), **_PACKED)
+                place.create_dataset(side, data=np.stack([term[axis] for term in terms]), **PACKED)
                 place.create_dataset(f"{side}_anchors", data=part.optics.weights[axis])
             for name in ("data", "indices", "indptr"):
-                place.create_dataset(name, data=getattr(part.light, name), **_PACKED)
+                place.create_dataset(name, data=getattr(part.light, name), **PACKED)
             place.create_dataset("rows", data=part.rows)
             place.create_dataset("columns", data=part.columns)
             place.attrs.update({"shape": part.light.shape, "lamps": part.lamps})
@@ -305,7 +303,7 @@ def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, 
             for name, values in rows.items():
                 row = np.asarray(values)
                 if name not in file:
-                    packed = _PACKED if row.ndim == 2 else {}
+                    packed = PACKED if row.ndim == 2 else {}
                     chunks = (1, *row.shape) if row.ndim else None
                     file.create_dataset(
                         name, (0, *row.shape), row.dtype, maxshape=(None, *row.shape), chunks=chunks or True, **packed
@@ -325,18 +323,20 @@ def is_shard(path: Path, digest: str, count: int) -> bool:
     digest, count
         of the store's configuration, and the shard's pairs.
     """
-    import h5py  # here, as everywhere: it takes 50 ms to import
-
-    if not path.is_file():
-        return False
     try:
-        with h5py.File(path, "r") as file:
+        with hdf5_errors(path), _open_shard(path) as file:
             return bool(file.attrs["configuration_sha256"] == digest and len(file["truth"]) == count)
-    except (OSError, KeyError):
+    except MitsimError:
         return False
 
 
 # -------- Reading
+
+
+def _open_shard(path: Path, known: set[object] | None = None) -> AbstractContextManager[h5py.File]:
+    """Open the shard ``path``: its light is read as a whole, and of the pairs' pictures and frames one row."""
+    rows = {"/picture", "/truth", "/expected", "/lamps"}
+    return checked_hdf5(path, lambda each: 1 / max(each.shape[0], 1) if each.name in rows else 1.0, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,6 +361,7 @@ class PairStore:
         """A store whose ``manifest`` was read from a ``folder``."""
         self.folder, self.manifest = folder, manifest
         self._lights: OrderedDict[int, tuple[PrintLight | None, float]] = OrderedDict()
+        self._known = set[object]()
 
     @classmethod
     @check_arguments
@@ -534,10 +535,8 @@ class PairStore:
 
     @contextmanager
     def _file(self, shard: Shard) -> Iterator[h5py.File]:
-        import h5py
-
         path = self.folder / shard.file
-        with hdf5_errors(path), h5py.File(path, "r") as file:
+        with hdf5_errors(path), _open_shard(path, self._known) as file:
             yield file
 
 

@@ -16,10 +16,9 @@ import numpy as np
 from scipy import sparse
 
 from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import FloatArray, hdf5_errors, whole_hdf5
+from mitsim.core.arrays import PACKED, FloatArray, checked_hdf5, hdf5_errors, whole_hdf5
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_plain, parse_json
-from mitsim.core.job import Cost, Limits
+from mitsim.core.files import parse_json
 from mitsim.light.grids import GRIDS, Grid, LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
 LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
 """Numbers of the layouts that are written here: attribute `mitsim_transport` of the file. The second has anchors'
 weights for columns too, where these do not lie as rows do."""
-_PACKED: dict[str, Any] = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
-"""Filters that every HDF5 library has, and a checksum for each chunk."""
 _KEPT = "kept"
 """Group of what only mitsim reads."""
 _COPIES = 4
@@ -76,7 +73,7 @@ def write_light(path: Path, light: SampledLight) -> None:
                 _write_matrix(place, sparse.csr_array(sparse.vstack(groups, format="csr")))
                 _write_shadow(place, light.simulation.grids[name])
         if light.simulation.physics.lamps:
-            file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **_PACKED)
+            file.create_dataset("ambient", data=_ambient(light).astype(np.float32), **PACKED)
         if specular is not None:
             _write_matrix(file.create_group("glint", track_order=True), specular)
         if light.plan.request is not None:
@@ -88,7 +85,7 @@ def _keep(group: h5py.Group, light: SampledLight) -> None:
     facts = {name: getattr(light, name) for name in ("paths", "reached", "restated")}
     group.attrs.update({**facts, "samples": json.dumps(dict(light.samples))})
     for name in ("flux", "flux_error"):
-        group.create_dataset(name, data=getattr(light, name), **_PACKED)
+        group.create_dataset(name, data=getattr(light, name), **PACKED)
     for name in ("received", "outside"):
         group.create_dataset(name, data=[getattr(each, name) for each in light.groups])
     group.create_dataset("plan", data=light.plan.as_text())
@@ -113,16 +110,10 @@ def read_light(path: Path, bench: Apparatus) -> SampledLight:
     MitsimError
         for a file that cannot be read or is none of light, and light of another bench or version of mitsim.
     """
-    import h5py  # here: it takes 50 ms to import, and most work reads none
-
-    check_plain(path, "light")
-    with hdf5_errors(path), h5py.File(path, "r") as file:
+    with hdf5_errors(path), checked_hdf5(path, lambda _: _COPIES) as file:
         if _KEPT not in file:
             raise MitsimError(f"light {path}: is no file of this version's `mitsim transport`; trace it again")
         kept, count = file[_KEPT], bench.n**2
-        bytes_held = list[int]()
-        file.visititems(lambda _, each: bytes_held.append(each.nbytes) if isinstance(each, h5py.Dataset) else None)
-        Cost(memory_bytes=_COPIES * sum(bytes_held)).check(f"light {path}", Limits())
         plan = Plan.of_data(parse_json(kept["plan"][()].decode()), f"light {path}")
         plan.check_made_of(bench.deciding, "light")
         simulation = Simulation(bench, plan.settings)
@@ -220,7 +211,7 @@ def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
     group.attrs["shape"] = matrix.shape
     parts = {"data": np.float32, "indices": np.int64 if matrix.shape[1] > 2**31 else np.int32, "indptr": np.int64}
     for name, kind in parts.items():
-        group.create_dataset(name, data=getattr(matrix, name).astype(kind), **_PACKED)
+        group.create_dataset(name, data=getattr(matrix, name).astype(kind), **PACKED)
 
 
 def _write_shadow(group: h5py.Group, grid: Grid) -> None:
@@ -229,7 +220,7 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
     layers = [shadow_terms(geometry, bundle.rows, bundle.columns, depth, spectrum) for depth in bundle.depths]
     for side, name in enumerate(("left", "right")):
         factors = np.stack([[term[side] for term in terms] for terms in layers])
-        group.create_dataset(name, data=factors.astype(np.float32), **_PACKED)
+        group.create_dataset(name, data=factors.astype(np.float32), **PACKED)
     positions = anchor_positions(bundle.anchors, geometry.half_width)
     arrays = {
         "anchors": anchor_weights(positions, geometry.centres(0)),

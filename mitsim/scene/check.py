@@ -62,7 +62,7 @@ class CheckedScene:
     into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``without_normals`` are names
     of the meshes' files that give their vertices no normals; ``own`` are paths of files that a user names and mitsim
-    prepares, with their parameter.
+    prepares, with their parameter; ``unread`` are names of materials that meshes refer to, by the mesh's path.
     """
 
     outline: Outline
@@ -78,6 +78,7 @@ class CheckedScene:
     samples: int | None
     without_normals: frozenset[str]
     own: Mapping[str, str]
+    unread: dict[str, str]
 
 
 def check_file(
@@ -118,7 +119,7 @@ def check_file(
     own = {str(path): name for path, name in files.own.items() if name in PREPARED}
     listed = tuple(tree.tags_of(shapes)), tuple(tree.tags_of(SMALL_LAMPS)), tuple(tree.coloured), tuple(tree.parting)
     without_normals = frozenset(name for name, given in tree.normals.items() if given == {False})
-    return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals, own)
+    return CheckedScene(outline, config, state, *facts, *listed, tree.samples, without_normals, own, tree.unread)
 
 
 @contextmanager
@@ -150,6 +151,7 @@ class _Tree:
     parting: list[Tag] = field(default_factory=list)
     samples: int | None = None
     normals: dict[str, set[bool]] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:
         """MitsimError for the first object that a scene cannot have."""
@@ -250,7 +252,7 @@ class _Tree:
                 if not grey:
                     self.coloured.append(tag)
             else:
-                given = (check_ply if plugin == "ply" else check_obj)(path)
+                given, self.unread[str(path)] = (check_ply if plugin == "ply" else check_obj)(path)
                 self.normals.setdefault(Path(name).name, set()).add(given)
         except (ValueError, OSError) as error:
             raise tag.refusal("filename", repr(name), f"the file {error}") from None

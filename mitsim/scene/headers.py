@@ -6,8 +6,10 @@ Each function raises ValueError with a sentence that completes "the file ...", o
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core import exr
+from mitsim.core.errors import cut
 
 MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
@@ -34,6 +37,16 @@ _PLY_TYPES = {
 """NumPy's name of each type in a header."""
 _CORNERS, _INDICES = "corner count", "corner indices"
 """A triangle's list as fields of an array: names with a blank, which no property has."""
+_LINE = re.compile(
+    rb"f\s+(?P<face>(?:[1-9][0-9]{0,8}(?:/[0-9]{0,9}){0,2}(?:\s+|$)){3,})(?:#.*)?|"
+    rb"v\s+(?P<vertex>\S+\s+\S+\s+\S+)(?:\s[^\r]*)?|(?P<normal>vn)\s[^\r]*|(?:mtllib|usemtl)\s+(?P<material>[^\r]*)|#[^\r]*|"
+    rb"(?:g|l|o|p|s|vt|bevel|[cd]_interp|lod|maplib|mg|shadow_obj|trace_obj|usemap)(?:\s[^\r]*)?|"
+)
+"""Lines of Wavefront files that are read, or do not change a mesh: faces of three or more corners, each the number of a
+vertex, of its place in textures and of its normal; but no free-form surfaces (Wavefront, "Object Files")."""
+_TURNED, _BENT = 1e-3, 1e-2
+"""Part of a face's area by which one of its triangles may be turned over (coordinates are rounded), and by which the
+triangles may exceed the face: 16 degrees between two of them."""
 _MOST_TEXT = 64 << 20
 """Chosen so that its words, some ten million Python objects, stay below 1 GiB."""
 
@@ -59,11 +72,11 @@ def check_image(path: Path) -> tuple[int, bool]:
     return width * height, grey
 
 
-def check_ply(path: Path) -> bool:
+def check_ply(path: Path) -> tuple[bool, str]:
     """Refuse ``path`` unless it is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
 
     Mitsuba would read beyond its arrays. Elements and properties beside those of triangles may be there, in any order.
-    Returns whether its vertices have normals. Raises ValueError or OSError.
+    Returns whether its vertices have normals, and the name of the texture that it refers to, "" without.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
@@ -79,30 +92,59 @@ def check_ply(path: Path) -> bool:
     if indices.min() < 0 or indices.max() >= count:
         named = f"{indices.min()} to {indices.max()}"
         raise ValueError(f"has faces with vertices {named}, but {count} vertices; mend the mesh")
-    return {"nx", "ny", "nz"} <= dict(parts["vertex"].properties).keys()
+    texture = re.search(rb"\ncomment TextureFile ([^\r\n]*)", found[0])
+    named = texture[1].decode("utf-8", "replace").strip() if texture else ""
+    return {"nx", "ny", "nz"} <= dict(parts["vertex"].properties).keys(), named
 
 
-def check_obj(path: Path) -> bool:
-    """Refuse ``path`` unless it is a Wavefront mesh of vertices within ``FARTHEST``; Mitsuba checks the faces.
+def check_obj(path: Path) -> tuple[bool, str]:
+    """Refuse ``path`` unless it is a Wavefront mesh that Mitsuba reads as it is meant, of vertices within ``FARTHEST``.
 
-    Returns whether any vertices have normals.
+    Mitsuba drops what follows a backslash at the end of a line, faces that it cannot read, and free-form surfaces; and
+    it covers every face by a fan of triangles from its first corner, which overlap where the face is concave.
+
+    Returns
+    -------
+    whether any vertices have normals, and the name of the materials that it refers to, "" without.
     """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
+    vertices, fans, normals, material = list[list[bytes]](), array("q"), False, b""
     with open(path, "rb") as file:
-        lines = [line.split()[:4] for line in file if line.split()[:1] in ([b"v"], [b"vn"], [b"f"])]
-    faces = sum(key == b"f" for key, *_ in lines)
-    lines = [line for line in lines if line[0] != b"f"]
+        for number, line in enumerate(map(bytes.strip, file), 1):
+            found = _LINE.fullmatch(line)
+            if not found or line.endswith(b"\\"):
+                rule = "no line may end in a backslash, and faces have three or more corners, which count from 1"
+                shown = cut(line.decode("latin-1"))
+                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}")
+            if found["vertex"]:
+                vertices.append(found["vertex"].split())
+            elif found["face"]:
+                corners = [int(corner.partition(b"/")[0]) - 1 for corner in found["face"].split()]
+                for after, before in pairwise(corners[1:]):
+                    fans.extend((number, corners[0], after, before))
+            normals, material = normals or bool(found["normal"]), material or found["material"] or b""
     try:
-        points = np.array([words for key, *words in lines if key == b"v"], dtype=np.float64)
+        points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     except ValueError:
         raise ValueError("holds vertices that are not three numbers; export the mesh again") from None
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError("is no Wavefront mesh: it has no vertices of three numbers")
     _check_points(points)
-    if not faces:
+    if not fans:
         raise ValueError("has no faces: it is a cloud of points; export a mesh")
-    return len(lines) > len(points)
+    lines, *corner = np.frombuffer(fans, np.int64).reshape(-1, 4).T
+    if np.max(corner) >= len(points):
+        raise ValueError(f"has faces with vertex {np.max(corner) + 1}, but {len(points)} vertices; mend the mesh")
+    first, after, before = points[np.array(corner)]
+    areas = np.cross(after - first, before - first)  # vectors, twice as long as a triangle is large
+    lines, face = np.unique(lines, return_inverse=True)
+    whole = np.stack([np.bincount(face, along, len(lines)) for along in areas.T], axis=1)
+    size, sums = np.square(whole).sum(axis=1), np.bincount(face, np.linalg.norm(areas, axis=1), len(lines))
+    turned = lines[face[(areas * whole[face]).sum(axis=1) < -_TURNED * size[face]]]
+    bent = lines[sums > (1 + _BENT) * np.sqrt(size)]
+    for wrong, why in ((turned, "is concave, or crosses itself"), (bent, "lies in no plane")):
+        if wrong.size:
+            raise ValueError(f"has a face that {why}, in line {wrong[0]}; triangulate the mesh")
+    return normals, material.decode("utf-8", "replace")
 
 
 def _check_points(points: npt.NDArray[np.float64]) -> None:

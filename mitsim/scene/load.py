@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -123,6 +124,9 @@ def load_scene(
         with tree.with_thin_shapes_as_meshes(checked.outline, checked.state):
             tree.put_wrappers(checked.state)
             scene = mi.parser.instantiate(checked.config, checked.state)
+    for mesh, materials in checked.unread.items():
+        if materials:
+            warnings.warn(f"mesh {mesh}: its materials ({materials}) are not read; it has the scene's", stacklevel=2)
     tree.check_meshes(moved, scene)
     _add_up_normals(scene, checked.without_normals)
     # After normals were added up: once Mitsuba's own had a NaN, which loading the same files again did not.
@@ -299,22 +303,17 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
             held = str(parameters.properties[key][2])
             if mi.is_spectral and (last.endswith("_color") or ("raw = 0" in held and values.shape[-1] == 3)):
                 continue  # coefficients of smooth spectra in Mitsuba's model: of any, they lie within 0 and 1
-            file = re.search(r'name = "([^"]*)"', held) if last == "data" else None
+            file = re.search(r'name = "([^"]*)"', held)
+            named = file[1] if file else name
             # Mitsuba calls a texture by its parameter, and one that is referenced by a number.
-            limit = limits.get(file[1] if file else last) or limits.get(name.rpartition(".")[2], _ANY)
+            limit = limits.get(named if last == "data" else last) or limits.get(name.rpartition(".")[2], _ANY)
             wrong = ~np.isfinite(values) | (values < limit.low) | (values > limit.high + _ROUNDING)
             if wrong.any():
-                place = _place_of_wrong(key, values, wrong, file[1] if file else key)
+                at, value, count = np.argwhere(wrong)[0], values[wrong][0], wrong.any(axis=-1).sum()
+                place = f"mesh {named}: number {at[0]} of its {last} is {value:g}"
+                if values.ndim == 3:
+                    place = (
+                        f"bitmap {named}: the texel in row {at[0]}, column {at[1]} is {value:g} ({count} such texels)"
+                    )
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
-
-
-def _place_of_wrong(key: str, values: npt.NDArray[np.float32], wrong: npt.NDArray[np.bool_], file: str) -> str:
-    """What holds the first wrong number, and where."""
-    at = np.argwhere(wrong)[0]
-    name, _, last = key.rpartition(".")
-    if values.ndim != 3:
-        return f"mesh {name}: number {at[0]} of its {last} is {values[tuple(at)]:g}"
-    texel = f"{name.rpartition('.')[2]} of the texel in row {at[0]}, column {at[1]}"
-    count = int(wrong.any(axis=2).sum())
-    return f"bitmap {file}: {texel} is {values[tuple(at)]:g} ({count} such texels)"

@@ -50,7 +50,7 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
                 node.props["filename"] = str(_print(Path(name), folder))
                 node.props["raw"] = True
             else:
-                _stand(node.props, Path(name))
+                checked.unread[name] = _stand(node.props, Path(name))
         yield
 
 
@@ -73,14 +73,15 @@ _ROUNDING = 1e-9
 """Of codes of eight bits that were divided by 255 and are multiplied again."""
 
 
-def _stand(props: mi.Properties, path: Path) -> None:
-    """Have a node be the mesh at ``path``, upright, and of a longest side of 1 before its ``to_world``."""
+def _stand(props: mi.Properties, path: Path) -> str:
+    """Have a node be the mesh at ``path``, upright, and of a longest side of 1 before its ``to_world``; return the name
+    of the materials that the mesh refers to."""
     kinds = {".ply": check_ply, ".obj": check_obj}
     kind = path.suffix.lower()
     if kind not in kinds:
         raise MitsimError(f"object {path}: ends in {kind or 'nothing'}; read are .ply (triangles) and .obj")
     try:
-        smooth = kinds[kind](path)
+        smooth, unread = kinds[kind](path)
         mesh = mi.load_dict({"type": kind[1:], "filename": str(path)})
     except (ValueError, RuntimeError, OSError) as error:
         said = str(error).strip().splitlines()[-1]
@@ -104,3 +105,4 @@ def _stand(props: mi.Properties, path: Path) -> None:
     upright = np.diag([1 / longest, 1 / longest, 1 / longest, 1.0])
     upright[:3, 3] = -np.array([middle[0], low[1], middle[2]]) / longest
     props["to_world"] = mi.ScalarAffineTransform4d(placement_of(props) @ upright)
+    return unread
