@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import correlate1d, uniform_filter
 from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
@@ -124,8 +124,11 @@ class PictureCheck:
         flicker.
         """
         power, *moves = (robust_scatter(own) for own in (self.power, *self.place[0]))
-        parts = [image * power, *(slope * move for slope, move in zip(np.gradient(image), moves, strict=True))]
-        return np.asarray(np.sqrt(sum(np.square(part) for part in parts)))
+        variance = np.square(image * power)
+        for axis, move in enumerate(moves):  # to either side, because a slope over both misses the finest print
+            for step in ([0.0, -1.0, 1.0], [-1.0, 1.0, 0.0]):
+                variance += np.square(move * correlate1d(image, step, axis, mode="nearest")) / 2
+        return np.asarray(np.sqrt(variance))
 
 
 def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
