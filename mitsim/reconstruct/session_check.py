@@ -57,9 +57,9 @@ _NEAR = 5
 _WRONG, _UNLIKE = 40.0, 0.03
 """Squared deviation of a vector from the predicted one, in that of the median pattern and as a part of its own square,
 from which a pattern is wrong: of 600 good sides of 64 and 260 of 128 patterns none has more than 17 and 20 of both."""
-_FOREIGN = 0.5, 15.0
-"""Part of a pattern that disagrees, and the same in standard errors, from which it is wrong too: good ones have at most
-0.25 at 6, and swapped patterns about 1 at 23 and more."""
+_FOREIGN = 0.5, 15.0, 15.0
+"""Part of a pattern that disagrees, the same in standard errors, and its deviation from which it is wrong too: good
+ones have 0.25 at 6 (64 patterns), or 1 at 30 and a deviation of 11 (128); swapped patterns about 1 at 23 and 30."""
 _UNEXPLAINED = 0.05
 """Part of a response's energy, beyond the others' noise, that no separable camera explains where it is a fault: 22 %
 of its amplitude."""
@@ -557,7 +557,8 @@ class _Check:
             if not shadow.predicts:
                 break
             doubtful = (shadow.deviations > _WRONG) & (shadow.unlike > _UNLIKE)
-            far = shadow.deviations * (doubtful | (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1]))
+            doubtful |= (shadow.shares > _FOREIGN[0]) & (shadow.sure > _FOREIGN[1]) & (shadow.deviations > _FOREIGN[2])
+            far = shadow.deviations * doubtful
             gains = shadow.by_turning * (shadow.by_turning > _TURNED * shadow.deviations)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
