@@ -68,8 +68,7 @@ def write_maps(folder: Path) -> None:
 def test_every_material_gives_forward_what_it_gives_backward(small_scene: Callable[..., Path]) -> None:
     """f*(a, b) = f(b, a) at random directions, refraction with its squares of indices: Veach 1997, 5.3.
 
-    A material that is not reciprocal and not in DIRECTED shows. (Planted: hair left out, 1.9 of 2; the value of
-    exchanged directions without the ratio of cosines.)
+    A material that is not reciprocal and not in DIRECTED shows. (Planted: hair left out of DIRECTED, 1.0 off.)
     """
     import drjit as dr
     import mitsuba as mi
@@ -118,7 +117,7 @@ CHOICES = (
 def test_a_choice_samples_each_part_by_its_share(variant: str, bsdf: dict, glass: float, paint: float) -> None:
     """What Mitsuba's own integrators sample, the reference's: light of each kind, 5 sigma of 2^18 draws.
 
-    (Mitsuba's blend of half a mirror: 0.8 of it. Planted: the density of the other part at a mirror's direction.)
+    (Mitsuba's blend of half a mirror: 0.8 of it.)
     """
     import drjit as dr
     import mitsuba as mi
@@ -150,7 +149,7 @@ NESTED = (
 def test_nested_mirrors_and_glass_send_on_all_their_light(tmp_path: Path, case: tuple[str, str, str, bool]) -> None:
     """Against float64 rays, seven standard errors of 0.1 to 0.4 %; `benchmarks/nestings.py` has all 92 nestings.
 
-    (Mitsuba's own wrappers: 0.42 to 1.6 of the light. Planted: the factor of bumps left out; a choice's pdf as it was.)
+    (Planted: the factor of bumps left out, 48 % too much under an even normal map.)
     """
     material = nestings.nested(*case)
     light, error = nestings.traced(open_bench(nestings.write_scene(tmp_path, material)), samples=1024)
@@ -172,10 +171,7 @@ WALL = """<shape type="rectangle"><transform name="to_world"><scale x="60" y="60
 def test_directed_materials_bring_the_same_light_from_either_side(
     shared_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, bsdf: str
 ) -> None:
-    """Followed from the projector, and from the camera alone, for which Mitsuba's values are defined.
-
-    (Mitsuba's own values forward: 2 to 60 % off, hair the most.)
-    """
+    """Followed from the projector, and from the camera alone, for which Mitsuba's values are defined."""
     path = shared_scene("directed", extra=WALL.format(bsdf))
     write_maps(path.parent)
     bench = open_bench(path)
