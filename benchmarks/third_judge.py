@@ -2,6 +2,7 @@
 
     python benchmarks/third_judge.py --json FILE [--scenes NAME ...] [--accuracy 1e-2]
     python benchmarks/third_judge.py --json FILE --reference 1024 [--scenes NAME ...]
+    python benchmarks/third_judge.py --json FILE --hidden 10 [--scenes NAME ...] [--accuracy 1e-2]
 
 Thirty scenes of rectangles, balls, wires, holes, a pane and mirrors (`tests/physics/judged_scenes.py`), twelve by hand
 and the rest drawn by a seeded generator. A row each: relative difference over all shots of dots:3 and 16 sensor pixels
@@ -9,7 +10,9 @@ between the factored estimator and the judge (`tests/physics/third_judge.py`), t
 their errors, whether the difference is within them, and why the run is flagged. With --reference, the reference's light
 over an unmasked sensor, of so many samples a pixel, in uniform light: its sum over the judge's, both standard errors,
 and z of the sixteenth of the sensor that is furthest off; three standard errors are allowed of the sum, four of a part.
-Mirrors are matt there and the pane is left out, for paths do not meet a pinhole over them. FILE is written after each
+Mirrors are matt there and the pane is left out, for paths do not meet a pinhole over them. With --hidden, eleven scenes
+whose caustics are seen over mirrors or curved glass (`tests/physics/hidden_light.py`): at how many of so many seeds the
+plan is flagged, and the part of the light that it says is left out, over the true one. FILE is written after each
 scene, and what it holds is not done again.
 """
 
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import tempfile
 import time
@@ -29,7 +33,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the judge lives with the tests
 
 import mitsim as ms
-from tests.physics import judged_scenes
+from mitsim.api.bench import open_bench
+from mitsim.devices.patterns import Lighting
+from mitsim.planner.planner import make_plan
+from tests.physics import hidden_light, judged_scenes
 from tests.physics import third_judge as judge
 
 
@@ -65,6 +72,30 @@ def of_reference(name: str, spp: int) -> dict[str, Any]:
     }
 
 
+def of_hidden(name: str, seeds: int, accuracy: float) -> dict[str, Any]:
+    """Plans of one scene whose light no tracer finds: flags, and the part left out over the true one."""
+    scene, effects = hidden_light.SCENES[name], {"diffraction": False}
+    true, stated = scene.light(), []
+    with tempfile.TemporaryDirectory() as folder:
+        bench = open_bench(scene.write(Path(folder), "hidden"), for_render=True)
+        found = float(bench.render("factored", accuracy=accuracy, effects=effects).mean.mean())
+        for seed in range(seeds):
+            warnings = " ".join(make_plan(bench, Lighting.uniform(bench.n), accuracy, seed, effects).warnings)
+            part = re.search(r"([-+.e\d]+) of the light comes over it", warnings)
+            stated.append(float(part[1]) if part else 0.0)
+    part_left_out = true / (true + found)
+    over = [each / part_left_out for each in stated]
+    return {
+        "scene": name,
+        "true": true,
+        "part": part_left_out,
+        "flagged": sum(each > 0 for each in stated),
+        "least": min(over),
+        "most": max(over),
+        "agrees": min(over) > 0.5 and max(over) < 2,
+    }
+
+
 def row(name: str, accuracy: float) -> dict[str, Any]:
     """Verdict of one scene."""
     judged = judged_scenes.scenes()[name]
@@ -83,16 +114,24 @@ def main() -> None:
     """Judge the scenes; exit status 1 where one disagrees."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--scenes", nargs="+", choices=list(judged_scenes.scenes()), metavar="NAME")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="all, if not given")
     parser.add_argument("--accuracy", type=float, default=1e-2)
     parser.add_argument("--reference", type=int, metavar="SPP", help="judge the reference")
+    parser.add_argument("--hidden", type=int, metavar="SEEDS", help="judge what plans say of light that none finds")
     options = parser.parse_args()
+    scenes = hidden_light.SCENES if options.hidden else judged_scenes.scenes()
+    unknown = set(options.scenes or ()) - set(scenes)
+    if unknown:
+        parser.error(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(scenes)}")
     rows = json.loads(options.json.read_text(encoding="utf-8")) if options.json.exists() else []
     known = {each["scene"] for each in rows}
-    for name in options.scenes or judged_scenes.scenes():
+    for name in options.scenes or scenes:
         if name not in known:
-            spp = options.reference
-            rows.append(of_reference(name, spp) if spp else row(name, options.accuracy))
+            spp, seeds = options.reference, options.hidden
+            if seeds:
+                rows.append(of_hidden(name, seeds, options.accuracy))
+            else:
+                rows.append(of_reference(name, spp) if spp else row(name, options.accuracy))
             options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
             print(json.dumps(rows[-1]), flush=True)
     agreeing = sum(each.get("agrees", False) for each in rows)

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,8 @@ _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
 path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
 _SAMPLES = 64
 """Samples a pixel where neither request nor scene states them, as the shipped scenes have it: a few seconds."""
+_UNKNOWN = 1.0
+"""Relative noise from which a frame is not known: where each pixel's light is that of one pass, it is infinite."""
 _SAMPLES_A_PASS = 64
 """Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
 
@@ -254,6 +256,11 @@ def render(
         mean, error = reference(bench.loaded, spp, seed, job)
         warnings = (bench.loaded.unfit.caustics,) if bench.loaded.unfit.caustics else ()
         warnings += _of_sampler(bench.loaded)
+        if bench.loaded.in_view:
+            warnings += (
+                f"{bench.loaded.path}: the projector shines on the sensor itself, and the reference has no light of it "
+                "but over surfaces, so that is missing; keep it out of the view, or use --estimator factored",
+            )
         warnings += tuple(unseen_lamps(bench.loaded, spp * mean.shape[0] * mean.shape[1], "the reference"))
     else:
         uniform = Lighting.uniform(bench.n)
@@ -277,7 +284,11 @@ def render(
         "seed": seed,
         "notes": notes,
     }
-    return Rendered(mean, error, facts, warnings)
+    rendered = Rendered(mean, error, facts, warnings)
+    if mean.any() and not rendered.mc_error < _UNKNOWN:
+        rule = "too few paths met any light to tell how much there is; give more samples (--spp), or more light"
+        return replace(rendered, warnings=(*warnings, f"relative noise {rendered.mc_error:.1e}: {rule}"))
+    return rendered
 
 
 def _of_the_factored(bench: Apparatus) -> tuple[str, ...]:

@@ -171,7 +171,7 @@ class Apparatus:
 
     @cached_property
     def specular(self) -> SpecularLight:
-        """Light of the projector that mirrors alone bring to the sensor."""
+        """Light of the projector that mirrors alone bring to the sensor, or nothing but free space."""
         from mitsim.optics.mirror_frames import SpecularLight
         from mitsim.transport.specular import trace_specular_chains
 
@@ -544,6 +544,7 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) 
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
     from mitsim.transport import plugins
+    from mitsim.transport.connect import shines_in
     from mitsim.transport.transmission import contacts
 
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
@@ -557,7 +558,9 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) 
     unfit = replace(
         loaded.unfit, factored=loaded.unfit.factored or factored, reference=loaded.unfit.reference or reference
     )
-    return replace(loaded, unfit=unfit)
+    projectors = [emitter for emitter in loaded.scene.emitters() if emitter.class_name() == "Projector"]
+    in_view = any(shines_in(loaded.scene, loaded.camera, each) for each in projectors)
+    return replace(loaded, unfit=unfit, in_view=in_view, mirrors=loaded.mirrors or in_view)
 
 
 def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:

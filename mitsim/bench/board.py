@@ -52,7 +52,7 @@ def before_board(
     board = board_object(bench, reflectance, shape, where)
     loaded = bench.loaded
     scene = mi.load_dict({"type": "scene", "camera": loaded.camera, "projector": loaded.projector, "board": board})
-    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False)
+    bare = replace(loaded, scene=scene, lamps=(), small_lamps=(), mirrors=False, glossy=False, in_view=False)
     alone = replace(bare, unfit=Unfit(), shapes=(), coloured=(), parting=())
     stated = {"reflectance": reflectance, "depth_mm": where, **shape.model_dump()}
     return replace(bench, loaded=alone, board=stated)

@@ -210,7 +210,7 @@ EFFECTS: Mapping[str, Effect] = _registry(
     Effect(
         "mirrors",
         {"mirrors": False},
-        what="light over mirrors and through glass, in single directions",
+        what="light over mirrors and through glass, in single directions, and of a projector in view",
         absent="no surface reflects or transmits light in single directions",
         retraced=_always(FOLLOWED),
         first_pilot_run=True,

@@ -32,6 +32,7 @@ from mitsim.light.plan import LEFT_OUT, NO_TIME, ONE, WITHOUT, Plan, PlanRow, St
 from mitsim.light.settings import Estimate, PilotResult, Settings
 from mitsim.planner.choose import Candidate, cheapest, predicted_candidate
 from mitsim.transport.missed import polished_shapes
+from mitsim.transport.plugins.base import turn_and_origin
 
 if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus
@@ -93,6 +94,14 @@ def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
         yield (
             f"{bench.projector.glare:.2g} of the light over mirrors alone is to be scattered in the projector's lens "
             "(ansi_contrast), and stays in its own pixels; --effects=-glare says that no scattering is meant"
+        )
+    lens = bench.projector.aperture_radius_mm
+    if lens and bench.loaded.in_view and not {"aperture", "mirrors"} & set(off):
+        camera = turn_and_origin(bench.loaded.camera.world_transform())[1]
+        blur = 2 * lens * geometry.mask_distance / math.dist(camera, bench.projector_optics.canvas_map.origin)
+        yield (
+            "the projector shines on the sensor itself as a pinhole, without its lens, which would blur the mask's "
+            f"shadow by {blur:.2g} mm; keep it out of the view, or set aperture_radius_mm to 0"
         )
     if bench.field_stop_cuts:
         yield (

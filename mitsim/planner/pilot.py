@@ -282,16 +282,6 @@ class PilotRuns:
         missing = float(unmet.irradiance.sum() - self._sharp.by_pixel[near].sum())
         return missing if missing > _LOOSELY * float(unmet.irradiance.sum()) else 0.0
 
-    def _unsure_specular(self, other: float) -> float:
-        """Part of all light that comes over mirrors alone and is in no frame, or may be in the wrong pixels.
-
-        ``other``: irradiance of all other light [W m^-2].
-        """
-        if not self.bench.loaded.mirrors:
-            return 0.0
-        found, unsure = self.bench.specular.irradiance(self.bench.geometry)
-        return unsure / (other + found + unsure) if unsure else 0.0
-
     # ---- The pilot's result ----
 
     @cached_property
@@ -314,7 +304,10 @@ class PilotRuns:
             "indirect": indirect,
         }
         left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
-        found = self._light + sharp.irradiance + switched.received
+        # Light over mirrors alone, and what of it is in no frame or may be in the wrong pixels.
+        mirrors = self.bench.loaded.mirrors
+        alone, unsure = self.bench.specular.irradiance(self.bench.geometry) if mirrors else (0.0, 0.0)
+        found = self._light + sharp.irradiance + switched.received + alone
         few = not apart and sharp.hits * self.samples["cells"].fine * REPLICATES < _FEWEST_HITS
         unmet = self._unmet
         unresolved = unmet + (sharp.irradiance if few else 0.0)
@@ -330,7 +323,7 @@ class PilotRuns:
             apart=switched.apart,
             unresolved=unresolved / (self._light + sharp.irradiance + unmet) if unresolved else 0.0,
             left_out=left_out / (left_out + found) if left_out else 0.0,
-            unresolved_specular=self._unsure_specular(found),
+            unresolved_specular=unsure / (found + unsure) if unsure else 0.0,
             mirror=mirror,
             reach=self._base.reach,
             sharp=apart,

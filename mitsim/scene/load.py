@@ -49,7 +49,8 @@ class LoadedScene:
     ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
     of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
     side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
-    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths.
+    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths; ``in_view``
+    tells that a projector shines on the sensor itself, over no surface: such light is traced as that of mirrors.
     """
 
     path: Path
@@ -71,13 +72,12 @@ class LoadedScene:
     one_way: bool = False
     sensor_note: str | None = None
     own: Mapping[str, str] = field(default_factory=dict)
+    in_view: bool = False
 
     @property
     def pixels(self) -> ProjectorGrid:
-        """The projector's grid; for scenes opened with ``needs_projector`` it is always there."""
-        if self.grid is None:
-            raise MitsimError(f"{self.path}: the scene was opened without its projector")
-        return self.grid
+        """The projector's grid; of a scene without one, MitsimError says why."""
+        return self.grid or locate_projector(str(self.path), _only_projector(self.path, self.scene), self.camera)
 
     @cached_property
     def smoothed(self) -> bool:
@@ -131,15 +131,13 @@ def load_scene(
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
     emitters = list(scene.emitters())
-    projectors = [emitter for emitter in emitters if emitter.class_name() == "Projector"]
+    projectors = _projectors(scene)
     for projector in projectors:
         scale = float(np.array(mi.traverse(projector)["scale"]).ravel()[0])
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
-    if needs_projector and len(projectors) != 1:
-        raise MitsimError(
-            f'{path}: {len(projectors)} emitters of type "projector"; coded illumination needs exactly one'
-        )
+    if needs_projector:
+        _only_projector(path, scene)
     grid = None
     if len(projectors) == 1:
         try:
@@ -168,6 +166,18 @@ def load_scene(
         sensor_note,
         checked.own,
     )
+
+
+def _projectors(scene: mi.Scene) -> list[mi.Emitter]:
+    return [emitter for emitter in scene.emitters() if emitter.class_name() == "Projector"]
+
+
+def _only_projector(path: Path, scene: mi.Scene) -> mi.Emitter:
+    """The projector of a ``scene``; MitsimError, with its ``path``, where there is not exactly one."""
+    found = _projectors(scene)
+    if len(found) != 1:
+        raise MitsimError(f"{path}: needs one emitter of type projector, the file has {len(found) or 'none'}")
+    return found[0]
 
 
 def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:

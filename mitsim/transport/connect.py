@@ -476,10 +476,10 @@ class ProjectorConnector:
 # -------- Light of a lamp onto the sensor, over no surface
 #
 # No path runs into a point, spot or directional lamp, few run into a small one that has a surface, and no tracer
-# connects the sensor itself to either.
+# connects the sensor itself to either. Of a projector such light is a beam's (:mod:`mitsim.transport.specular`).
 
-_SENSOR_POINTS = 9
-"""Points along each side of the sensor, its edges with them: things in the way are larger than an eighth of it."""
+_SENSOR_POINTS = 129
+"""Points along each side of the sensor, its edges with them: a hole lights more than a 128th of it."""
 _LAMP_POINTS = 2**10
 """Points of a lamp: how much of it is seen is known to some percent."""
 
@@ -493,7 +493,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     scene, camera
         what may stand in the way, and the sensor.
     lamp
-        a point, spot or directional one.
+        a point, spot or directional one, or a projector.
     """
     edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
     x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
@@ -503,6 +503,8 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     sensor.wavelengths, _ = sample_wavelengths(camera, rng)
     ds, light = lamp.sample_direction(sensor, mi.Point2f(0.5), True)
     met = _in_view(camera, ds.d) & (dr.max(mi.unpolarized_spectrum(light)) > 0)
+    if not np.array(met).any():
+        return False
     seen, _ = Passage(scene).between(sensor, ds.p, met)
     return bool(np.array(met & seen).any())
 

@@ -2,11 +2,13 @@
 
 Light that mirrors or curved glass bring both from the projector to a surface and from there to the camera (a print in a
 bottle), and the part of indirect light that is followed from the camera to a caustic: a path from the camera meets no
-pinhole, and none from the projector the sensor's centre. A small lens in the pinhole's place casts the same light, and
-paths run into it. A lens of the projector's own they run into as well, but seldom where it is smaller.
+pinhole, and none from the projector the sensor's centre. So rays of the projector are followed over mirrors to where
+they land, and what lands near the vertices of paths from the camera is what these lack: light per area, over small
+squares of a surface. A lens of the projector's own paths run into by chance, but seldom where it is small.
 
-So do paths over one mirror and one sharp lobe. Connections may meet such a lobe by chance: of the projector's side from
-the lobe to the sensor, of the camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
+Other paths come over one mirror and one sharp lobe: a small lens in the pinhole's place casts the same light, and they
+run into it. Connections may meet such a lobe by chance: of the projector's side from the lobe to the sensor, of the
+camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
 path that runs into the lens and I that of the connection along the same way, E[x I] is a connection's second moment, so
 a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would. Whether that is
 enough, whoever asks knows: lobes of curved surfaces are met seldom however broad they are.
@@ -42,8 +44,14 @@ from mitsim.transport.plugins.base import (
 )
 from mitsim.transport.projector import PinholeRays, wavelength_sets
 from mitsim.transport.records import DIRECT, INDIRECT, CellGrid, PathSamples, Sightings, check_finite
+from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival
 
+_CUBE, _CUBES = 5e-3, 2**20
+"""Side of cubes over the scene's distance, 2 mm at 400, and codes of them: a surface that crosses a cube has the area
+of its square, or at 45 degrees 0.94 of that in the mean, and finer caustics have the right light in the mean."""
+_GRAZING = 1e-3
+"""Least cosine that light on a surface is divided by."""
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
 
@@ -101,8 +109,10 @@ def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int)
     """
     far = setup.geometry.scene_distance
     lens = replace(setup.projector, aperture=_LENS * far, focus=far)
-    paths = Paths(mirrors=True, interreflection=True)
-    found = _MissedTracer(replace(setup, projector=lens), grid, paths).trace(seed, 0, samples)
+    tracer = _MissedTracer(replace(setup, projector=lens), grid, Paths(mirrors=True, interreflection=True))
+    tracer.landed = _Landed.of(setup)
+    dr.eval(tracer.landed)
+    found = tracer.trace(seed, 0, samples)
     # Path samples name shapes by their number in Dr.Jit's registry.
     numbers = np.array(dr.reinterpret_array(mi.UInt32, setup.scene.shapes_dr())).astype(np.int64)
 
@@ -110,10 +120,11 @@ def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int)
         return np.asarray(np.bincount(light.pixel, values, int(numbers.max()) + 1)[numbers] / samples)
 
     lost, met = (found.where(found.kind == kind) for kind in (INDIRECT, DIRECT))
-    mirrors, hits = _equal_hits(by_shape(lost, lost.value), by_shape(lost, np.square(lost.value)))
-    # A lens of half the radius is met a quarter as often, and four times as bright.
-    seldom = np.square(setup.projector.aperture / lens.aperture)
-    return LeftOut(mirrors, hits * seldom, *_equal_hits(by_shape(met, met.value), by_shape(met, met.value * met.row)))
+    # A lens of 1 mm^2; one of half the radius is met a quarter as often, and four times as bright.
+    (mirrors, hits), lobes = (
+        _equal_hits(by_shape(each, each.value), by_shape(each, each.value * each.row)) for each in (lost, met)
+    )
+    return LeftOut(mirrors, hits * math.pi * setup.projector.aperture**2, *lobes)
 
 
 def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -121,9 +132,71 @@ def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, Flo
     return light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
 
 
+@dataclass
+class _Turned:
+    """Rays that mirrors have turned, where they met surfaces: place, direction, the mirror, flux [W m^-2 mm^2], and
+    what of it leaves 1 mm^2 at unit distance."""
+
+    place: mi.Vector3f
+    direction: mi.Vector3f
+    mirror: mi.UInt32
+    flux: mi.Float
+    power: mi.Float
+
+
+@dataclass(frozen=True, eq=False)
+class _Landed:
+    """``rays`` in the order of cubes of space: the ``first`` of each cube, by its code, and cubes' ``side`` [mm]."""
+
+    first: mi.UInt32
+    side: mi.Float
+    rays: _Turned
+
+    @classmethod
+    def of(cls, setup: OpticalSetup) -> _Landed | None:
+        """Those of a ``setup``; None where there are none."""
+        found = turned_by_mirrors(setup.scene, setup.camera, setup.projector)
+        if not (count := len(found.index)):
+            return None
+        start, way = (mi.Vector3f(*device_vectors(each)) for each in (found.start, found.direction))
+        si, side = setup.scene.ray_intersect(mi.Ray3f(start, way)), mi.Float(_CUBE * setup.geometry.scene_distance)
+        scatters = host_values(si.bsdf().flags() & int(mi.BSDFFlags.Smooth), count) != 0
+        code = np.where(scatters, host_values(_cube(si.p, side), count), _CUBES)
+        order = np.argsort(code, kind="stable")
+        first = np.searchsorted(code[order], np.arange(_CUBES + 1))
+        rays = _Turned(mi.Vector3f(si.p), way, mi.UInt32(found.mirror), *map(mi.Float, found.spectrum.T))
+        return cls(mi.UInt32(first), side, dr.gather(_Turned, rays, mi.UInt32(order)))
+
+    def light(
+        self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
+        """Radiance that surfaces at ``si`` send on of the light in their cubes, one ray of each being drawn by ``rng``
+        for all; that of a lens of 1 mm^2 in the pinhole's place, where a turn meets it; and the mirror."""
+        code = _cube(si.p, self.side)
+        first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
+        count = mi.Float(end - first)
+        number = first + mi.UInt32(rng.next_float32() * count)
+        ray = dr.gather(_Turned, self.rays, number, active)
+        # Cubes far apart may have the same code.
+        active &= (number < end) & (dr.squared_norm(ray.place - si.p) < 3 * dr.square(self.side))
+        sent = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(-ray.direction), active))
+        sent /= dr.maximum(dr.abs(dr.dot(si.n, ray.direction)), _GRAZING)
+        parts = ray.flux * count / dr.square(self.side), ray.power * dr.pi
+        landed, turned = (dr.select(active, sent * part, 0) for part in parts)
+        return landed, turned, ray.mirror
+
+
+def _cube(place: mi.Point3f, side: mi.Float) -> mi.UInt32:
+    """Code of the cube that a ``place`` lies in, off the planes where scenes have their walls."""
+    x, y, z = (mi.UInt32(mi.Int32(dr.floor(part / side + 0.381966))) for part in place)
+    return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & (_CUBES - 1)
+
+
 class _MissedTracer(FromCameraTracer):
-    """Light that a lens would bring, accumulated by shape: that which no connection finds as indirect light, that over
-    a mirror and a lobe as direct light, with what a connection brings in the row's stead."""
+    """Light that no connection finds as indirect light, that over a mirror and a lobe as direct light, by shape; in the
+    row's stead what a path into a lens of 1 mm^2 brings, or a connection."""
+
+    landed: _Landed | None
 
     def _paths(self, flight: InFlight) -> _MissedPaths:
         return _MissedPaths(self, flight)
@@ -131,36 +204,44 @@ class _MissedTracer(FromCameraTracer):
 
 @dataclass(kw_only=True)
 class _MissedState(CameraState):
-    """``mirror`` and ``lobe`` are the last shape of either kind that a path met, ``density`` that of the turn there."""
+    """``lobe`` is the last shape that scattered a path, ``density`` that of the turn there."""
 
-    mirror: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
     lobe: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
     density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
 class _MissedPaths(CameraPaths[_MissedState]):
-    """Paths from the camera that only running into the lens can end."""
+    """Paths from the camera that only running into the lens, or what mirrors bring to their vertices, can end."""
 
-    def __init__(self, tracer: FromCameraTracer, flight: InFlight) -> None:
+    tracer: _MissedTracer
+
+    def __init__(self, tracer: _MissedTracer, flight: InFlight) -> None:
         super().__init__(tracer, _MissedState, flight)
         self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Nothing: what connections find is not left out."""
+        """Keep light that mirrors bring, from where it lands; what connections find is not left out."""
+        if first or self.tracer.landed is None:
+            return
+        foreign = paths.active & (paths.in_mirror | (paths.scattered > 0))
+        # Numbers of its own, so that paths are those of a scene without such light.
+        light, turned, mirror = self.tracer.landed.light(si, mi.PCG32(paths.rng), foreign)
+        missed, hit = (self._irradiance(paths, each) * paths.part for each in (light, turned))
+        none = mi.Float(0)
+        self._join(paths, "indirect", Sightings.of(missed, self.by_line, mirror, panchromatic(hit), none, none))
 
     def _hit_lens(self, paths: _MissedState, si: mi.SurfaceInteraction3f) -> None:
-        """Light that mirrors bring from the lens to the last surface, or over a mirror and a sharp lobe."""
-        lost = self._is_foreign(paths) & paths.by_delta
+        """Keep light over a mirror and a sharp lobe."""
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
-        hit = self.connector.hit(paths.ray, si.t, paths.rng, lost | met, paths.since)
-        light, none, by_line = self._irradiance(paths, hit.radiance), mi.Float(0), self.by_line
-        missed = dr.select(hit.met & lost, light * paths.part, 0)
-        self._join(paths, "indirect", Sightings.of(missed, by_line, paths.mirror, none, none, none))
+        hit = self.connector.hit(paths.ray, si.t, paths.rng, met, paths.since)
+        light, none = self._irradiance(paths, hit.radiance), mi.Float(0)
         met &= hit.met
         in_mirror = panchromatic(light) * paths.density / hit.pdf
         connected = dr.select(met, dr.select(paths.in_mirror, in_mirror, self._projector_light(paths, hit)), 0)
-        self._join(paths, "direct", Sightings.of(dr.select(met, light, 0), by_line, paths.lobe, connected, none, none))
+        self._join(
+            paths, "direct", Sightings.of(dr.select(met, light, 0), self.by_line, paths.lobe, connected, none, none)
+        )
 
     def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
         """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
@@ -175,7 +256,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
         going = super()._note_turn(paths, si, turn, first)
         shape = dr.reinterpret_array(mi.UInt32, dr.select(si.instance != None, si.instance, si.shape))  # noqa: E711
         turned = ~turn.passing & ~paths.by_delta
-        paths.mirror = dr.select(~turn.passing & paths.by_delta, shape, paths.mirror)
         paths.lobe = dr.select(turned, shape, paths.lobe)
         paths.density = dr.select(turned, paths.came_pdf, paths.density)
         return going

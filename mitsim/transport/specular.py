@@ -1,10 +1,11 @@
 """Specular chains: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors
-alone.
+alone, or over nothing.
 
-A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it: it is traced from the
-projector instead (:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel.
-Four neighbours that met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are
-divided until the map from the projector's window to the sensor is bilinear over each.
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it; nor does one find a
+projector in view, through a hole or beside a card. Such light is traced from the projector instead
+(:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel. Four neighbours that
+met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided until the map
+from the projector's window to the sensor is bilinear over each.
 :mod:`mitsim.optics.mirror_frames` turns beams into frames.
 
 Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
@@ -29,7 +30,7 @@ from mitsim.devices.camera import CameraGeometry
 from mitsim.optics.mirror_frames import Beams
 from mitsim.transport.plugins.base import turn_and_origin
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
-from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, SpecularRays, delta_bsdfs, grazing
+from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, Rays, SpecularRays, grazing, join
 
 _UNIT = 2**24
 """Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
@@ -45,6 +46,10 @@ _AT_ONCE = 2**18
 """Squares that are looked at together, some hundreds of MB."""
 _COARSE = 128
 """Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
+_TURNED, _MIRRORS = 256, 16
+"""Rays along the window's side that tell where mirrors send its light to, and how many mirrors a ray may meet."""
+_ACROSS_SENSOR = 128
+"""Rays across a sensor that the projector shines on over no mirror: a hole that lights a 128th of it is seen."""
 _TOLERANCE = 0.02
 """Largest departure from a bilinear map, in sensor pixels: twice what float32 leaves of a place at the sensor."""
 _SHADES = 0.01
@@ -67,14 +72,11 @@ _MARGIN = 0.02
 """Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
 
-def has_mirrors(scene: mi.Scene) -> bool:
-    """Whether some surface of the ``scene`` reflects or refracts like a perfect mirror or lens."""
-    return bool(delta_bsdfs(scene, int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)))
-
-
 @keep_scenes()
-def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = 16) -> Beams:
-    """All beams that leave the projector, meet perfect mirrors or lenses alone, and reach the sensor.
+def trace_specular_chains(
+    scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = _MIRRORS
+) -> Beams:
+    """All beams that leave the projector, meet perfect mirrors or lenses alone, or nothing, and reach the sensor.
 
     A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
 
@@ -94,8 +96,6 @@ def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: Project
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
-    if not has_mirrors(scene):
-        return _join([], np.zeros(2))
     parts, left = [], np.zeros(2)
     for each in projector.per_wavelength:
         beams, lost = _projector_beams(SpecularRays(scene, camera, each, max_depth), projector.n, camera.geometry)
@@ -106,16 +106,40 @@ def trace_specular_chains(scene: mi.Scene, camera: mi.Sensor, projector: Project
 
 def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
     """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
-    step = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(_COARSE / n)))))
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
     parts, left = [], np.array([close, 0.0])
-    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _UNIT, step, _DIVISIONS, arcs):
+    # Where the window holds the sensor itself, it is looked for as finely as small mirrors are.
+    sides = np.array([[geometry.half_width], [2 * geometry.half_width / _ACROSS_SENSOR]])
+    arcs.append(_window_boxes(_Spots(tracer.camera_place[None], *sides), tracer.rays))
+    for size, row, column in first_squares(tracer.mirrors, tracer.rays, n, _COARSE, arcs):
         for first in range(0, len(row), _AT_ONCE):
             chosen = slice(first, first + _AT_ONCE)
             beams, lost = _search(tracer, row[chosen], column[chosen], size, n, geometry)
             parts += beams
             left += lost
     return parts, left
+
+
+def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics) -> Rays:
+    """Rays that mirrors have turned, before each surface; one is sent through the middle of each square of a grid.
+
+    In the ``spectrum``'s stead they have their flux [W m^-2 mm^2], and what leaves 1 mm^2 at unit distance.
+
+    Parameters
+    ----------
+    scene, camera, projector
+        as for :func:`trace_specular_chains`.
+    """
+    parts = list[Rays]()
+    for each in projector.per_wavelength:
+        tracer = SpecularRays(scene, camera, each, _MIRRORS)
+        for size, row, column in first_squares(tracer.mirrors, tracer.rays, each.n, _TURNED):
+            turned = list[Rays]()
+            tracer.follow((np.stack([row, column], axis=1) + size / 2) / _UNIT, turned)
+            rays, area = join(turned), tracer.rays.area * (size / _UNIT) ** 2
+            flux = _fluxes(tracer, row, column, size, each.n)[rays.index] * (rays.spectrum @ tracer.colour)
+            parts.append(replace(rays, spectrum=np.stack([flux, flux / area], axis=1)))
+    return join(parts)
 
 
 def _search(
@@ -430,7 +454,7 @@ class _Spots:
 
 
 def first_squares(
-    mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, unit: int, size: int, least: int, more: Sequence[Boxes] = ()
+    mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, coarse: int, more: Sequence[Boxes] = ()
 ) -> Iterator[tuple[int, IntArray, IntArray]]:
     """Squares that tile the window, small ones where small mirrors are seen: size, first rows and first columns.
 
@@ -440,19 +464,20 @@ def first_squares(
         shapes whose light is looked for.
     rays
         of the projector.
-    n, unit
-        projector pixels along the window's side, and points of the lattice a pixel.
-    size, least
-        of the largest squares and the smallest, in points of the lattice.
+    n, coarse
+        projector pixels along the window's side, and squares of the coarsest grid, at least.
     more
         boxes that are looked through besides, as finely as they say.
     """
-    line = np.arange(0, n * unit, size)
+    size = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(coarse / n)))))
+    line = np.arange(0, n * _UNIT, size)
     row, column = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
-    cell = size / unit * np.sqrt(rays.area)  # side of a square at unit distance
-    spots = [_window_boxes(_spots(shape, rays, cell), rays, unit) for shape in mirrors]
-    spots = [(low, high, np.maximum(step, least)) for low, high, step in spots]
-    low, high, step = (np.concatenate(parts) for parts in zip(*spots, *more, strict=True))
+    cell = size / _UNIT * np.sqrt(rays.area)  # side of a square at unit distance
+    spots = [_window_boxes(_spots(shape, rays, cell), rays) for shape in mirrors]
+    spots = [(low, high, np.maximum(step, _DIVISIONS)) for low, high, step in spots]
+    none = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+    low, high, step = (np.concatenate(parts) for parts in zip(none, *spots, *more, strict=True))
+    low, high = (np.clip(ends, -1.0, n * _UNIT) for ends in (low, high))  # what is beside the window may be far
     while len(row):
         small = step < size
         low, high, step = low[small], high[small], step[small]
@@ -489,11 +514,11 @@ def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: Fl
     return found
 
 
-def _window_boxes(spots: _Spots, rays: PinholeRays, unit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _window_boxes(spots: _Spots, rays: PinholeRays) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Boxes (k, 2) that hold ``spots`` in the window, and steps, in points of the lattice."""
     place, depth = rays.points(spots.centre)
     front = (depth > 0) & np.isfinite(place).all(axis=1)
-    place, scale = place[front] * unit, unit / (np.sqrt(rays.area) * depth[front])
+    place, scale = place[front] * _UNIT, _UNIT / (np.sqrt(rays.area) * depth[front])
     reach = (_SPOT_MARGIN * spots.radius[front] + spots.step[front]) * scale
     return place - reach[:, None], place + reach[:, None], spots.step[front] * scale
 

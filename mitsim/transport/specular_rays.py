@@ -21,7 +21,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
-from mitsim.transport.transmission import CLEAR, Passage, transmits
+from mitsim.transport.transmission import CLEAR, Passage, flat_panes, transmits
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
@@ -50,7 +50,7 @@ def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Rays that crossed the sensor plane from the front after at least one mirror; one ray may arrive several times.
+    """Rays that crossed the sensor plane from the front, over mirrors or none; one ray may arrive several times.
 
     Attributes
     ----------
@@ -72,10 +72,23 @@ class Crossings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rays:
-    """Rays under way. ``start`` lies on the ray a little beyond ``origin``, clear of the surface that it leaves."""
+class Rays:
+    """Rays under way, (k, .) each.
+
+    Attributes
+    ----------
+    index
+        number of the ray that was sent.
+    mirror
+        number, in Dr.Jit's registry, of what turned it last and is no pane of glass; 0 for nothing.
+    origin, direction, start
+        where it left a surface, which way, and a place on it a little beyond, clear of the surface.
+    chain, spectrum
+        as in :class:`Crossings`, and the part of its light left by colour.
+    """
 
     index: IntArray
+    mirror: IntArray
     origin: FloatArray
     direction: FloatArray
     start: FloatArray
@@ -83,10 +96,10 @@ class _Rays:
     spectrum: FloatArray
 
 
-Some = TypeVar("Some", Crossings, _Rays)
+Some = TypeVar("Some", Crossings, Rays)
 
 
-def _join(parts: Sequence[Some]) -> Some:
+def join(parts: Sequence[Some]) -> Some:
     """All of one or more ``parts`` in one."""
     return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
@@ -113,26 +126,29 @@ class SpecularRays:
         self._wavelengths = wavelength_sets(projector.lines)
         self.rays = PinholeRays(projector, self._wavelengths)
         mean = self.rays.power.mean(axis=0)
-        self._colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
+        self.colour = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
         self._lobes = _group_lobes(
             lobe for bsdf in delta_bsdfs(scene, int(mi.BSDFFlags.Delta)) for lobe in _lobes(bsdf)
         )
         polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
         self.mirrors = [s for s in scene.shapes() if s.bsdf() is not None and s.bsdf().flags() & polished]
         self._exact = ExactHits(self.mirrors)
+        self._panes = [_number(pane) for pane in flat_panes(scene)]
         self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
-    def follow(self, points: FloatArray) -> Crossings:
-        """Send rays through window ``points`` (row, column) (k, 2), in projector pixels."""
+    def follow(self, points: FloatArray, turned: list[Rays] | None = None) -> Crossings:
+        """Send rays through window ``points`` (row, column) (k, 2), in projector pixels; a list ``turned`` gets those
+        that mirrors have turned, before each surface that they meet."""
         count = len(points)
         origin = np.broadcast_to(self.rays.origin, (count, 3))
-        rays = _Rays(
+        rays = Rays(
             np.arange(count),
+            np.zeros(count, np.int64),
             origin,
             self.rays.directions(points),
             origin,
             np.zeros(count, dtype=np.uint64),
-            np.ones((count, len(self._colour))),
+            np.ones((count, len(self.colour))),
         )
         crossings = []
         for _ in range(self._max_depth + 1):
@@ -141,19 +157,23 @@ class SpecularRays:
             distance = distance + np.linalg.norm(rays.start - rays.origin, axis=1)
             crossing, arrived = self._cross(rays, distance)
             crossings.append(crossing)
-            onward = self._bounce(rays, si, ~arrived & np.isfinite(distance))
+            met = ~arrived & np.isfinite(distance)
+            if turned is not None:
+                own = met & (rays.mirror != 0)
+                turned.append(Rays(*(values[own] for values in vars(rays).values())))
+            onward = self._bounce(rays, si, met)
             if not onward:
                 break
-            rays = _join(onward)
-        return _join(crossings)
+            rays = join(onward)
+        return join(crossings)
 
-    def _intersect(self, rays: _Rays) -> mi.SurfaceInteraction3f:
+    def _intersect(self, rays: Rays) -> mi.SurfaceInteraction3f:
         ray = mi.Ray3f(mi.Point3f(*device_vectors(rays.start)), mi.Vector3f(*device_vectors(rays.direction)))
         si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
         dr.eval(si)
         return si
 
-    def _cross(self, rays: _Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
+    def _cross(self, rays: Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
         """Rays that cross the sensor plane from the front before they meet anything."""
         origin = (rays.origin - self.camera_place) @ self._camera_turn
         direction = rays.direction @ self._camera_turn
@@ -161,18 +181,17 @@ class SpecularRays:
         reach = np.full(len(ahead), np.inf)
         np.divide(-origin[:, 2], direction[:, 2], out=reach, where=ahead)
         arrived = ahead & (reach < distance)
-        turned = arrived & (rays.chain != 0)
-        o, d, r = origin[turned], direction[turned], reach[turned, None]
+        o, d, r = origin[arrived], direction[arrived], reach[arrived, None]
         crossing = Crossings(
-            rays.index[turned],
-            rays.chain[turned],
+            rays.index[arrived],
+            rays.chain[arrived],
             _rows_columns(o + d * r),
             _rows_columns(d / d[:, 2:]),
-            rays.spectrum[turned] @ self._colour,
+            rays.spectrum[arrived] @ self.colour,
         )
         return crossing, arrived
 
-    def _bounce(self, rays: _Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[_Rays]:
+    def _bounce(self, rays: Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[Rays]:
         """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
         hits = _plane_hits(rays, si)
@@ -181,7 +200,7 @@ class SpecularRays:
         numbers = shapes.astype(np.int64), host_values(si.prim_index, count).astype(np.int64)
         self._exact.refine(rays.origin, rays.direction, hits, *numbers)
         point, geometric, normal = hits.point, hits.geometric, hits.normal
-        onward: list[_Rays] = []
+        onward: list[Rays] = []
         materials = host_values(dr.reinterpret_array(mi.UInt32, si.bsdf()), count)
         for lobe, own in self._lobes:
             own_lobe = active & np.isin(materials, own)
@@ -192,7 +211,7 @@ class SpecularRays:
             kind, eta = host_values(sample.sampled_type, count), host_values(sample.eta, count)
             single = (kind & int(mi.BSDFFlags.Delta)) != 0
             spectrum = rays.spectrum * np.nan_to_num(weight)
-            chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self._colour) > _FAINTEST))
+            chosen = np.flatnonzero(own_lobe & single & ((spectrum @ self.colour) > _FAINTEST))
             traced = vectors(si.to_world(sample.wo), count)[chosen]
             turn = kind[chosen], eta[chosen], rays.direction[chosen]
             # What Mitsuba did with its own normal tells which law it is; the better normal is for where light goes.
@@ -205,9 +224,11 @@ class SpecularRays:
             code = shapes[chosen] * np.uint64(2) + reflected.astype(np.uint64) + np.uint64(1)
             straight = lobe.kind == int(mi.BSDFFlags.Null)
             chain = rays.chain[chosen] if straight else rays.chain[chosen] * _CHAIN + code
-            start = point[chosen] + direction * clear[:, None]
+            passes = straight | (np.isin(numbers[0][chosen], self._panes) & ~reflected)
+            mirror = np.where(passes, rays.mirror[chosen], numbers[0][chosen])
+            ways = point[chosen], direction, point[chosen] + direction * clear[:, None]
             if len(chosen):
-                onward.append(_Rays(rays.index[chosen], point[chosen], direction, start, chain, spectrum[chosen]))
+                onward.append(Rays(rays.index[chosen], mirror, *ways, chain, spectrum[chosen]))
         return onward
 
     def _sample_lobe(
@@ -285,7 +306,7 @@ def _context() -> mi.BSDFContext:
     return mi.BSDFContext(mi.TransportMode.Importance)
 
 
-def _plane_hits(rays: _Rays, si: mi.SurfaceInteraction3f) -> Hits:
+def _plane_hits(rays: Rays, si: mi.SurfaceInteraction3f) -> Hits:
     """Where rays met surfaces, in float64 with the tangent plane of each."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
@@ -347,8 +368,7 @@ class ExactHits:
         for shape in shapes:
             surface = _surface(shape)
             if surface is not None:
-                number = int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
-                self._surfaces[number] = surface
+                self._surfaces[_number(shape)] = surface
 
     def refine(self, origin: FloatArray, direction: FloatArray, hits: Hits, shape: IntArray, face: IntArray) -> None:
         """Replace ``hits`` on the surfaces that are known.
@@ -367,6 +387,10 @@ class ExactHits:
             old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
             with np.errstate(all="ignore"):
                 hits.put(mine, self._surfaces[int(number)].meet(origin[mine], direction[mine], old, face[mine]))
+
+
+def _number(shape: mi.Shape) -> int:
+    return int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))).ravel()[0])
 
 
 def _surface(shape: mi.Shape) -> _Surface | None:

@@ -49,12 +49,13 @@ def bench(
             unfit=Unfit(),
             shapes=(),
             mirrors=mirrors,
+            in_view=False,
             small_lamps=(),
             coloured=coloured,
             parting=(),
         ),
         lines=None,
-        projector=SimpleNamespace(glare=glare),
+        projector=SimpleNamespace(glare=glare, aperture_radius_mm=0.0),
         sensor=SimpleNamespace(quantum_efficiency_curve=curve),
     )
 

@@ -249,10 +249,10 @@ def test_a_scene_without_projector_is_for_render_only(small_scene: Write) -> Non
     text = path.read_text()
     start, end = text.index("<emitter"), text.index("</emitter>") + len("</emitter>")
     path.write_text(text[:start] + '<emitter type="constant"/>' + text[end:])
-    assert '0 emitters of type "projector"' in refusal(path)
+    assert "needs one emitter of type projector, the file has none" in refusal(path)
     loaded = load_scene(path, needs_projector=False)
     assert loaded.grid is None and loaded.projector is None and len(loaded.lamps) == 1
-    with pytest.raises(MitsimError, match="without its projector"):
+    with pytest.raises(MitsimError, match="needs one emitter of type projector, the file has none"):
         _ = loaded.pixels
 
 

@@ -10,8 +10,11 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.optics.fft_shadow import geometric_samplers
 from mitsim.optics.mirror_frames import specular_frames
+from mitsim.scene.limits import Unfit
+from mitsim.scene.load import _mirrors_and_gloss
+from mitsim.transport.connect import shines_in
 from mitsim.transport.projector import PinholeRays, ProjectorOptics
-from mitsim.transport.specular import has_mirrors, trace_specular_chains
+from mitsim.transport.specular import trace_specular_chains
 from mitsim.transport.specular_rays import SpecularRays
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -100,7 +103,7 @@ def test_power_is_the_irradiance_that_mitsuba_renders(variant: str) -> None:
 
 
 def test_what_counts_as_a_mirror(variant: str) -> None:
-    assert not has_mirrors(scene_with())
+    assert not _mirrors_and_gloss(scene_with(), Unfit())[0]
     for bsdf, answer in (
         ({"type": "diffuse"}, False),
         ({"type": "roughconductor", "alpha": 0.05}, False),
@@ -111,7 +114,7 @@ def test_what_counts_as_a_mirror(variant: str) -> None:
         ({"type": "thindielectric"}, True),
         ({"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"}, "b": CONDUCTOR}, True),
     ):
-        assert has_mirrors(scene_with(sheet=plane(0, 400, bsdf))) is answer, bsdf
+        assert _mirrors_and_gloss(scene_with(sheet=plane(0, 400, bsdf)), Unfit())[0] is answer, bsdf
 
 
 def test_no_mirror_no_beams_and_a_depth_of_at_least_one(variant: str) -> None:
@@ -194,6 +197,41 @@ def test_the_edge_of_a_card_that_is_not_there_cuts_no_beam(variant: str) -> None
     alone = scene_with(sheet=plane(0, 400, CONDUCTOR))
     assert beams.unresolved == 0
     assert len(beams) == len(trace_specular_chains(alone, alone.sensors()[0], projector(alone)))
+
+
+def hole(half: float) -> dict:
+    """An opacity of 200 x 200 texels with a square hole in the middle, ``half`` its side in texels."""
+    opaque = np.ones((200, 200, 1), np.float32)
+    opaque[100 - int(half) : 100 + int(half), 100 - int(half) : 100 + int(half)] = 0
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(opaque), "raw": True, "filter_type": "nearest"}
+    return {"type": "mask", "opacity": texture, "bsdf": {"type": "diffuse"}}
+
+
+@pytest.mark.parametrize(
+    ("card", "part"),
+    [
+        ({"type": "mask", "opacity": 0.75, "bsdf": {"type": "diffuse"}}, 0.25),
+        (hole, 1.2**2 / 6.4**2),
+        ({"type": "diffuse"}, 0.0),
+    ],
+    ids=["thin", "hole", "closed"],
+)
+def test_a_projector_in_view_shines_on_the_sensor(variant: str, card: object, part: float) -> None:
+    """The irradiance pi scale texture / z^2 at 800 mm of the window's mean pixel row, through a card halfway.
+
+    A hole of 0.6 mm lights 1.2 mm of the sensor's 6.4, and the pinhole lies on the axis. (Planted: rays over no surface
+    are dropped, as they were: 0 for all three.)
+    """
+    toward = mi.ScalarAffineTransform4f().look_at(origin=[0, 0, 800], target=[0, 0, 0], up=[0, 1, 0])
+    sheet = plane(0, 400, hole(3) if card is hole else card, 10, 1.0)
+    camera = scene_with().sensors()[0]
+    scene = mi.load_dict({"type": "scene", "camera": camera, "light": emitter(100, toward), "card": sheet})
+    camera, optics = scene.sensors()[0], ProjectorOptics(scene.emitters()[0], 100, 1, 2, (103, 201))
+    beams = trace_specular_chains(scene, camera, optics)
+    terms = geometric_samplers(camera.geometry)
+    found = specular_frames(beams, camera.geometry, terms, np.zeros(100**2, np.int64)).flux / 6.4**2
+    assert found == pytest.approx(part * np.pi * SCALE * 0.75 / 800**2, rel=0.02)
+    assert shines_in(scene, camera, optics.emitter) is (part > 0)
 
 
 def test_a_slab_of_glass_shifts_the_ray_by_snells_law(variant: str) -> None:
