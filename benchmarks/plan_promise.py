@@ -66,7 +66,7 @@ def session_psnrs(bench: Any, patterns: str, recipe: Any, seeds: range) -> list[
 
 def transport(scene: str, side: int | None, projector: str | None) -> str:
     """A row of predicted and measured seconds of transport."""
-    given = {"projector": projector} if projector else {}
+    given: dict[str, Any] = {"projector": projector} if projector else {}
     bench = ms.open_bench(scene, for_render=True, **given)
     if side:
         with tempfile.TemporaryDirectory() as folder:
