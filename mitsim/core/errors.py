@@ -132,7 +132,7 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
             allowed = kinds.get(name, rest)
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                raise ArgumentError(name, f"{shown(value)}: give {words}")
+                raise ArgumentError(name, f"{short_text(value)}: give {words}")
         plain = {name: _plain(value) for name, value in named.items()}
         return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
 
@@ -219,7 +219,7 @@ def is_masked(value: object) -> bool:
     return "MaskedArray" in (each.__name__ for each in type(value).__mro__)
 
 
-def shown(value: object) -> str:
+def short_text(value: object) -> str:
     """Return a refused ``value`` on a short line; of a number of thousands of digits its kind."""
     try:
         return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else repr(value))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mitsim.core.errors import ArgumentError, MitsimError, shown
+from mitsim.core.errors import ArgumentError, MitsimError, short_text
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
@@ -80,23 +80,25 @@ class ImageRequest:
         if lam != "auto" and not isinstance(self.method, str):
             raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
         if lam != "auto" and (isinstance(lam, str) or not 0 <= lam <= _MOST):
-            raise ArgumentError("lam", f"{shown(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}")
+            raise ArgumentError(
+                "lam", f"{short_text(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}"
+            )
         if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus <= _MOST):
-            raise ArgumentError("focus", f"{shown(focus)}: give a depth above 0 mm, auto or map")
+            raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto or map")
         if self.depth_range is not None:
             self._check_range(self.depth_range)
         if self.bounds is not None:
             self._check_bounds(self.bounds)
         steps: Any = self.iterations
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
-            raise ArgumentError("iterations", f"{shown(steps)}: give a whole number, at least 1")
+            raise ArgumentError("iterations", f"{short_text(steps)}: give a whole number, at least 1")
         for name, value in self.iterative.items():
             if method not in (NONNEGATIVE, TV):
                 raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
         if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
-            raise ArgumentError("margin", f"{shown(margin)}: give a whole number of cells, at least 0")
+            raise ArgumentError("margin", f"{short_text(margin)}: give a whole number of cells, at least 0")
         if margin and (focus is not None or method != TIKHONOV):
             raise ArgumentError(
                 "margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus"
@@ -106,7 +108,7 @@ class ImageRequest:
         two = isinstance(ends, (tuple, list)) and len(ends) == 2
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
         if not (real and 0 < ends[0] < ends[1] <= _MOST):
-            raise ArgumentError("depth_range", f"{shown(ends)}: give two depths above 0 mm, the nearer one first")
+            raise ArgumentError("depth_range", f"{short_text(ends)}: give two depths above 0 mm, the nearer one first")
         if not self.looks_for_depth:
             raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
 
@@ -115,7 +117,7 @@ class ImageRequest:
         real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
         within = real and all(abs(end) <= _MOST or abs(end) == math.inf for end in ends)
         if not (real and ends[0] < ends[1] and ends[0] <= _MOST and ends[1] >= -_MOST and within):
-            raise ArgumentError("bounds", f"{shown(ends)}: give two numbers, the smaller one first")
+            raise ArgumentError("bounds", f"{short_text(ends)}: give two numbers, the smaller one first")
 
     @property
     def iterative(self) -> dict[str, Any]:
@@ -186,7 +188,7 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 def check_joint(lam: float | str) -> None:
     """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
     if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
-        raise ArgumentError("lam", f"{shown(lam)}: behind colour filters give a finite number above 0, or auto")
+        raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
 
 # ---- What a Tikhonov image takes -------------------------------------------------------------------------------------

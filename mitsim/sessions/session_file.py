@@ -22,7 +22,7 @@ import tomli_w
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request, SessionRequest
 from mitsim.core.configuration import Configuration, locate, read_toml, shipped_path, validate
-from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, shown
+from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, short_text
 from mitsim.core.files import PAGE, PICTURES, resolve
 from mitsim.core.mistakes import Mistake, Place, Table, mistakes, told_together
 from mitsim.devices.session import SessionRecipe, load_recipe
@@ -330,7 +330,7 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
 def _change(data: Table, name: str, value: Any, where: str) -> Place:
     """Set the field of a dotted ``name`` to a ``value``; its place."""
     if not isinstance(name, str):
-        raise MitsimError(f"values: {shown(name)}: give names of fields, such as capture.patterns")
+        raise MitsimError(f"values: {short_text(name)}: give names of fields, such as capture.patterns")
     place: list[str | int] = [int(part) if part.isdecimal() else part for part in name.split(".")]
     if len(place) < 2 or place[0] not in TABLES:
         raise MitsimError(

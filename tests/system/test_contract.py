@@ -194,6 +194,7 @@ def test_reconstruct(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None
     written = json.loads((tmp_path / "image" / "result.json").read_text())
     assert written.pop("inputs").keys() == {"run", "calibration", "lambda", "method"}
     assert written.pop("made_of") == {"run": str(lab.run), "calibration": str(lab.calibration)}
+    assert written.pop("checksums").keys() == {"image.exr", "image.png", "uncertainty.exr"}
     assert written.pop("command").startswith(f"mitsim reconstruct {lab.run} --calibration")
     assert number(found.pop("memory_bytes"), 0)  # of the process, which may do more than this
     assert written == found

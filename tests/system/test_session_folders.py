@@ -159,7 +159,7 @@ cli.run()
 
 @pytest.mark.parametrize("file", ["image/image.exr", "image/image.png", "out/session.json"])
 def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: str) -> None:
-    """(Planted: a step that was begun does not count as the session's own.)"""
+    """An image without its result, and a session without its steps, are taken up again; 0.10.0 refused the first."""
     (place / "session.toml").write_text('[[reconstruct]]\nrun = "run"\ncalibration = "calibration"\n')
     environment = {**os.environ, "PYTHONPATH": str(Path(ms.__file__).parents[1])}
     killed = subprocess.run([sys.executable, "-c", KILLED, file], env=environment, capture_output=True, text=True)
