@@ -21,7 +21,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, rows_columns, turn_and_origin, vectors
 from mitsim.transport.projector import PinholeRays, ProjectorOptics, wavelength_sets
-from mitsim.transport.transmission import CLEAR, Passage, flat_panes, transmits
+from mitsim.transport.transmission import CLEAR, flat_panes, transmits
 
 IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
