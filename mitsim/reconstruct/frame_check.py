@@ -153,7 +153,8 @@ class FrameCheck:
                 restored = sums.without([(int(i), int(j)) for i, j in np.argwhere(bad)])
                 restored -= float((noise * sums.free + share)[bad].sum())
                 few = restored >= _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
-            off = np.maximum(off, np.where(bad, part, 0.0)) if few or beyond is not tests[0][0] else off
+            if few or np.count_nonzero(bad) > max(1, _MOST_BAD * count):
+                off = np.maximum(off, np.where(bad, part, 0.0))
         named = sorted(((int(i), int(j)) for i, j in np.argwhere(off)), key=lambda place: -off[place])
         if len(named) <= max(1, _MOST_BAD * count):
             for row, column in named:
