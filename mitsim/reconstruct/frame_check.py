@@ -28,6 +28,8 @@ OFF = 7e-3
 """Part of a frame, rms, by which it may be off: twice what all measurements together may, as print is not averaged."""
 _CLOSING = 4e-3
 """Part of a closing frame, rms, by which it may be off: no calibration and no print is between it and other frames."""
+_TURNED = 0.5
+"""Part of its energy by which a pattern of exchanged halves differs at least: they leave twice its light."""
 _SIDE = 0.3
 """Correlation of a pair's sum with its difference from which one of its halves is at fault."""
 _MORE, _LEADING, _MOST_BAD = 12.0, 0.35, 0.25
@@ -98,6 +100,8 @@ class FrameCheck:
         self._shots = data.shots.manifest.patterns.captures
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
         self._patterns = [(shot.row, shot.column) for shot in self._shots]
+        spare = float(self._variance.sum()) * sums.squares.size * data.prepared.spare
+        self._excess = float(sums.squares.sum()) - spare - beside
         self._signed = data.noise.shots == 2
         lit = [(side != 0).sum(axis=1) for side in data.shots.patterns]
         exclusive = not self._signed and all((each == 1).all() for each in lit) and self._variance.size > 1
@@ -141,19 +145,23 @@ class FrameCheck:
             rest = np.reshape([sums.pairs[pattern].rest for pattern in np.ndindex(noise.shape)], noise.shape)
             whole = sums.squares.size / data
             tests.append((whole * (rest - of_sums * data) - share, 2 * whole * of_sums * np.sqrt(2 * data)))
-        excess = float(sums.squares.sum() - noise.sum() * sums.squares.size * self._data.prepared.spare) - self._beside
-        off = np.zeros(noise.shape)
+        # Gloss is in the even pattern above all; were its frame wrong, the sum of its pair would be, too, or its halves
+        # are exchanged, which leaves twice its light.
+        off, even = np.zeros(noise.shape), lit_everywhere(self._data)
         for beyond, chance in tests:
             part = np.maximum(beyond, 0.0) / np.maximum(sums.shots, np.median(sums.shots) + TINY)
             usual = float(np.median(part)) if count > 2 else float(part.max())
             bad = (beyond > CHANCE * chance) & (part > max(OFF**2, _MORE * usual)) & (part > _LEADING * part.max())
+            if sums.pairs and even and part[even] < _TURNED and not (tests[1][0] > CHANCE * tests[1][1])[even]:
+                bad[even] = False
             few = 0 < int(np.count_nonzero(bad)) <= max(1, _MOST_BAD * count)
             if few and beyond is tests[0][0]:
                 # Single frames are at fault only if the rest fits without them.
                 restored = sums.without([(int(i), int(j)) for i, j in np.argwhere(bad)])
                 restored -= float((noise * sums.free + share)[bad].sum())
-                few = restored >= _RESTORED * excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
-            off = np.maximum(off, np.where(bad, part, 0.0)) if few or beyond is not tests[0][0] else off
+                few = restored >= _RESTORED * self._excess - CHANCE * float(np.sqrt(np.square(chance).sum()))
+            if few or np.count_nonzero(bad) > max(1, _MOST_BAD * count):
+                off = np.maximum(off, np.where(bad, part, 0.0))
         named = sorted(((int(i), int(j)) for i, j in np.argwhere(off)), key=lambda place: -off[place])
         if len(named) <= max(1, _MOST_BAD * count):
             for row, column in named:
@@ -182,8 +190,9 @@ class FrameCheck:
         foreign = np.flatnonzero(found.foreign > _FOREIGN)
         if len(foreign):
             yield self._fault("picture", foreign, "show another picture than the frames around, dot by dot")
-        disturbed = np.setdiff1d(np.flatnonzero(found.disturbed > _DISTURBED), foreign)
-        if len(disturbed) and not len(foreign):
+        disturbed = np.flatnonzero(found.disturbed > _DISTURBED)
+        # Gloss is seen in some frames, too, but its light has no image: no frame is at fault.
+        if len(disturbed) and not len(foreign) and self._excess < OFF**2 * float(self._sums.shots.sum()):
             strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]
             yield self._fault("picture", strongest, "show a part of the scene otherwise than the frames around")
         limit = max(_POWER, _FLICKERS * float(np.median(found.power_error)))

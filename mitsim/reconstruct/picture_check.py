@@ -175,6 +175,13 @@ class _Stencil:
         self.offsets = [
             each for each in offsets if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
         ]
+        # Differences along a line of pixels that the same frame lights share their error.
+        lines = self._some
+        for axis in (0, 1):
+            if (np.diff(frame_of, axis=axis) == 0).all():
+                lines = np.unravel_index(self._some, self.shape)[1 - axis]
+        ones = np.ones(len(lines))
+        self._lines = csr_matrix((ones, (lines, np.arange(len(lines)))), shape=(int(lines.max()) + 1, len(lines)))
         self.weights = np.full(len(self.offsets) + 2, 1.0 / max(len(self.offsets), 1))
 
     def fit(
@@ -209,7 +216,7 @@ class _Stencil:
             inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
             found = inverse @ (weighted.T @ rest)
             left_over = rest - design @ found
-        scores = weighted.multiply(left_over[:, None]).tocsr()
+        scores = self._lines @ weighted.multiply(left_over[:, None]).tocsr()
         covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(len(known)) / prior**2) @ inverse
         spare = max(len(left_over) - len(inverse), 1) / len(left_over)
         return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)

@@ -186,13 +186,13 @@ class _Part:
     def alone(self) -> Iterator[Found]:
         """Yield turns of the frames, and other orders of the shots."""
         pairs = [(turn, _TAKEN) for turn in self._turns[1:]] + [(_KEPT, order) for order in self._others]
-        return (self._found(*each) for each in pairs)
+        return (self._try(*each) for each in pairs)
 
     def together(self) -> Iterator[Found]:
         """Yield turns together with other orders."""
-        return (self._found(*each) for each in product(self._turns[1:], self._others))
+        return (self._try(*each) for each in product(self._turns[1:], self._others))
 
-    def _found(self, turn: str, order: str) -> Found:
+    def _try(self, turn: str, order: str) -> Found:
         parts = [] if turn == _KEPT else [f"the frames are {turn}"]
         parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
         known = None if order == _TAKEN or order in _STEPS else order

@@ -24,7 +24,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, cg
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
 from mitsim.core.runs import Measurement
@@ -51,8 +50,8 @@ _PAIR_ROWS = 96
 _BRIGHT, _ALIKE = 50.0, 1e-3
 """Energy of a half over that of its noise from which it is no black one, because it would be fitted to its own noise;
 and determinant of the products of a pair's halves, over the square of the larger, below which they are alike."""
-_EXACT, _STEPS = 1e-2, 50
-"""Relative residual at which conjugate gradients end, and steps at most; patterns that share little need a few."""
+_STEPS = 50
+"""Steps of conjugate gradients at most; patterns that share little need a few."""
 _SAMPLE = 20_000
 """Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
@@ -255,23 +254,25 @@ class Residuals:
         """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
 
         That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
-        + <z, x> with z = A^T e and (I - A^T A) x = z.
+        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952). Directions
+        that no other pattern sees have no curvature: the steps end there, which scipy's cg would not do.
         """
         grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
         seen = np.zeros_like(self.weights)
         for each in patterns:
             seen[self._prepared.places(each)] += self._seen.get(each, 0.0)
-
-        def apart(values: FloatArray) -> FloatArray:
-            found = values.reshape(seen.shape).copy()
+        found, rest, step, squared = np.zeros_like(seen), seen.copy(), seen.copy(), sum_of_squares(seen)
+        for _ in range(_STEPS):
+            moved = step.copy()
             for each, (left, right) in grams.items():
                 places = self._prepared.places(each)
-                found[places] -= left @ values.reshape(seen.shape)[places] @ right
-            return found.ravel()
-
-        # Directions that no other pattern sees have no curvature: later steps would end there.
-        operator = LinearOperator((seen.size, seen.size), matvec=apart, dtype=np.float64)
-        found, _ = cg(operator, seen.ravel(), rtol=_EXACT, maxiter=_STEPS)
+                moved[places] -= left @ step[places] @ right
+            curvature = float(np.vdot(step, moved))
+            if curvature <= 1e-9 * sum_of_squares(step):
+                break
+            found, rest = found + squared / curvature * step, rest - squared / curvature * moved
+            before, squared = squared, sum_of_squares(rest)
+            step = rest + squared / max(before, TINY) * step
         return sum(float(self.own[each]) for each in patterns) + float(np.vdot(seen, found))
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
