@@ -46,7 +46,7 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
-_LIKELY = 2.0
+_LIKELY = 4.0
 """The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
@@ -284,6 +284,12 @@ class _Side:
     def size(self) -> float:
         return max(float(np.square(self.vectors).sum()), 1e-300)
 
+    def result(self) -> StripeSums:
+        """Return the sums with what was mended; a good session's are left as they are."""
+        if np.array_equal(self.vectors, self.sums.vectors):
+            return self.sums
+        return replace(self.sums, vectors=self.vectors, misfit=float(self.misfits.sum()))
+
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
@@ -370,8 +376,8 @@ class _Check:
         if not self.centre:
             (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
             fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
-        shown = [block_means(own.sums.vectors) for own in self.sides]
-        shown[0][:, 0] = shown[1][:, 0] = 0.0  # the uniform pattern has one lit frame
+        patterned = np.arange(self.count) > 0  # the uniform pattern has one lit frame
+        shown = [block_means(own.sums.vectors) * patterned for own in self.sides]
         left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
         # Least squares: all is projected on the shapes first, and the rest on the responses.
         usual = np.median(sums, axis=(0, 1)).ravel()
@@ -440,7 +446,11 @@ class _Check:
         """Subtract the change of ambient light within pairs from the vectors."""
         light = own.light
         for found, effect, scale in zip(own.sums.ambient.T, light.effects, light.variances, strict=True):
-            kept, left, _ = _shrunk(found, np.full(self.count, own.variance * scale), good)
+            variance = own.variance * scale
+            # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
+            shared = 0.0 if self.paired else float(np.median(found))
+            kept, left, _ = _shrunk(found - shared, np.full(self.count, variance), good)
+            kept += shared * (shared**2 > _SURE**2 * variance / 3)
             own.vectors -= np.outer(effect, kept)
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
             # In the uniform frames it changes the vector that all responses share.
@@ -581,7 +591,10 @@ class _Check:
             sign = None if self.paired else 1
             self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
         least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
-        odd = own.misfits - np.median(own.misfits) > np.maximum(least, _DEVIATIONS * robust_scatter(own.misfits))
+        middle = float(np.median(own.misfits))
+        # Few misfits hardly show their scatter, which is that of squares of noise at least.
+        scatter = max(robust_scatter(own.misfits), float(np.sqrt(2 * own.variance * max(middle, 0.0))))
+        odd = own.misfits - middle > np.maximum(least, _DEVIATIONS * scatter)
         if odd.sum() > max(2, MOST_FAULTS * self.count):
             raise MitsimError(
                 f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
@@ -640,5 +653,5 @@ class _Check:
             raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
         found.doubts += [f"session: {words}" for words in doubts]
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
-        left, right = (replace(own.sums, vectors=own.vectors, misfit=float(own.misfits.sum())) for own in sides)
+        left, right = (own.result() for own in sides)
         found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))

@@ -251,7 +251,7 @@ def test_light_that_does_not_fit_is_refused(bench: Bench, light: Light, tmp_path
 
     with pytest.MonkeyPatch.context() as full:
         full.setattr("mitsim.core.job.free_memory", lambda: 1e4)
-        with pytest.raises(MitsimError, match=r"^light .*light\.h5: would take about .* of memory"):
+        with pytest.raises(MitsimError, match=r"^file .*light\.h5: would take about .* of memory"):
             Light.load(path, bench)
     damaged(lambda file: file.pop("kept"), "is no file of this version's `mitsim transport`; trace it again")
     damaged(lambda file: file["kept"].pop("flux"), "damaged")

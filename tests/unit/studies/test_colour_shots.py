@@ -17,6 +17,7 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import PLANES, JointMosaic, chart
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.mosaic_images import demosaic
 from mitsim.studies.lit_lines import ARRAY, HALF, JOINT, MosaicShots, filter_weights, replace_spectra, serving
 from tests.ideal_sessions import picture, shadow
@@ -96,7 +97,8 @@ def test_spectra_become_numbers(tmp_path: Path) -> None:
 def test_a_lent_camera_has_the_gain_of_the_line() -> None:
     """Its own factors twice and three times as large lend themselves exactly."""
     manifest = CalibrationManifest(camera={})
-    own, lent = (Factors(left, left, manifest, None) for left in (shadow(0.0, N), 2 * shadow(0.0, N)))  # type: ignore[arg-type]
+    status = Status(Verdict.CALIBRATED, "Calibrated")
+    own, lent = (Factors(left, left, manifest, status) for left in (shadow(0.0, N), 2 * shadow(0.0, N)))
     line, other = (SimpleNamespace(factors=each) for each in (own, lent))
     found = serving(line, other)  # type: ignore[arg-type]
     assert np.allclose(found.left, own.left) and np.allclose(found.right, own.right)
