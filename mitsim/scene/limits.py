@@ -320,7 +320,7 @@ def _thin_sheet(outline: Outline, tree: _References) -> MitsimError | None:
     """Return the refusal of a sheet that, followed forward, sends on 8 times the light it gets at grazing angles."""
     for node, name in tree.to(("principledthin",)):
         thin = tree.nodes[node.props[name].index()]
-        if "spec_trans" in thin.props:
+        if thin.props.get("spec_trans", 0.0) != 0.0:  # a number, or a texture of unknown values
             rule = (
                 "its sharp transmission is defined for light from the camera alone, so only the reference renders it; "
                 "remove it, or use diff_trans, a thindielectric or render's reference"

@@ -264,6 +264,12 @@ def test_what_one_estimator_alone_would_obey_is_refused(small_scene: Write, numb
 
 
 @pytest.mark.usefixtures("flat")
+def test_a_thin_sheet_without_sharp_transmission_is_allowed(small_scene: Write) -> None:
+    """A card with ``spec_trans`` of 0 was refused. (Planted: the presence of the parameter, not its value.)"""
+    open_bench(small_scene(extra=THIN.replace("0.5", "0")), "llvm_ad_mono")
+
+
+@pytest.mark.usefixtures("flat")
 @pytest.mark.parametrize("inner", [*BUMPS, "mitsim_grating", "roughconductor"])
 def test_what_differs_along_the_surface_is_not_turned_by_a_bump_map(small_scene: Write, inner: str) -> None:
     """Mitsuba takes the axes of a bump map from another frame: mirrors under two maps lost all their light."""
