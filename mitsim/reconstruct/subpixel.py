@@ -345,8 +345,6 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
     sides = model.sides, model.sides[::-1]
     for axis, ((own, other), response, variance) in enumerate(zip(sides, model.moved, known, strict=True)):
         weights, light = np.square(gain.T if axis else gain), np.square(other.response).sum(axis=0)
-        if not weights.any():
-            break  # a lambda of 1e300 leaves nothing of the data in the image
         whole = response.sum(axis=0)
         parts = whole, response[0] - whole @ own.first_half
         struck, expected = (float(np.square(part).sum(axis=0) @ weights @ light) for part in parts)
