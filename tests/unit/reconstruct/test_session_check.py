@@ -17,7 +17,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, Half, halves_in_order
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.estimate_factors import stripe_sums
+from mitsim.reconstruct.estimate_factors import StripeSums, stripe_sums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session, frame_words
 
@@ -59,22 +59,26 @@ def frames(
     }
 
 
-def checked(shown: Frames, pairs: bool = True, **wrong: Half) -> CheckedSession:
-    """Check frames of which some are known to be ``wrong``, why: which; not
-    ``pairs``: each response is of its +1 frame and that of all light."""
+def sums_of(shown: Frames, pairs: bool = True) -> tuple[StripeSums, StripeSums]:
+    """Sums of frames; not ``pairs``: each response is of its +1 frame and that of all light."""
 
     def pair(side: str, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         one, other = shown[side, index, 1], shown[side, index, -1]
         return (one - other, one + other) if pairs else (2 * one - shown.get((side, 0, 0), shown[side, 0, 1]), None)
 
-    taken = SessionConditions(ORDER, wrong={half: why for why, half in wrong.items()})
     first = [pair(side, 0) for side in SIDES]
     sums = stripe_sums(first[0][0], first[1][0], N, lights=[both for _, both in first])
     for own in sums:
         for index in range(1, N):
             response, both = pair(own.side, index)
             own.put(own.fit_response(response, index, both))
-    return check_session(sums, SIGNS, taken)
+    return sums
+
+
+def checked(shown: Frames, pairs: bool = True, **wrong: Half) -> CheckedSession:
+    """Check frames of which some are known to be ``wrong``, why: which."""
+    taken = SessionConditions(ORDER, wrong={half: why for why, half in wrong.items()})
+    return check_session(sums_of(shown, pairs), SIGNS, taken)
 
 
 def error(found: CheckedSession) -> tuple[float, float]:
@@ -108,9 +112,13 @@ def shown_frames(text: str) -> set[tuple[str, int]]:
 
 @pytest.mark.parametrize("pairs", [True, False])
 def test_a_good_session_is_left_as_it_is_to_the_bit(pairs: bool) -> None:
-    found = checked(frames(), pairs)
+    """(Planted: the uniform pattern's vector is set to zero in the given sums; ambient light taken off the misfit.)"""
+    given = sums_of(frames(), pairs)
+    vectors, misfits = [own.vectors.copy() for own in given], [own.misfit for own in given]
+    found = check_session(given, SIGNS, SessionConditions(ORDER))
     assert not found.warnings and found.lamp is None
-    assert all(np.array_equal(own.vectors, found.sums[axis].vectors) for axis, own in enumerate(found.sums))
+    assert all(np.array_equal(own.vectors, exact) for own, exact in zip(found.sums, vectors, strict=True))
+    assert [own.misfit for own in found.sums] == misfits
     actual, stated = error(found)
     assert 0.7 * stated < actual < 1.2 * stated
 
