@@ -200,7 +200,7 @@ def test_a_uniform_frame_that_shows_something_else_is_refused_and_named() -> Non
 @pytest.mark.parametrize("side", SIDES)
 def test_the_signs_of_exchanged_pairs_are_turned(side: str, indices: list[int]) -> None:
     """The light decides on pattern 0, the moving shadow on all others. (Planted: pattern 0 is turned by the shadow,
-    which cannot tell it from the turn of all others; 2 pi + k and 4 pi - k are left out, for the finest stripes.)"""
+    which cannot tell it from the turn of all others.)"""
     shown = frames()
     turned = {(side, index, sign): shown[side, index, -sign] for index in indices for sign in (1, -1)}
     found = checked({**shown, **turned})
@@ -410,7 +410,7 @@ def test_a_wrong_uniform_frame_without_pairs_is_refused() -> None:
 
 
 def test_sides_of_different_power_without_pairs_count() -> None:
-    """The lamp is 3 % brighter for vertical stripes. (Planted: the whole difference in place of half.)"""
+    """The lamp is 3 % brighter for vertical stripes."""
     found = checked(frames(lambda frame, time, half: (1.03 if half[0] == SIDES[1] else 1.0) * frame), pairs=False)
     assert holds(found) and any("frames are of different power" in words for words in found.doubts)
     shown = frames()
