@@ -228,8 +228,8 @@ def short_text(value: object) -> str:
 
 
 def is_path(value: object) -> bool:
-    """Return True if text, or an object that stands for some, can be a path: an empty one would be the working folder,
-    and of a longer one the operating system has an error of its own."""
+    """Return True if a ``value``, text or an object that stands for some, can be a path: an empty one would be the
+    working folder, and of a longer one the operating system has an error of its own."""
     try:
         text = os.fspath(value)  # type: ignore[call-overload]
         data = os.fsencode(text) if isinstance(text, str) else b""

@@ -114,7 +114,10 @@ def check_obj(path: Path) -> tuple[bool, str]:
         for number, line in enumerate(map(bytes.strip, file), 1):
             found = _LINE.fullmatch(line)
             if not found or line.endswith(b"\\"):
-                rule = "no line may end in a backslash, and faces have three or more corners, which count from 1"
+                rule = (
+                    "no line may end in a backslash, vertices have three numbers, and faces have three or more "
+                    "corners, which count from 1"
+                )
                 shown = cut(line.decode("latin-1"))
                 raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}")
             if found["vertex"]:

@@ -116,7 +116,11 @@ def test_a_scene_without_projector(refused: Refused, small_scene: Callable[..., 
     text = path.read_text()
     end = text.index("</emitter>") + len("</emitter>")
     path.write_text(text[: text.index("<emitter")] + '<emitter type="constant"/>' + text[end:])
-    mentions(refused("capture", path, *NEW, "--patterns", "dots:4"), str(path), '0 emitters of type "projector"')
+    mentions(
+        refused("capture", path, *NEW, "--patterns", "dots:4"),
+        str(path),
+        "needs one emitter of type projector, the file has none",
+    )
 
 
 @pytest.mark.usefixtures("soon_dark")

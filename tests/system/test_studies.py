@@ -59,7 +59,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         (
             "weather",
             (),
-            "there is no such study; use accuracy, calibration, diffraction, solver, transfer, twin, patterns",
+            "there is no such study; use accuracy, calibration, diffraction, transfer, twin, patterns",
         ),
         ("no_such.module", (), "cannot be used"),
         ("patterns", ("--shard", "3/2"), "--shard '3/2': give I/N"),

@@ -153,10 +153,10 @@ def plugin_classes() -> dict[str, type]:
             if self.white is not None:
                 # Refracted light is looked at from the side that it comes from, where white matt has a value.
                 beside = bs.wo * dr.mulsign(dr.mulsign(mi.Float(1), si.wi.z), bs.wo.z)
-                values = _exchanged(self.white, ctx, si, beside, single), self.white.eval(ctx, si, beside, single)
+                values = _adjoint(self.white, ctx, si, beside, single), self.white.eval(ctx, si, beside, single)
                 into, out = (mi.unpolarized_spectrum(each)[0] for each in values)
                 value *= dr.select(single, dr.select(out > 0, into / out, 0), 1)
-            turned = _exchanged(self.parts[0], ctx, si, bs.wo, active & ~single)
+            turned = _adjoint(self.parts[0], ctx, si, bs.wo, active & ~single)
             return bs, dr.select(single, value, dr.select(bs.pdf > 0, turned / bs.pdf, 0))
 
         def eval_pdf(
@@ -164,14 +164,14 @@ def plugin_classes() -> dict[str, type]:
         ) -> tuple[mi.Spectrum, mi.Float]:
             value, density = self.parts[0].eval_pdf(ctx, si, wo, active)
             if ctx.mode == mi.TransportMode.Importance:
-                value = _exchanged(self.parts[0], ctx, si, wo, active)
+                value = _adjoint(self.parts[0], ctx, si, wo, active)
             return value, density
 
     made = {**dict.fromkeys(CHOICES, Choice), **dict.fromkeys(DIRECTED, Directed)}
     return {PREFIX + name: each for name, each in made.items()}
 
 
-def _exchanged(
+def _adjoint(
     bsdf: mi.BSDF, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
     """Return the value of a ``bsdf`` for light that comes from ``si.wi`` and is seen from ``wo``, with the cosine of

@@ -336,7 +336,7 @@ def _contents() -> list[Case]:
             good.replace(b"float z\n", b"float z\ncomment \x85property float w\n").replace(points, points[:-4]),
             "more than its bytes hold",
         ),
-        meshed("text", "hello", "no vertices", kind="obj"),
+        meshed("text", "hello", "not understood, 1 ('hello')", kind="obj"),
         meshed("vertex not finite", OBJ.replace("9 0 500", "nan 0 500"), "not finite", kind="obj"),
         meshed("two coordinates", OBJ.replace("9 0 500", "9 0"), "three numbers", kind="obj"),
         meshed("words", OBJ.replace("9 0 500", "9 zero 0"), "three numbers", kind="obj"),
