@@ -83,8 +83,8 @@ class NoiseTest:
     def off(self, noise: FrameNoise, whole: float, stated: float, beside: float) -> bool:
         """Return True if the noise is not what is stated.
 
-        Structure and second differences must agree: too little energy is too little noise, and too much is too much,
-        only if second differences show it, too. Where read noise is not stated, only the slope over the light is compared.
+        Energy and second differences must agree, because structure adds to the energy, and the error of rendering may
+        be stated too large. Where read noise is not stated, only the slope over the light is compared.
 
         Parameters
         ----------
