@@ -289,7 +289,7 @@ def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = 
 PROBES = 8
 """Random signs beside the constant vector; chosen so that probing costs less than a frame (:func:`probe_vectors`)."""
 _STUDENT = 12.706205, 4.302653, 3.182446
-"""97.5 % quantiles of Student's t with 1, 2 and 3 degrees of freedom, and with more the last one, which is too large."""
+"""97.5 % quantiles of Student's t with 1, 2 and 3 degrees of freedom, and with more the last, which is larger."""
 _MANY_KINDS, _OF_ONE_KIND = 1.05, 0.75
 """Bound over error where noise is of many kinds, and power of the part of one kind with which its square grows. With
 them the bound of four groups holds in 95 to 98 % for 1 to 200 equal kinds, and in 92 to 95 % where one kind has a

@@ -289,8 +289,7 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
     slower = sum(by[name] * ratio for name, ratio in ratios.items()) if timed else 1.0
     found = {
         name: replace(
-            pilot_result.sample_costs.get(name, SampleCost.none()),
-            seconds=timed.get(name, slower * FIXED.passes[name]),
+            pilot_result.sample_costs.get(name, SampleCost.none()), seconds=timed.get(name, slower * FIXED.passes[name])
         )
         for name in simulation.passes
     }

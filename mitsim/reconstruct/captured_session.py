@@ -505,12 +505,7 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
-    taken = SessionConditions(
-        session.order,
-        session.frame_name,
-        bool(readings.saturated),
-        wrong=readings.wrong(),
-    )
+    taken = SessionConditions(session.order, session.frame_name, bool(readings.saturated), wrong=readings.wrong())
     found = check_session(sums, signs, taken)
     noise = float(np.sqrt(max(float(np.mean(variances)), 0.0))) if session.listed.digital.noise_is_stated else None
     with job.clock.stage("estimate"):

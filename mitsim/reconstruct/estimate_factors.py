@@ -134,10 +134,7 @@ class PairLight:
     @classmethod
     def together(cls, pairs: Sequence[PairLight]) -> PairLight:
         """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns)."""
-        return cls(
-            np.stack([pair.light for pair in pairs], axis=1),
-            np.stack([pair.blocks for pair in pairs]),
-        )
+        return cls(np.stack([pair.light for pair in pairs], axis=1), np.stack([pair.blocks for pair in pairs]))
 
 
 @dataclass

@@ -10,13 +10,7 @@ from typing import Any, ClassVar
 
 from matplotlib.figure import Figure
 
-from mitsim.report.plots import (
-    FONT,
-    Cost,
-    costs,
-    error_bars,
-    stacked_bars,
-)
+from mitsim.report.plots import FONT, Cost, costs, error_bars, stacked_bars
 from mitsim.studies.framework.findings import Part
 from mitsim.studies.framework.run import Findings
 
@@ -467,9 +461,4 @@ class Budget:
 def times(spread: Spread) -> dict[str, float | int]:
     """A ``spread`` as JSON rows hold it: ``seconds``, ``least_s``, ``most_s``, ``repeats``."""
     found = asdict(spread)
-    return {
-        "seconds": found["median"],
-        "least_s": found["least"],
-        "most_s": found["most"],
-        "repeats": found["repeats"],
-    }
+    return {"seconds": found["median"], "least_s": found["least"], "most_s": found["most"], "repeats": found["repeats"]}

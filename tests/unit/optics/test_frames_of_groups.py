@@ -147,7 +147,7 @@ def test_the_bound_of_a_monte_carlo_error_holds(kinds: str) -> None:
 
 
 def test_the_bound_of_one_kind_of_noise_is_students() -> None:
-    """Of two groups there is one difference, and of up to four, as lights have, the ratio is Student's two-sided quantile."""
+    """The ratio is Student's two-sided quantile, for the two to four groups that lights have."""
     for groups in (2, 3, 4):
         off = np.arange(groups) - (groups - 1) / 2
         bound = bound_of(np.outer(off, off), 1.0) / np.sqrt(off @ off)
