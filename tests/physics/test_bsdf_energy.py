@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 
 import mitsim.transport
-from mitsim.scene.limits import LIMITS
+from mitsim.scene.limits import DIRECTED, LIMITS
+from mitsim.transport.plugins import wrappers
 
 pytestmark = pytest.mark.usefixtures("variant")
 STEP = 0.0025
 ROUNDING = 1e-4
 """A lobe of sigma 4 steps summed on the grid is right to 1e-6, the Lambertian disc to 1e-5; float32 adds some."""
+WHITE = {"type": "diffuse", "reflectance": 1.0}
 CASES: dict[str, list[dict[str, Any]]] = {
     "mitsim_grating": [
         {},
@@ -30,9 +32,14 @@ CASES: dict[str, list[dict[str, Any]]] = {
         {"efficiencies": "0.02, " + ", ".join(["0.03"] * 16), "pitch": 8000.0, "reflectance": 0.9},
         {"efficiencies": "0"},
     ],
+    "mitsim_blendbsdf": [{"weight": 0.4, "a": {"type": "mitsim_grating"}, "b": WHITE}],
+    "mitsim_mask": [{"opacity": 0.4, "in": WHITE}],
+    "mitsim_twosided": [{"a": WHITE, "b": {"type": "mitsim_grating"}}],
 }
 SINGLE = {"mitsim_glass": [{}, {"glass": "n-sf11"}, {"index": 1.0, "abbe": 30.0}, {"sellmeier": "8, 0.04"}]}
 """Those that send light into single directions, which no grid of them meets."""
+EXCHANGED = {f"{wrappers.PREFIX}{name}" for name in DIRECTED}
+"""Those that are not reciprocal; tests/unit/transport/test_wrappers.py compares their light forward and back."""
 LIST = [pytest.param(name, settings, id=f"{name}-{i}") for name in CASES for i, settings in enumerate(CASES[name])]
 INCIDENT = [(0, 0), (15, 80), (30, 0), (45, 45), (60, 180), (75, 250), (85, 0), (89, 100), (89.9, 0), (89.9, 90)]
 
@@ -91,8 +98,9 @@ def test_no_bsdf_is_left_out() -> None:
     found = set()
     for path in (Path(mitsim.transport.__file__).parent / "plugins").glob("*.py"):
         if "(bsdf_class())" in path.read_text(encoding="utf-8"):
-            found.add(importlib.import_module(f"mitsim.transport.plugins.{path.stem}").PLUGIN)
-    assert found == {*CASES, *SINGLE}
+            module = importlib.import_module(f"mitsim.transport.plugins.{path.stem}")
+            found |= {*module.plugin_classes()} if module is wrappers else {module.PLUGIN}
+    assert found == {*CASES, *SINGLE, *EXCHANGED}
 
 
 @pytest.mark.parametrize(("name", "settings"), LIST)
