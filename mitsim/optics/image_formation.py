@@ -181,7 +181,7 @@ class _Raster:
             for places, each in zip((lit.rows, lit.columns), both, strict=True)
         )
         correlation = CORRELATION_PRODUCTS * pairs * cells_per_pixel(geometry) ** 2 * math.prod(geometry.frame_shape)
-        return held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
+        return 0 < held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
         """(m, m') irradiance of a ``light`` (r, c)."""
