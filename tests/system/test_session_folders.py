@@ -52,7 +52,7 @@ def test_arguments_are_not_changed(place: Path) -> None:
 
 
 def test_mappings_of_public_functions_are_not_changed(place: Path) -> None:
-    """Every public call that takes mappings leaves them as they were. (Planted: `more` that takes checksums in.)"""
+    """Every public call that takes mappings leaves them as they were."""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     stages, more, effects = {"read": 1.0, "total": 2.0}, {"note": {"a": [1]}}, {"diffraction": False}
@@ -171,7 +171,7 @@ def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: s
 
 
 def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
-    """Of the same inputs; others are refused, and the page of an unfinished image is. (Planted: no head before it.)"""
+    """Of the same inputs; others are refused, and the page of an unfinished image is."""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     image.save("image")
@@ -195,7 +195,7 @@ def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
     ],
 )
 def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change: dict[str, Any]) -> None:
-    """(Planted: entries that are taken as they are.)"""
+    """Each wrong kind is refused in one line."""
     tables = {"reconstruct": [{**IMAGE}]}
     ms.run(tables, "out", pictures=False)
     held = json.loads((place / "out" / "session.json").read_text())
@@ -207,7 +207,7 @@ def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change:
 
 
 def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
-    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests alone.)"""
+    """Folders and files that steps read are looked into before the first of them works."""
     frame = place / "run" / "frame_00003.exr"
     shutil.copytree(place / "run", place / "good")
     frame.write_bytes(frame.read_bytes()[:-5])
