@@ -13,6 +13,8 @@ import pytest
 
 from mitsim.core.manifests import Patterns
 from mitsim.core.runs import Capture
+from mitsim.devices.camera import centred_edges
+from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Verdict
@@ -167,6 +169,26 @@ def test_no_frame_of_a_fitting_run_is_named(patterns: str, print_: str) -> None:
     shots = bench(peak=3e3).run(patterns, scene, 4)
     misfit = reconstruct(shots, bench().calibrated(4)).misfit
     assert misfit is not None and not misfit.faults and not misfit.flagged and misfit.defects is None
+
+
+@pytest.mark.parametrize("patterns", ["dots:1x8", "hadamard:4"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_frames_of_gloss_are_not_at_fault(patterns: str, seed: int) -> None:
+    """Gloss is light that has no image. The run may be flagged for it, and no frame is named, because all frames were
+    captured rightly. (Planted: the even pattern is at fault; windows are reported beside light that has no image.)"""
+    rng = np.random.default_rng(seed)
+    code = rng.integers(0, 2, 511).astype(np.float64)
+    y, x = np.mgrid[:64, :64] / 64
+    scene = 0.45 + 0.3 * np.sin(2 * np.pi * (2 * x + rng.random())) * np.cos(2 * np.pi * (1.5 * y + rng.random()))
+    row, column = rng.integers(16, 48, 2)
+    scene[row : row + 2, column : column + 2] *= 12
+    edges = centred_edges(PIXELS, 6.0 / PIXELS), centred_edges(64, 120 / 64)
+    sides = [scene_factor(code, 0.06, edges[0], edges[1] + shift, 2.0, 400.0) for shift in (0.0, 7.0)]
+    place = np.linspace(-1, 1, PIXELS)
+    gloss = 1 + 0.05 * np.outer(place, np.exp(-4 * np.square(place - 0.3)))
+    camera = Bench(*sides, optics=lambda light: light * gloss)
+    misfit = reconstruct(camera.run(patterns, scene, seed), camera.calibrated(seed)).misfit
+    assert misfit is not None and not misfit.faults
 
 
 def test_more_than_a_quarter_of_the_dots_black() -> None:
