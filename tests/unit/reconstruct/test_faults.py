@@ -16,6 +16,7 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.misfit import Cause
+from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
@@ -189,6 +190,17 @@ def test_frames_of_gloss_are_not_at_fault(patterns: str, seed: int) -> None:
     camera = Bench(*sides, optics=lambda light: light * gloss)
     misfit = reconstruct(camera.run(patterns, scene, seed), camera.calibrated(seed)).misfit
     assert misfit is not None and not misfit.faults
+
+
+def test_pixels_along_a_line_of_dots_share_their_error() -> None:
+    """Bars along lines that one frame lights: four times as many rows know nothing more of a frame's power. (Planted:
+    an error of each pixel by itself, which halves.)"""
+    bars, frames = np.random.default_rng(2).random(64), np.arange(64) % 8
+    errors = []
+    for rows in (24, 96):
+        image, frame_of = (np.tile(each, (rows, 1)) for each in (bars, frames))
+        errors.append(np.median(PictureCheck(image, frame_of, (1, 8), np.zeros((rows, 64))).power_error))
+    assert errors[1] == pytest.approx(errors[0], rel=0.1)
 
 
 def test_more_than_a_quarter_of_the_dots_black() -> None:
