@@ -22,24 +22,19 @@ from mitsim.reconstruct.focus import DerivedCapture
 
 _SPREADS = 7.0
 """Standard deviations of noise, 1e-12 for a pixel, beyond which its residual's energy is no chance."""
-_AROUND = 3
-"""Pixels to each side whose median energy is what a pixel's is compared with: 7 x 7, so that a dead row and column are
-less than a third of them."""
-_CROWD = 0.35
-"""Part of these 7 x 7 that are off at most: two dead lines side by side, or two that cross, are less than a third."""
-_MOST = 0.02
-"""Part of the sensor that may be defective: where more is off, the scene does not fit."""
+_AROUND, _CROWD = 3, 0.35
+"""Pixels to each side whose median energy is what a pixel's is compared with, and part of these 7 x 7 that are off at
+most: two dead lines side by side, or two that cross, are less than a third of them."""
+_MOST, _LEAKS = 0.02, 0.1
+"""Part of the sensor that may be defective, because the scene does not fit where more is off; and part of the largest
+energy of a pixel that others may have by it: the square of what the fit takes from one reading for the next, 0.03 where
+the scene has 0.4 of the sensor's pixels a side."""
 _LEAST_VARIANCE, _MOST_VARIANCE = 1e-3, 4.0
 """Part of the mean variance that a pixel's counts as at least, as one that reads nothing has none of light; and times
 the mean at most, as that of a hot one is not light's: frames are four times as bright at their brightest."""
-_LEAKS = 0.1
-"""Part of the largest energy of a pixel that others may have by it: the square of what the fit takes from one reading
-for the next, 0.03 where the scene has 0.4 of the sensor's pixels a side."""
-_ROUNDS = 8
+_ROUNDS, _SHOWN = 8, 5
 """Rounds in which defective readings are replaced: leverages are below 1/4 where the sensor has twice the scene's
-pixels a side, and 4^-8 of a reading is below noise."""
-_SHOWN = 5
-"""Places that a sentence names."""
+pixels a side, and 4^-8 of a reading is below noise. And places that a sentence names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,78 +45,59 @@ class Defects:
     columns: IndexArray
 
     def __str__(self) -> str:
-        places = ", ".join(f"({row}, {column})" for row, column in self.places[:_SHOWN])
-        many = len(self.rows) > 1
-        more = ", ..." if len(self.rows) > _SHOWN else ""
-        return f"{len(self.rows)} defective pixel{'s' if many else ''} left out, at (row, column) {places}{more}"
+        count, more = len(self.rows), ", ..." if len(self.rows) > _SHOWN else ""
+        places = ", ".join(map(str, self.places[:_SHOWN]))
+        return f"{count} defective pixel{'s' * (count > 1)} left out, at (row, column) {places}{more}"
 
     @property
     def places(self) -> list[tuple[int, int]]:
         """Row and column of each."""
-        return [(int(row), int(column)) for row, column in zip(self.rows, self.columns, strict=True)]
+        return list(zip(self.rows.tolist(), self.columns.tolist(), strict=True))
 
     def summary(self) -> dict[str, object]:
-        """For result.json."""
+        """Return the entry of result.json."""
         return {"count": len(self.rows), "first": self.places[:_SHOWN]}
 
     def with_others(self, others: Defects | None) -> Defects:
-        """These and ``others``."""
-        places = sorted({*self.places, *(others.places if others else ())})
-        rows, columns = np.array(places, dtype=np.intp).T
-        return Defects(rows, columns)
+        """Return these defects and ``others``."""
+        return Defects(*np.array(sorted({*self.places, *(others.places if others else ())}), dtype=np.intp).T)
 
     def left_out(self, data: Accumulation) -> LeftOut:
-        """The capture of ``data`` whose readings at these pixels are those that all others tell."""
-        prepared, weights = data.prepared, data.weights
-        values = {
-            (each.row, each.column): prepared.as_solved(each.frame)[self.rows, self.columns]
-            for each in data.measurements_again()
-        }
-        # Of a reading that is changed the means of its row and column take up their part.
-        gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
-        first = {pattern: value.copy() for pattern, value in values.items()}
-        for _ in range(_ROUNDS):
-            change = np.zeros_like(weights)
-            for (row, column), value in values.items():
-                left, right = prepared.slabs((row, column))
-                own, other = left.matrix[self.rows], right.matrix[self.columns]
-                predicted = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
-                step = (predicted - value) / gain
-                value += gain * step
-                change[prepared.places((row, column))] += own.T @ (step[:, None] * other)
-            weights += change
-        moved = {pattern: (values[pattern] - first[pattern]) / gain for pattern in values}
-        whole = lit_everywhere(data)
-        total = np.zeros(len(self.rows)) if whole is None else prepared.frame(weights, whole)[self.rows, self.columns]
-        return LeftOut(data, self, moved, total)
+        """Return the capture of ``data`` whose readings at these pixels are those that all others predict."""
+        return LeftOut(data, self)
 
 
 class LeftOut(DerivedCapture):
-    """A capture whose readings at some pixels are other ones.
+    """The capture of ``data`` with other readings at ``defects``: those that all other readings predict."""
 
-    Parameters
-    ----------
-    data
-        the capture added up.
-    defects, moved, total
-        the pixels, by pattern what is added to their readings, and for signed patterns the sum of a pair's halves
-        there.
-    """
-
-    def __init__(
-        self, data: Accumulation, defects: Defects, moved: dict[tuple[int, int], FloatArray], total: FloatArray
-    ) -> None:
+    def __init__(self, data: Accumulation, defects: Defects) -> None:
         super().__init__(data.shots)
-        self._data, self._defects, self.moved, self._total = data, defects, moved, total
+        self._data, self._places = data, (defects.rows, defects.columns)
+        prepared, weights, whole = data.prepared, data.weights, lit_everywhere(data)
+        frames = ((each.row, each.column, prepared.as_solved(each.frame)) for each in data.measurements_again())
+        values = {(row, column): frame[self._places] for row, column, frame in frames}
+        self._moved = {pattern: np.zeros(len(defects.rows)) for pattern in values}
+        # If a reading changes, the means of its row and column take up their part.
+        gain = (1 - 1 / prepared.left.sensor_size) * (1 - 1 / prepared.right.sensor_size) if prepared.centre else 1.0
+        for _ in range(_ROUNDS):
+            change = np.zeros_like(weights)
+            for pattern, value in values.items():
+                left, right = prepared.slabs(pattern)
+                own, other = left.matrix[defects.rows], right.matrix[defects.columns]
+                predicted = (own @ weights[left.columns][:, right.columns] * other).sum(axis=1)
+                step = (predicted - value) / gain - self._moved[pattern]
+                self._moved[pattern] += step
+                change[prepared.places(pattern)] += own.T @ (step[:, None] * other)
+            weights += change
+        # The sum of the halves of a signed pattern, which is that of all pairs.
+        self._total = prepared.frame(weights, whole)[self._places] if whole else np.zeros(len(defects.rows))
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """As of the capture itself, whose ``shape`` is known, with other readings at its defective pixels."""
-        places = self._defects.rows, self._defects.columns
+        """Yield the measurements of the capture, whose ``shape`` is known, with other readings at these places."""
         for each in self._data.measurements_again():
             frame, light = each.frame.copy(), each.light.copy()
-            frame[places] += self.moved[each.row, each.column]
-            # The sum of a pair's halves is that of all pairs.
-            light[places] = frame[places] if each.shots == 1 else np.maximum(np.abs(frame[places]), self._total)
+            frame[self._places] += self._moved[each.row, each.column]
+            light[self._places] = np.maximum(np.abs(frame[self._places]), self._total)
             yield replace(each, frame=frame, light=light)
 
 
@@ -143,16 +119,14 @@ def find_defects(data: Accumulation, squares: FloatArray, ratio: float) -> Defec
     ratio
         measured over stated variance of the noise.
     """
-    noise, prepared = data.noise, data.prepared
-    count = noise.variance.size
+    noise, prepared, count = data.noise, data.prepared, data.noise.variance.size
     mean = noise.light / count
     variance = ratio * noise.of(mean, noise.shots)
     found = defects_of(squares, count * variance, count)
     if noise.shots == 1 or (whole := lit_everywhere(data)) is None:
         return found
     # Differences of halves show little of pixels that stand still, and their sums show all of it.
-    away = prepared.as_solved(mean) - prepared.frame(data.weights, whole)
-    still = defects_of(np.square(away), variance / count, 1)
+    still = defects_of(np.square(prepared.as_solved(mean) - prepared.frame(data.weights, whole)), variance / count, 1)
     return still.with_others(found) if still else found
 
 
@@ -166,29 +140,23 @@ def defects_of(squares: FloatArray, variance: FloatArray, count: int) -> Defects
     count
         of the measurements.
     """
-    mean = float(variance.mean())
-    ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean or 1.0, _MOST_VARIANCE * mean or 1.0)
-    limit = _limit(count)
-    typical, most = (1 - 2 / (9 * count)) ** 3, float(ratio.max())
-    if not most > limit:
-        return None
+    mean = float(variance.mean()) or 1.0
+    ratio = squares / np.clip(variance, _LEAST_VARIANCE * mean, _MOST_VARIANCE * mean)
+    limit, typical, most, width = _limit(count), (1 - 2 / (9 * count)) ** 3, float(ratio.max()), 2 * _AROUND + 1
     # What the scene's light is off by at a pixel may be the same in all frames: the square of one number.
-    off = ratio > limit + _limit(1) * max(float(np.median(ratio)) / typical - 1, 0.0)
     # What bright ones are off by leaks into others: these first.
-    off &= ratio > _LEAKS * most
+    least = limit + _limit(1) * max(float(np.median(ratio)) / typical - 1, 0.0)
+    off = (ratio > least) & (ratio > _LEAKS * most)
     places = np.argwhere(off)
-    if not 0 < len(places) <= _MOST * ratio.size:
+    if not most > limit or not 0 < len(places) <= _MOST * ratio.size:
         return None
     padded = np.pad(ratio, _AROUND, mode="reflect")
-    width = 2 * _AROUND + 1
     around = np.array([np.median(padded[row : row + width, column : column + width]) for row, column in places])
-    own = ratio[places[:, 0], places[:, 1]]
-    kept = own > limit * np.maximum(around / typical, 1.0)
     # A spot of light is off in pixels side by side, and so are its edges.
     crowd = np.where(off, uniform_filter(off.astype(np.float64), width, mode="constant"), 0.0)
-    kept &= maximum_filter(crowd, width)[places[:, 0], places[:, 1]] < _CROWD
-    places = places[kept]
-    return Defects(places[:, 0], places[:, 1]) if len(places) else None
+    kept = ratio[off] > limit * np.maximum(around / typical, 1.0)
+    rows, columns = places[kept & (maximum_filter(crowd, width)[off] < _CROWD)].T
+    return Defects(rows, columns) if len(rows) else None
 
 
 def _limit(count: int) -> float:

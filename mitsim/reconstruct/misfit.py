@@ -38,17 +38,15 @@ and 3e-3 (edges under pixels of 7.5 mm); a sheet 2 mm off 400 leaves 4.2e-3 (16 
 GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
 """Unexplained part and chi-square of shot noise alone from which an image is flagged where no other noise is stated:
 read noise of as many electrons makes 2."""
-_SHOWN = 4
-"""Faults that a sentence names; result.json has all of them."""
 _LAMBDA_BESIDE = 1e-3
 """Lambda, over the largest sigma^2, of the image that frames are compared with if the method has no lambda of its
 own."""
-_MOSTLY = 0.5
-"""Part of the unexplained energy at defective pixels from which nothing else is blamed."""
-_IN_RANGE = 1e-6
-"""Part of the energy of a common light below which it counts as lying in the model's range."""
-_COMMON_IMAGE = 0.01
-"""Change of the image, rms, by light that is the same in all frames, from which it is reported."""
+_SHOWN, _MOSTLY = 4, 0.5
+"""Faults that a sentence names, because result.json has all of them; and part of the unexplained energy in one place
+from which nothing else is blamed."""
+_IN_RANGE, _COMMON_IMAGE = 1e-6, 0.01
+"""Part of the energy of a common light below which it counts as lying in the model's range; and change of the image,
+rms, from which such a light is reported."""
 
 
 class Cause(Enum):
@@ -56,18 +54,17 @@ class Cause(Enum):
 
     NOISE = (
         "the frames' noise",
-        "check the camera file's gain, read noise and black level, and that the numbers are raw",
+        "check gain, read noise and black level of the camera file, and that the numbers are raw",
     )
-    READING = ("another reading of the frames", "see which of the readings is true, and import the frames so")
-    FRAMES = ("frames that do not fit the others", "capture these frames again")
-    PIXELS = ("a part of the sensor or of the session", "look at the map of the misfit, and capture again")
-    LIGHT = ("light that is the same in all frames", "darken the room, or capture with ambient_frame=yes")
-    SATURATION = ("readings at the full well or the ADC's end", "expose for less")
+    READING = "another reading of the frames", "see which of the readings is true, and import the frames so"
+    FRAMES = "frames that do not fit the others", "capture these frames again"
+    PIXELS = "a part of the sensor or of the session", "look at the map of the misfit, and capture again"
+    LIGHT = "light that is the same in all frames", "darken the room, or capture with ambient_frame=yes"
+    SATURATION = "readings at the full well or the ADC's end", "expose for less"
     MODEL = (
         "light that the calibrated camera does not see from a flat matt scene at the calibrated distance: depth, "
         "gloss, indirect light, or another camera",
-        "try `--focus auto`, check that the camera is the calibrated one, and compare the map of the misfit with the "
-        "scene",
+        "try `--focus auto`, check that the camera is the calibrated one, and compare the misfit's map with the scene",
     )
 
 
@@ -137,61 +134,43 @@ class Misfit:
 
     def __str__(self) -> str:
         noise = "" if self.stated else " of shot noise alone, as no other was stated"
-        cause = f"; {self.reason}" if self.cause else ""
-        defects = f"; {self.defects}" if self.defects else ""
         detail = f" beside {self.detail:.1e} of print finer than a scene pixel" if self.detail else ""
-        return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{detail}{cause}{defects}"
+        others = "".join(f"; {other}" for other in (self.reason, self.defects) if other)
+        return f"misfit: {self.gist}{noise}, {self.unexplained:.1e} unexplained{detail}{others}"
 
     @property
     def reason(self) -> str:
         """The finding in words; empty where nothing is off."""
-        if self.cause is None:
-            return ""
-        sentences = {
-            Cause.NOISE: self._noise_sentence,
-            Cause.READING: self._reading_sentence,
-            Cause.FRAMES: "; ".join(map(str, self.faults[:_SHOWN])),
-            Cause.PIXELS: f"the misfit is in {self.places[0].words}" if self.places else "",
-            Cause.LIGHT: f"light that is the same in all frames changes the image by {self.common:.1%}",
-        }
-        return sentences.get(self.cause) or self.cause.value[0]
-
-    @property
-    def _noise_sentence(self) -> str:
-        """State measured and stated noise and gain."""
-        if self.noise is None:
-            return ""
-        words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
-        if self.gain and self.noise.gain_error < 0.1 * self.noise.gain:
-            measured, error = self.gain * self.noise.gain, self.gain * self.noise.gain_error
-            words += f"; stated gain {self.gain:.4g} DN per electron, measured {measured:.3g} +- {error:.1g}"
+        words = self.cause.value[0] if self.cause else ""
+        if self.cause is Cause.READING:
+            words = f"the frames fit if {'; or if '.join(each.words for each in self.readings[:_SHOWN])}"
+            if len(self.readings) > 1:
+                words += f" ({len(self.readings)} readings fit alike, and the frames cannot decide)"
+        elif self.cause is Cause.FRAMES:
+            words = "; ".join(map(str, self.faults[:_SHOWN]))
+        elif self.cause is Cause.PIXELS and self.places:
+            words = f"the misfit is in {self.places[0].words}"
+        elif self.cause is Cause.LIGHT:
+            words = f"light that is the same in all frames changes the image by {self.common:.1%}"
+        elif self.cause is Cause.NOISE and self.noise:
+            words = f"the frames' noise has {self.noise.ratio:.3g} times the variance that the camera file states"
+            if self.gain and self.noise.gain_error < 0.1 * self.noise.gain:
+                measured, error = self.gain * self.noise.gain, self.gain * self.noise.gain_error
+                words += f"; stated gain {self.gain:.4g} DN per electron, measured {measured:.3g} +- {error:.1g}"
         return words
-
-    @property
-    def _reading_sentence(self) -> str:
-        ways = "; or if ".join(reading.words for reading in self.readings[:_SHOWN])
-        more = (
-            ""
-            if len(self.readings) == 1
-            else f" ({len(self.readings)} readings fit alike, and the frames cannot decide)"
-        )
-        return f"the frames fit if {ways}{more}"
 
     def summary(self) -> dict[str, Any]:
         """Return the entry of result.json and of the command line's JSON."""
+        measured = self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None
         return {
-            "chi_square": self.chi_square,
-            "unexplained": self.unexplained,
-            "worst_tile": self.worst_tile,
+            **{name: getattr(self, name) for name in ("chi_square", "unexplained", "worst_tile", "flagged", "detail")},
             "noise_stated": self.stated,
-            "flagged": self.flagged,
             "cause": self.cause.name.lower() if self.cause else None,
             "reason": self.reason or None,
             "noise_ratio": self.noise.ratio if self.noise else None,
             "gain_stated": self.gain,
-            "gain_measured": self.gain * self.noise.gain if self.gain and self.noise and self.noise.gain > 0 else None,
+            "gain_measured": measured,
             "foretold": self.predicted,
-            "detail": self.detail,
             "defective_pixels": self.defects.summary() if self.defects else None,
             "reading": self.readings[0].words if len(self.readings) == 1 else None,
             "readings": [reading.summary() for reading in self.readings],
@@ -207,17 +186,16 @@ class Misfit:
         if self.cause is None:
             return status
         times = f", {chi_square_text(self.chi_square)} times what its noise makes" if self.stated else ""
-        part = f"{self.unexplained:.1%} of the measurements fit no image{times}"
-        heads = {Cause.NOISE: "Noise is not as stated: ", Cause.FRAMES: "Faulty frames: "}
-        sentence = heads.get(self.cause, f"Misfit: {part}; ") + self.reason
+        head = f"Misfit: {self.unexplained:.1%} of the measurements fit no image{times}; "
+        head = {Cause.NOISE: "Noise is not as stated: ", Cause.FRAMES: "Faulty frames: "}.get(self.cause, head)
+        sentence, remedy = head + self.reason, self.cause.value[1]
         if self.predicted:
             sentence += f"; its calibration foretells up to {self.predicted:.1%} ({decibels(self.predicted):.1f} dB)"
         if len(self.faults) > _SHOWN and self.cause is Cause.FRAMES:
             sentence += f"; and {len(self.faults) - _SHOWN} more"
-        remedy = self.cause.value[1]
-        if not status.verdict.good:
-            return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
-        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
+        if status.verdict.good:
+            return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
+        return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
 
 
 def chi_square_text(chi_square: float) -> str:
@@ -244,7 +222,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     if prepared.spare <= 0:
         return None
     factor_energy, of_ramps = data.factor_energy(image), print_energy(data.model, image)
-    beside = noise.rendering + (factor_energy or 0.0)
+    beside, known = noise.rendering + (factor_energy or 0.0), factor_energy is not None
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
     sums, change = Residuals(data), 0.0
@@ -252,52 +230,41 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
         sums = Residuals(data, common)
         moved = prepared.image(Propagation(data.model, lam).gain * (data.weights - sums.weights))
         change = float(np.sqrt(sum_of_squares(moved) / max(sum_of_squares(image), TINY)))
-    test, energy, whole = sums.noise_test, float(sums.energy.sum()), float(sums.squares.sum())
-    off = test is not None and test.off(noise, whole, stated, beside)
-    if off and test and test.ratio < 1 and not data.digital.step_dn:
-        off = False  # numbers without an ADC may be means of many shots
-    ratio = test.ratio if test and off else max(test.ratio, 1.0) if test and not noise.stated else 1.0
-    expected, known = sums.expected_energy(ratio, factor_energy or 0.0), factor_energy is not None
-    energies = sums.residual, sums.energy, expected, sums.pixels
+    test, energy, whole = sums.noise_test, max(float(sums.energy.sum()), TINY), float(sums.squares.sum())
+    # Numbers without an ADC may be means of many shots.
+    off = test is not None and test.off(noise, whole, stated, beside) and bool(test.ratio >= 1 or data.digital.step_dn)
+    ratio = 1.0 if test is None or (noise.stated and not off) else test.ratio if off else max(test.ratio, 1.0)
+    energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
     found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
     if off:  # chi-square is of the stated noise
         found = replace(found, chi_square=whole / max(stated + beside, TINY))
     if lack := data.lack(image):
-        found = replace(found, predicted=float(np.sqrt(lack.energy / max(energy, TINY))))
+        found = replace(found, predicted=float(np.sqrt(lack.energy / energy)))
     if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
         return replace(found, defects=defects)  # the caller leaves them out, and tries again
     check = FrameCheck(data, sums, lam, ratio, beside + of_ramps)
-    faults = check.faults()
-    places = sums.places(ratio) if noise.stated and not off else []
-    found = replace(found, faults=faults, places=tuple(places), picture=check.picture, limits=check.limits())
+    faults, places = check.faults(), tuple(sums.places(ratio)) if noise.stated and not off else ()
     scaled = multiple(noise.factor, test.ratio) if test and noise.stated else None
     turned = noise.shots == 2 and negative(prepared, pixel_groups(data.shots.patterns), sums.weights)
     # A reading is looked for in dim light, too, where chance hides half of what is off.
     hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
-    fitting = not (found.flagged or faults or places or off or turned or hinted)
-    others = () if fitting or scaled else find_readings(data, ratio, beside + of_ramps)
-    found = replace(found, readings=(scaled,) if scaled else others)
-    detail = _detail(data, sums, excess, beside) if found.flagged and not (found.readings or faults) else 0.0
-    if detail:
+    readings = (scaled,) if scaled else ()
+    if not scaled and (found.flagged or faults or places or off or turned or hinted):
+        readings = find_readings(data, ratio, beside + of_ramps)
+    if found.flagged and not (readings or faults) and (detail := _detail(data, sums, excess, beside)):
         fine, _ = weigh(energies, known, noise, max(of_ramps, detail))
         if not fine.flagged:
-            found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile, places=())
-            found = replace(found, detail=float(np.sqrt(detail / max(energy, TINY))))
-    full = noise.saturated > 1e-5 * noise.readings
-    local = bool(found.places) and found.places[0].energy > _MOSTLY * excess
-    findings = (
-        (found.readings, Cause.READING),
-        (faults, Cause.FRAMES),
-        (found.flagged, Cause.SATURATION if full else Cause.PIXELS if local else Cause.MODEL),
-        (found.places, Cause.PIXELS),
-        (turned, Cause.MODEL),
-        (off, Cause.NOISE),
-        (change > _COMMON_IMAGE, Cause.LIGHT),
-    )
-    cause = next((cause for finding, cause in findings if finding), None)
-    return replace(found, flagged=cause is not None, cause=cause)
+            found = replace(found, flagged=False, unexplained=fine.unexplained, worst_tile=fine.worst_tile)
+            found, places = replace(found, detail=float(np.sqrt(detail / energy))), ()
+    full, local = noise.saturated > 1e-5 * noise.readings, bool(places) and places[0].energy > _MOSTLY * excess
+    unlike = Cause.SATURATION if full else Cause.PIXELS if local else Cause.MODEL
+    findings = {Cause.READING: readings, Cause.FRAMES: faults, unlike: found.flagged}
+    later = {Cause.PIXELS: places, Cause.MODEL: turned, Cause.NOISE: off, Cause.LIGHT: change > _COMMON_IMAGE}
+    cause = next((cause for some in (findings, later) for cause, finding in some.items() if finding), None)
+    found = replace(found, faults=faults, places=places, readings=readings, flagged=cause is not None, cause=cause)
+    return replace(found, picture=check.picture, limits=check.limits())
 
 
 def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[FrameFault, ...]:
@@ -324,20 +291,19 @@ def _common_light(data: Accumulation, sums: Residuals, expected: float) -> Float
     prepared, count = data.prepared, data.noise.variance.size
     if data.noise.shots == 2 or count < 2:
         return None
-    even_scene = [side.sum(axis=1) for side in data.factors.sides]
-    lights = [np.stack([np.ones(len(seen)), seen / max(float(np.abs(seen).max()), TINY)]) for seen in even_scene]
+    lights = [side.sum(axis=1) for side in data.factors.sides]
+    lights = [np.stack([np.ones(len(seen)), seen / max(float(np.abs(seen).max()), TINY)]) for seen in lights]
     if prepared.centre:
         lights = [light - light.mean(axis=1, keepdims=True) for light in lights]
     weights = [light @ side.common for light, side in zip(lights, (prepared.left, prepared.right), strict=True)]
-    whole = count * np.prod([light @ light.T for light in lights], axis=0)
-    normal = whole - np.prod([weight @ weight.T for weight in weights], axis=0)
+    whole, normal = (np.prod([each @ each.T for each in sides], axis=0) for sides in (lights, weights))
+    whole, normal = count * whole, count * whole - normal
     # Light of an even scene may lie in the model's range, and light without contrast is lost by centring.
     scale = np.sqrt(np.maximum(np.diag(normal), _IN_RANGE * np.diag(whole)) + TINY)
     side = np.einsum("fi,ij,fj->f", lights[0], sums.total, lights[1], optimize=True) / scale
     found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=_IN_RANGE) @ side
-    energy, excess = max(float(sums.energy.sum()), TINY), float(sums.squares.sum()) - expected
-    least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * energy)
-    if found @ side < max(least, _MOSTLY * excess):
+    least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * float(sums.energy.sum()))
+    if found @ side < max(least, _MOSTLY * (float(sums.squares.sum()) - expected)):
         return None
     return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
 
@@ -346,9 +312,8 @@ def _detail(data: Accumulation, sums: Residuals, excess: float, beside: float) -
     """Return the energy of print finer than a scene pixel, as the frames show it."""
     lit = LitFrames(data.factors.sides, data.shots.patterns)
     for each in data.measurements_again():
-        pattern = each.row, each.column
-        variance = data.noise.of(float(data.noise.means[pattern]), each.shots)
-        lit.collect(each, data.prepared.as_solved(each.frame), float(variance))
+        variance = float(data.noise.of(float(data.noise.means[each.row, each.column]), each.shots))
+        lit.collect(each, data.prepared.as_solved(each.frame), variance)
     return float(np.nan_to_num(lit.print_part())) * max(excess + beside, 0.0)
 
 
@@ -380,9 +345,7 @@ def weigh(
     chi_square = float(residual.sum() / max(float(expected.sum()), TINY))
     chi_squares = residual / np.maximum(expected, TINY)
     stated = noise.stated and factors_stated
-    if stated:
-        flagged = unexplained > UNEXPLAINED and chi_square > 1 + noise_chance(noise, float(pixels.sum()))
-    else:
-        flagged = unexplained > GROSS and chi_square > _GROSS_CHI_SQUARE
+    part, most = (UNEXPLAINED, 1 + noise_chance(noise, float(pixels.sum()))) if stated else (GROSS, _GROSS_CHI_SQUARE)
+    flagged = unexplained > part and chi_square > most
     cause = Cause.MODEL if flagged else None
     return Misfit(chi_square, unexplained, chi_squares, float(tiles.max()), stated, flagged, cause), excess

@@ -20,36 +20,35 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import correlate1d, uniform_filter
 from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 
 from mitsim.core.arrays import FloatArray
-
-IntArray = npt.NDArray[np.intp]
+from mitsim.reconstruct.factorisation import IndexArray
 
 _POWER, _SHIFT = 0.1, 0.5
 """Standard deviations of the power of a frame and of its place [scene pixels] before the frames are seen."""
 _SCALES = 8.0, 3.0, 1.0, 1.0
 """Scales of the rounds of reweighted least squares, because small ones at once end in another minimum."""
-_PIXELS = 2500
-"""Pixels to which the stencil is fitted at most, to save time."""
-_WINDOWS = 3, 5
-"""Dots along each side of the windows in which a disturbance is looked for."""
+_PIXELS, _FEWEST = 2500, 4
+"""Pixels to which the stencil is fitted at most, to save time; and pixels for each number that is fitted, below which
+the picture decides nothing."""
+_WINDOWS, _LONGEST = (3, 5), 4
+"""Dots along each side of the windows, and most consecutive shots, in which a disturbance is looked for."""
 _FEW, _OF_NORMAL = 0.2, 0.253
 """Part of the frames that no disturbance reaches, and the quantile of the size of normal numbers there."""
 _BLACK, _DARKER = 6.0, 1.5
 """Deviations of noise up to which a frame has no light, and weight of its deviation, because no good frame lacks all of
 what the picture predicts."""
-_MOST = 3.0
-"""Scales at which a single pixel's difference counts in full: edges of a print reach more."""
-_FIXED = 1e12
-"""Weight with which the mean change of all frames is held at zero."""
-_LONGEST = 4
-"""Most consecutive shots in which one disturbance is looked for."""
-_FEWEST = 4
-"""Pixels for each number that is fitted, below which the picture decides nothing."""
+_MOST, _FIXED = 3.0, 1e12
+"""Scales at which a single pixel's difference counts in full, because edges of a print reach more; and weight with
+which the mean change of all frames is held at zero."""
+_UNDERSTATED = 2.0
+"""Scatter of powers and places in good runs over their standard errors, at most, because neighbours share errors."""
+_UNMOVED, _SHARED = 0.3, 0.25
+"""Part of the frames that a wrong one leaves as they are, and part of the differences that pixels along a line share
+from which the picture varies in one direction only, and decides nothing."""
 
 
 def robust_scatter(values: FloatArray) -> float:
@@ -83,108 +82,115 @@ class PictureCheck:
         (K,) robust deviations of the whole frame, and of its most deviating window, from those of other frames.
     """
 
-    def __init__(self, image: FloatArray, frame_of: IntArray, periods: Sequence[int], noise: FloatArray) -> None:
-        count = int(frame_of.max()) + 1
-        self._stencil = stencil = _Stencil(image, frame_of, noise)
-        self.decides = bool(stencil.offsets) and stencil.pixels.size >= _FEWEST * (count + len(stencil.offsets))
+    def __init__(self, image: FloatArray, frame_of: IndexArray, periods: Sequence[int], noise: FloatArray) -> None:
+        self._shape, self._frames, self._noise = image.shape, frame_of.ravel(), noise.ravel()
+        self._count, self._floor = int(frame_of.max()) + 1, 1e-9 * float(np.abs(image).max()) + 1e-300
+        reach, width = [2 if size >= 24 else 1 for size in image.shape], image.shape[1]
+        inner = (np.arange(far, size - far) for far, size in zip(reach, image.shape, strict=True))
+        self._pixels: IndexArray = np.ravel_multi_index(np.meshgrid(*inner, indexing="ij"), image.shape).ravel()
+        own = self._frames[self._pixels]
+        offsets = [y * width + x for y in range(reach[0] + 1) for x in range(-reach[1], reach[1] + 1) if y or x > 0]
+        near = {each: self._frames[np.stack([self._pixels + each, self._pixels - each])] for each in offsets}
+        self._offsets = [each for each, frames in near.items() if (frames != own).all()]
+        self._weights = np.full(len(self._offsets) + 2, 1.0 / max(len(self._offsets), 1))
+        self.decides = bool(self._offsets) and len(own) >= _FEWEST * (self._count + len(self._offsets))
         if not self.decides:
             return
-        self.power, self.power_error = stencil.fit(image, [image], _POWER, _SCALES)
+        self._some = np.random.default_rng(0).choice(self._pixels, min(len(own), _PIXELS), replace=False)
+        # Differences along a line of pixels that the same frame lights share their error.
+        along = [axis for axis in (0, 1) if (np.diff(frame_of, axis=axis) == 0).all()]
+        self._line_of: IndexArray = np.indices(image.shape)[1 - along[0]].ravel() if along else np.arange(image.size)
+        self.power, self.power_error = self._fit(image, [image], _POWER, _SCALES)
         self._even = image * (1 - self.power[frame_of])
-        left_over = stencil.differences(self._even)
-        differences = left_over / stencil.scale(left_over, stencil.pixels)
+        left_over = self._differences(self._even)
+        differences = left_over / self._scale(left_over, self._pixels)
         self.predicted = float(np.sqrt(np.mean(np.square(left_over))))
-        own = frame_of.ravel()[stencil.pixels]
-        lit = np.maximum(np.bincount(own, minlength=count), 1)
-        roughness = np.log1p(np.square(differences))
-        means = np.bincount(own, roughness, count) / lit
-        self.foreign = (means - np.median(means)) / np.maximum(robust_scatter(means), np.sqrt(roughness.var() / lit))
-        # A black frame decides nothing of its own power, but its mean is far below the predicted one.
-        lack = -stencil.differences(image)
-        shown, missing, squares, noises = (
-            np.bincount(own, each, count) / lit
-            for each in (image.ravel()[stencil.pixels], lack, np.square(lack), noise.ravel()[stencil.pixels])
+        moved, roughness = np.clip(differences, -_MOST, _MOST), np.log1p(np.square(differences))
+        # Along a line, bars of a print make the same difference of all pixels. A wrong frame does so, too, but leaves a
+        # part of the frames as they are.
+        number = np.bincount(lines := self._line_of[self._pixels])
+        shared = (np.bincount(lines, moved) / np.maximum(number, 1))[lines] * moved
+        parts = np.bincount(own, shared, self._count) / (np.bincount(own, moved**2, self._count) + 1e-300)
+        alike = max(float(np.quantile(parts, _UNMOVED)) * number.max(), 1.0)
+        lit = np.maximum(np.bincount(own, minlength=self._count), 1)
+        lack = -self._differences(image)
+        means, shown, missing, squares, noises = (
+            np.bincount(own, each, self._count) / lit
+            for each in (roughness, image.ravel()[self._pixels], lack, np.square(lack), self._noise[self._pixels])
         )
+        away = means - np.median(means)
+        self.foreign = away / np.maximum(robust_scatter(means), np.sqrt(alike * roughness.var() / lit))
+        # A black frame decides nothing of its own power, but its mean is far below the predicted one.
         black = (np.square(shown) < _BLACK**2 * noises / lit) & (missing > shown)
-        chance = np.sqrt(np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
+        chance = np.sqrt(alike * np.maximum(squares - np.square(missing), 0.0) / lit) + 1e-300
         self.foreign = np.maximum(self.foreign, np.where(black, _DARKER * missing / chance, 0.0))
-        self.disturbed = _disturbance(stencil, own, np.clip(differences, -_MOST, _MOST), periods, count)
+        self.decides = bool(black.any() or alike - 1 <= _SHARED * (number.max() - 1))
+        common = float(shared.sum() / (np.square(moved).sum() + 1e-300)) if along else 0.0
+        self.disturbed = self._disturbance(moved, periods, common)
 
     @cached_property
     def place(self) -> tuple[FloatArray, FloatArray]:
         """The place (2, K) of each frame along rows and columns [scene pixels], and its standard error."""
         # Looked for in the picture without the powers, because in even parts these look like a slope.
-        place, error = self._stencil.fit(self._even, [*np.gradient(self._even)], _SHIFT)
+        place, error = self._fit(self._even, [*np.gradient(self._even)], _SHIFT)
         return place.reshape(2, -1), error.reshape(2, -1)
 
     def uncertainty(self, image: FloatArray) -> FloatArray:
         """Return (n, n') standard uncertainty of an ``image`` (n, n') by the power and the place of single frames.
 
-        It is made of their scatter over the frames. A regular print makes part of that, which cannot be told from a
+        Of the scatter of the powers and places over the frames, the part that their own errors explain is no change of
+        lamp, camera or scene. The variance that remains is stated, and at least its standard error, because a flicker
+        as small as the errors is not seen. A regular print makes a part of the scatter, which cannot be told from a
         flicker.
         """
-        power, *moves = (robust_scatter(own) for own in (self.power, *self.place[0]))
+        found, errors = (
+            np.stack([own, *others]) for own, others in zip((self.power, self.power_error), self.place, strict=True)
+        )
+        scatter, known = np.var(found, axis=1), np.mean(np.square(_UNDERSTATED * errors), axis=1)
+        power, *moves = np.sqrt(np.maximum(scatter - known, scatter * np.sqrt(2 / self._count)))
         variance = np.square(image * power)
         for axis, move in enumerate(moves):  # to either side, because a slope over both misses the finest print
             for step in ([0.0, -1.0, 1.0], [-1.0, 1.0, 0.0]):
                 variance += np.square(move * correlate1d(image, step, axis, mode="nearest")) / 2
         return np.asarray(np.sqrt(variance))
 
+    def _disturbance(self, moved: FloatArray, periods: Sequence[int], common: float) -> FloatArray:
+        """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later.
 
-def _disturbance(stencil: _Stencil, own: IntArray, moved: FloatArray, periods: Sequence[int], count: int) -> FloatArray:
-    """Return the largest deviation (K,) of the mean of a window of each frame, alone and with up to three later ones.
-
-    ``moved`` are the differences of pixels from their predictions in units of their scale, limited.
-    """
-    places = np.unravel_index(stencil.pixels, stencil.shape)
-    cells = [place // period for place, period in zip(places, periods, strict=True)]
-    shape = count, *(-(-size // period) for size, period in zip(stencil.shape, periods, strict=True))
-    index = np.ravel_multi_index((own, *cells), shape)
-    parts = [np.bincount(index, weights, int(np.prod(shape))).reshape(shape) for weights in (moved, moved**2, None)]
-    found, spread = np.zeros(count), float(np.mean(np.square(moved)))
-    for dots in _WINDOWS:
-        light, power, lit = (uniform_filter(part * 1.0, (0, dots, dots), mode="constant") * dots**2 for part in parts)
-        # Windows over a texture of the print scatter more than others, in all frames.
-        usual = np.maximum(np.median(power / np.maximum(lit, 1), axis=0), spread)
-        for length in range(1, min(_LONGEST, count // 3) + 1):
-            runs = range(count - length + 1)
-            total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
-            scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
-            # A texture with a period of its own deviates in most frames, and a disturbance in few.
-            few = int(_FEW * (len(scores) - 1))
-            scores /= np.maximum(np.partition(scores, few, axis=0)[few] / _OF_NORMAL, 1.0)
-            for k, worst in enumerate(scores.max(axis=(1, 2))):
-                found[k : k + length] = np.maximum(found[k : k + length], worst)
-    return found
-
-
-class _Stencil:
-    """Predicts pixels from the means of pairs of opposite neighbours, none of which is in the pixel's own frame."""
-
-    def __init__(self, image: FloatArray, frame_of: IntArray, noise: FloatArray) -> None:
-        self.shape, self._frames, self._noise = image.shape, frame_of.ravel(), noise.ravel()
-        self._floor, self._count = 1e-9 * float(np.abs(image).max()) + 1e-300, int(frame_of.max()) + 1
-        reach = [2 if size >= 24 else 1 for size in self.shape]
-        inner = (np.arange(far, size - far) for far, size in zip(reach, self.shape, strict=True))
-        self.pixels: IntArray = np.ravel_multi_index(np.meshgrid(*inner, indexing="ij"), self.shape).ravel()
-        self._some = self.pixels
-        if len(self.pixels) > _PIXELS:
-            self._some = np.random.default_rng(0).choice(self.pixels, _PIXELS, replace=False)
-        width, own = self.shape[1], self._frames[self.pixels]
-        offsets = [y * width + x for y in range(reach[0] + 1) for x in range(-reach[1], reach[1] + 1) if y or x > 0]
-        self.offsets = [
-            each for each in offsets if all((self._frames[self.pixels + sign * each] != own).all() for sign in (1, -1))
+        Parameters
+        ----------
+        moved
+            differences of pixels from their predictions in units of their scale, limited.
+        periods
+            as of the class.
+        common
+            part of the differences' energy that pixels along a line share.
+        """
+        cells = [
+            place // each for place, each in zip(np.unravel_index(self._pixels, self._shape), periods, strict=True)
         ]
-        # Differences along a line of pixels that the same frame lights share their error.
-        lines = self._some
-        for axis in (0, 1):
-            if (np.diff(frame_of, axis=axis) == 0).all():
-                lines = np.unravel_index(self._some, self.shape)[1 - axis]
-        ones = np.ones(len(lines))
-        self._lines = csr_matrix((ones, (lines, np.arange(len(lines)))), shape=(int(lines.max()) + 1, len(lines)))
-        self.weights = np.full(len(self.offsets) + 2, 1.0 / max(len(self.offsets), 1))
+        shape = self._count, *(-(-size // period) for size, period in zip(self._shape, periods, strict=True))
+        index = np.ravel_multi_index((self._frames[self._pixels], *cells), shape)
+        parts = [np.bincount(index, weights, int(np.prod(shape))).reshape(shape) for weights in (moved, moved**2, None)]
+        found, spread = np.zeros(self._count), float(np.mean(np.square(moved)))
+        for dots in _WINDOWS:
+            light, power, lit = (
+                uniform_filter(part * 1.0, (0, dots, dots), mode="constant") * dots**2 for part in parts
+            )
+            # Windows over a texture of the print scatter more than others, in all frames.
+            usual = np.maximum(np.median(power / np.maximum(lit, 1), axis=0), spread) * (1 + (dots - 1) * common)
+            for length in range(1, min(_LONGEST, self._count // 3) + 1):
+                runs = range(self._count - length + 1)
+                total, number = (np.stack([part[k : k + length].sum(axis=0) for k in runs]) for part in (light, lit))
+                scores = np.abs(total) / np.sqrt(np.maximum(number, dots**2 * length / 2) * usual + 1e-300)
+                # A texture with a period of its own deviates in most frames, and a disturbance in few.
+                few = int(_FEW * (len(scores) - 1))
+                scores /= np.maximum(np.partition(scores, few, axis=0)[few] / _OF_NORMAL, 1.0)
+                for k, worst in enumerate(scores.max(axis=(1, 2))):
+                    found[k : k + length] = np.maximum(found[k : k + length], worst)
+        return found
 
-    def fit(
+    def _fit(
         self, image: FloatArray, changes: Sequence[FloatArray], prior: float, learned: Sequence[float] = ()
     ) -> tuple[FloatArray, FloatArray]:
         """Fit how far each frame is off by each of the ``changes`` (n, n') of an ``image`` (n, n').
@@ -199,47 +205,46 @@ class _Stencil:
         """
         own, target = self._pairs(image, self._some), image.ravel()[self._some]
         # The same change of all frames is a change of the picture, and is held at zero.
-        known = np.eye(len(changes) * self._count) / prior**2
-        known += np.kron(np.eye(len(changes)), np.full((self._count, self._count), _FIXED))
-        found, left_over = np.zeros(len(known)), target - own @ self.weights
+        known = np.kron(np.eye(len(changes)), np.eye(self._count) / prior**2 + _FIXED)
+        found, left_over = np.zeros(len(known)), target - own @ self._weights
         design = self._sensitivity(changes)
         for wider in learned or (1.0, 1.0):
-            weights = 1 / (np.square(wider * self.scale(left_over, self._some)) + np.square(left_over))
+            weights = 1 / (np.square(wider * self._scale(left_over, self._some)) + np.square(left_over))
             if learned:
                 normal = own.T @ (weights[:, None] * own)
                 normal[np.diag_indices_from(normal)] += 1e-9 * np.trace(normal)
                 root = np.linalg.cholesky(normal)
                 side = own.T @ (weights * (target - design @ found))
-                self.weights = nnls(root.T, np.linalg.solve(root, side))[0]
+                self._weights = nnls(root.T, np.linalg.solve(root, side))[0]
                 design = self._sensitivity(changes)
-            rest, weighted = target - own @ self.weights, design.multiply(weights[:, None]).tocsr()
+            rest, weighted = target - own @ self._weights, design.multiply(weights[:, None]).tocsr()
             inverse = np.linalg.inv((weighted.T @ design).toarray() + known)
             found = inverse @ (weighted.T @ rest)
             left_over = rest - design @ found
-        scores = self._lines @ weighted.multiply(left_over[:, None]).tocsr()
+        lines, place = self._line_of[self._some], np.arange(len(self._some))
+        scores = csr_matrix((np.ones(len(lines)), (lines, place))) @ weighted.multiply(left_over[:, None]).tocsr()
         covariance = inverse @ ((scores.T @ scores).toarray() + np.eye(len(known)) / prior**2) @ inverse
         spare = max(len(left_over) - len(inverse), 1) / len(left_over)
         return found, np.sqrt(np.maximum(np.diag(covariance), 0.0) / spare)
 
-    def differences(self, image: FloatArray) -> FloatArray:
+    def _differences(self, image: FloatArray) -> FloatArray:
         """Return the pixels inside of an ``image`` (n, n') less what the stencil predicts of them."""
-        return np.asarray(image.ravel()[self.pixels] - self._pairs(image, self.pixels) @ self.weights)
+        return np.asarray(image.ravel()[self._pixels] - self._pairs(image, self._pixels) @ self._weights)
 
-    def scale(self, left_over: FloatArray, pixels: IntArray) -> FloatArray:
+    def _scale(self, left_over: FloatArray, pixels: IndexArray) -> FloatArray:
         """Return the scale of the differences ``left_over`` of ``pixels``."""
         return np.maximum(np.sqrt(robust_scatter(left_over) ** 2 + self._noise[pixels]), self._floor)
 
-    def _pairs(self, image: FloatArray, pixels: IntArray) -> FloatArray:
+    def _pairs(self, image: FloatArray, pixels: IndexArray) -> FloatArray:
         """Return the means of opposite neighbours (pixels, pairs), and a constant of either sign."""
         values, ones = image.ravel(), np.ones(len(pixels))
-        pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self.offsets]
+        pairs = [(values[pixels + each] + values[pixels - each]) / 2 for each in self._offsets]
         return np.stack([*pairs, ones, -ones], axis=1)
 
     def _sensitivity(self, changes: Sequence[FloatArray]) -> csr_matrix:
         """Return the change of pixels less their predictions (pixels, len(changes) K) by one frame alone."""
-        place, terms = np.arange(len(self._some)), [(0, 1.0)]
-        for offset, weight in zip(self.offsets, self.weights, strict=False):
-            terms += [(offset, -weight / 2), (-offset, -weight / 2)] if weight else []
+        place, near = np.arange(len(self._some)), zip(self._offsets, self._weights, strict=False)
+        terms = [(0, 1.0), *((sign * offset, -weight / 2) for offset, weight in near for sign in (1, -1) if weight)]
         parts = [
             (weight * change.ravel()[places], place, self._frames[places] + number * self._count)
             for number, change in enumerate(changes)

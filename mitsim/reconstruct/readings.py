@@ -12,7 +12,7 @@ on both sides, transposed frames and shots of a loop over columns leave the same
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -27,14 +27,12 @@ from mitsim.reconstruct.solver import Prepared, prepare
 
 _FITS, _AT_MOST = 0.05, 2e-2
 """Part of the unexplained energy, and of the measurements, rms, that a reading may leave."""
-_ALIKE = 0.02
-"""Relative difference of misfits up to which two readings fit alike."""
-_ROWS = 4.0
-"""Sensor rows for each scene row, at least, of the part of the sensor that decides."""
-_EXPONENTS, _LAGS = (0.3, 3.0), (0.0, 0.5)
-"""Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before."""
-_LINEAR, _NO_LAG = 0.05, 2e-3
-"""Differences from an exponent of one, and lag, that are no readings of their own."""
+_ALIKE, _ROWS = 0.02, 4.0
+"""Relative difference of misfits up to which two readings fit alike; and sensor rows for each scene row, at least, of
+the part of the sensor that decides."""
+_EXPONENTS, _LAGS, _LINEAR, _NO_LAG = (0.3, 3.0), (0.0, 0.5), 0.05, 2e-3
+"""Ranges of the tone curve's exponent, and of the part of a frame that is left of the one before; and difference of an
+exponent's logarithm from zero, and lag, that are no readings of their own."""
 _LAMBDA, _NEGATIVE = 1e-3, 0.5
 """Lambda, over the largest sigma^2, of the image whose mean is looked at; and the part of its largest mean by which an
 image is negative: noise of no picture that shows anything is as large."""
@@ -74,19 +72,13 @@ class Reading:
         return {"words": self.words, "order": self.order, "unexplained": self.left}
 
 
-Found = tuple[str, str | None, float]
-"""Words of a reading, the order if `mitsim import --order` has it, and the misfit."""
-
-
 def multiple(factor: int, chi_square: float) -> Reading | None:
     """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its
     ``chi_square``."""
     if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
         return None
-    words = f"the numbers are divided by {factor}, because all of them are multiples of {factor}"
-    return Reading(
-        words if factor & (factor - 1) else f"{words}, as of fewer bits that were moved up by {factor.bit_length() - 1}"
-    )
+    bits = "" if factor & (factor - 1) else f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
+    return Reading(f"the numbers are divided by {factor}, because all of them are multiples of {factor}{bits}")
 
 
 def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
@@ -105,10 +97,7 @@ def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatA
         of :func:`pixel_groups`.
     """
     sigma = prepared.sigma
-    gain = np.divide(
-        sigma, np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2, out=np.zeros_like(sigma), where=sigma > 0
-    )
-    image = prepared.image(gain * weights)
+    image = prepared.image(weights * sigma / (np.square(sigma) + _LAMBDA * float(sigma.max()) ** 2 + TINY))
     means = np.array([[image[np.ix_(rows, columns)].mean() for columns in groups[1]] for rows in groups[0]])
     return bool(means.min() < -_NEGATIVE * np.abs(means).max())
 
@@ -137,16 +126,13 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     if unexplained <= chance / 2:
         return ()
     limit = allowed + max(min(_FITS * unexplained, _AT_MOST**2 * whole), min(chance, unexplained / 2))
-    good: list[Found] = []
-    for stage in (run.alone, run.together, run.curves):
-        good = sorted((each for each in stage() if each[2] < limit), key=lambda each: each[2])
-        if good:
-            break
-    seen: dict[str, Reading] = {}
-    for words, order, misfit in good:
-        if misfit <= good[0][2] * (1 + _ALIKE) + chance:
-            seen.setdefault(words, Reading(words, float(np.sqrt(max(misfit - allowed, 0.0) / whole)), order))
-    return tuple(seen.values())
+    turns, orders = ([(turn, _TAKEN) for turn in run.turns], [(_KEPT, order) for order in run.orders])
+    stages = map(run.moved, turns + orders), map(run.moved, product(run.turns, run.orders)), run.curves()
+    good: list[Reading] = []
+    for stage in stages:
+        good = good or sorted((each for each in stage if each.left < limit), key=lambda each: each.left)
+    alike = [each for each in good if each.left <= good[0].left * (1 + _ALIKE) + chance]
+    return tuple(replace(each, left=float(np.sqrt(max(each.left - allowed, 0.0) / whole))) for each in alike)
 
 
 class _Part:
@@ -154,52 +140,38 @@ class _Part:
 
     def __init__(self, data: Accumulation) -> None:
         manifest = data.shots.manifest
-        left, right = (np.asarray(side) for side in (data.factors.left, data.factors.right))
-        steps = [max(int(len(side) / (_ROWS * side.shape[1])), 1) for side in (left, right)]
+        sides, patterns = (data.factors.left, data.factors.right), data.shots.patterns
+        steps = [max(int(len(side) / (_ROWS * side.shape[1])), 1) for side in sides]
         self._part = tuple(slice(None, None, step) for step in steps)
-        patterns = data.shots.patterns
-        sides = left[self._part[0]], right[self._part[1]]
-        self.prepared: Prepared = prepare(*sides, *patterns, centre=data.prepared.centre)
-        self._groups = pixel_groups(patterns)
-        self._captures = manifest.patterns.captures
-        self._signed = any(shot.sign for shot in self._captures)
-        self._dark = data.digital.dark_current_e_per_s
+        left, right = (np.asarray(side)[part] for side, part in zip(sides, self._part, strict=True))
+        self.prepared: Prepared = prepare(left, right, *patterns, centre=data.prepared.centre)
+        self._groups, self._captures = pixel_groups(patterns), manifest.patterns.captures
+        self._signed, self._dark = data.noise.shots == 2, data.digital.dark_current_e_per_s
         number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._captures)}
-        frames: list[FloatArray] = [np.zeros(())] * len(self._captures)
+        self._frames: list[FloatArray] = [np.zeros(())] * len(number)
         for each in data.measurements_again():
-            halves = [(0, each.frame)]
-            if each.shots == 2:
-                halves = [(1, (each.light + each.frame) / 2), (-1, (each.light - each.frame) / 2)]
-            for sign, light in halves:
-                frames[number[each.row, each.column, sign]] = light.astype(np.float32)
-        self._frames, shape = frames, frames[0].shape
-        self._turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape]
-        taken = np.arange(len(frames))
+            for sign in (1, -1) if self._signed else (0,):
+                light = (each.light + sign * each.frame) / 2 if sign else each.frame
+                self._frames[number[each.row, each.column, sign]] = light.astype(np.float32)
+        shape, taken = self._frames[0].shape, np.arange(len(number))
+        self.turns = [name for name, turn in _TURNS.items() if turn(np.zeros(shape, bool)).shape == shape][1:]
         self._orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
         self._orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
-        self.size = len(sides[0]) * len(sides[1])
+        distinct = {tuple(order): name for name, order in reversed(self._orders.items())}
+        self.orders = [name for name in distinct.values() if name != _TAKEN]
+        self.size = len(left) * len(right)
         self.energy = self._weights(self.shots())[1]
 
-        distinct = {tuple(order): name for name, order in reversed(self._orders.items())}
-        self._others = [name for name in distinct.values() if name != _TAKEN]
-
-    def alone(self) -> Iterator[Found]:
-        """Yield turns of the frames, and other orders of the shots."""
-        pairs = [(turn, _TAKEN) for turn in self._turns[1:]] + [(_KEPT, order) for order in self._others]
-        return (self._try(*each) for each in pairs)
-
-    def together(self) -> Iterator[Found]:
-        """Yield turns together with other orders."""
-        return (self._try(*each) for each in product(self._turns[1:], self._others))
-
-    def _try(self, turn: str, order: str) -> Found:
+    def moved(self, change: tuple[str, str]) -> Reading:
+        """Return the reading of a turn of the frames and an order of the shots, with the energy that it leaves."""
+        turn, order = change
         parts = [] if turn == _KEPT else [f"the frames are {turn}"]
         parts += [] if order == _TAKEN else [_STEPS.get(order, f"the shots were taken in the order {order}")]
         known = None if order == _TAKEN or order in _STEPS else order
-        return " and ".join(parts), known, self.misfit(self.shots(turn, order))
+        return Reading(" and ".join(parts), self.misfit(self.shots(turn, order)), known)
 
-    def curves(self) -> Iterator[Found]:
-        """Yield the best tone curve and the best lag."""
+    def curves(self) -> Iterator[Reading]:
+        """Yield the best tone curve and the best lag, each with the energy that it leaves."""
         shots = self.shots()
 
         def misfit_of_lag(part: float) -> float:
@@ -209,13 +181,13 @@ class _Part:
 
         if not self.prepared.centre:  # without means of rows and columns, no number is known
             best = minimize_scalar(self._bent_misfit, bounds=np.log(_EXPONENTS), args=(shots,), method="bounded")
+            words = f"the numbers went through a tone curve: they are the light to the power of {np.exp(-best.x):.2g}"
             if abs(best.x) > _LINEAR:
-                words = "the numbers went through a tone curve: they are the light to the power of "
-                yield f"{words}{np.exp(-best.x):.2g}", None, float(best.fun)
+                yield Reading(words, float(best.fun))
         if not self._signed:
             best = minimize_scalar(misfit_of_lag, bounds=_LAGS, method="bounded")
             if best.x > _NO_LAG:
-                yield f"the sensor lags: each frame holds {best.x:.1%} of the frame before", None, float(best.fun)
+                yield Reading(f"the sensor lags: each frame holds {best.x:.1%} of the frame before", float(best.fun))
 
     def shots(self, turn: str = _KEPT, order: str = _TAKEN) -> list[FloatArray]:
         """Return this part of all shots, their frames brought back by a ``turn`` and taken in another ``order``."""
@@ -242,22 +214,19 @@ class _Part:
 
     def _bent_misfit(self, logarithm: float, shots: Sequence[FloatArray]) -> float:
         """Return the misfit, in numbers as they were read, of light that is a power of them, exp(``logarithm``)."""
-        exponent = float(np.exp(logarithm))
+        exponent, spare = float(np.exp(logarithm)), self.prepared.spare
         top = max(float(shot.max()) for shot in shots) + self._dark or 1.0
 
         def bend(values: FloatArray, power: float) -> FloatArray:
             return np.asarray(np.sign(values) * np.abs(values) ** power)
 
-        bent = [bend((shot + self._dark) / top, exponent) for shot in shots]
         even = bend(np.array(self._dark / top), exponent)
-        linear = [shot - even for shot in bent]
+        linear = [bend((shot + self._dark) / top, exponent) - even for shot in shots]
         weights, _ = self._weights(linear)
-        total = 0.0
         # The halves of a pair are known by their sum, which is the same for all pairs.
-        mean = 2 * np.mean(linear, axis=0) if self._signed else None
+        mean, total = 2 * np.mean(linear, axis=0), 0.0
         for capture, shot in zip(self._captures, shots, strict=True):
             model = self.prepared.frame(weights, (capture.row, capture.column))
-            model = model if mean is None else (mean + capture.sign * model) / 2
+            model = (mean + capture.sign * model) / 2 if self._signed else model
             total += sum_of_squares(shot + self._dark - top * bend(model + even, 1 / exponent))
-        spare = self.prepared.spare
-        return total if mean is None else total * 2 * spare / (1 + spare)
+        return total * 2 * spare / (1 + spare) if self._signed else total

@@ -17,7 +17,6 @@ that is in one place, and sensors of uneven response raise no alarm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -41,19 +40,15 @@ _NOISE_TILE, _NOISE_TILES = 16, 1500
 _NOISE_OFF, _SLOPE_OFF, _SLOPE_KNOWN = 0.15, 0.25, 0.05
 """Relative differences of measured from stated noise, and of its slope where read noise is not stated, from which they
 are flagged, because published gains are good to some per cent; and the error up to which a slope counts as known."""
-_STRUCTURE = 0.5
-"""Energy of structure over that of noise up to which residuals count as white."""
-_CORRELATED = (70 / 36) ** 2
-"""Sum of the squared correlations of second differences: they have so many times fewer degrees of freedom."""
-_PAIR_ROWS = 96
-"""Sensor rows and columns, at least, by which the sums of pairs are compared, to save time."""
+_STRUCTURE, _CORRELATED = 0.5, (70 / 36) ** 2
+"""Energy of structure over that of noise up to which residuals count as white; and sum of the squared correlations of
+second differences, because they have so many times fewer degrees of freedom."""
+_PAIR_ROWS, _SAMPLE = 96, 20_000
+"""Sensor rows and columns, at least, by which the sums of pairs are compared, and numbers whose median and scatter
+stand for those of more, to save time."""
 _BRIGHT, _ALIKE = 50.0, 1e-3
 """Energy of a half over that of its noise from which it is no black one, because it would be fitted to its own noise;
 and determinant of the products of a pair's halves, over the square of the larger, below which they are alike."""
-_STEPS = 50
-"""Steps of conjugate gradients at most; patterns that share little need a few."""
-_SAMPLE = 20_000
-"""Numbers whose median and scatter stand for those of more, to save time."""
 _PLACE, _PLACE_ENERGY = 7.0, 0.02
 """Robust deviations from which a place stands out, and the part of the expected energy that its residual must
 exceed."""
@@ -94,8 +89,7 @@ class NoiseTest:
             energy of all residuals, of their stated noise, and of what calibration and rendering add.
         """
         if not noise.stated:
-            known = self.gain_error < _SLOPE_KNOWN
-            return bool(known and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error)
+            return self.gain_error < _SLOPE_KNOWN and abs(self.gain - 1) > _SLOPE_OFF + CHANCE * self.gain_error
         chance = noise_chance(noise, float(noise.light.size))
         # The energy beside may be stated too large, because a few groups of paths estimate that of rendering.
         little = whole - beside < (1 - _NOISE_OFF - chance) * stated
@@ -105,31 +99,6 @@ class NoiseTest:
         more = whole > (1 + _NOISE_OFF + chance) * stated + beside
         seen = self.ratio > (1 + beside / max(stated, TINY)) * (1 + _NOISE_OFF) + CHANCE / 2 * self.error
         return white and more and seen
-
-
-class Pair(NamedTuple):
-    """Difference of the sum of a signed pattern's halves from those of all other pairs, which are the same light.
-
-    Attributes
-    ----------
-    powers, errors
-        (2,) relative power of the first and of the second half beyond that of the other pairs, and their standard
-        errors; infinite where a half is as good as black, or as the other one.
-    rest, size
-        energy that no power of the halves explains, and number of the data that are compared.
-    side
-        correlation of the rest with the residual of the halves' difference: 1 if the first half is wrong, -1 if the
-        second is.
-    contrast
-        difference of the halves' light over their sum.
-    """
-
-    powers: FloatArray
-    errors: FloatArray
-    rest: float
-    size: int
-    side: float
-    contrast: float
 
 
 class Place(NamedTuple):
@@ -153,50 +122,52 @@ class Residuals:
         (tiles, tiles) pixels of each tile.
     squares, total
         (m, m') sums of the squares of residuals of each sensor pixel, and of the residuals.
-    own, leave_out
-        (K, K') energy of a pattern's residual e, and e^T (I - H_kk)^-1 e: what is left of it when the others predict
-        it.
+    leave_out
+        (K, K') e^T (I - H_kk)^-1 e of a pattern's residual e, the energy of its difference from the prediction of all
+        other patterns.
     shots
         (K, K') energy of a pattern's shots.
     free
         (K, K') data of a pattern that others predict too.
     fitted
         (K, K') product of a pattern's residual and of what the model has of it.
-    pairs
-        by signed pattern, the difference of the sum of its halves from the sums of all other pairs.
+    powers
+        by signed pattern, (2,) relative power of its first and second half beyond that of the other pairs, whose halves
+        add up to the same light, and the standard errors; infinite where a half is as good as black, or as the other.
+    rest, compared
+        (K, K') energy of the differences of these sums that no power of the halves explains, and number of its data.
+    side
+        (K, K') correlation of that rest with the residual of the halves' difference: 1 if the first half is wrong, -1
+        if the second is.
+    contrast
+        (K, K') difference of the halves' light over their sum.
     same, clipped
-        patterns and halves by a number that equal frames share, and readings at the largest number of such a frame.
+        row, column and sign of shots by a number that equal frames share, and readings at a shot's largest number.
     """
 
     def __init__(self, data: Accumulation, light: FloatArray | None = None) -> None:
         """Read all measurements of ``data``, less a ``light`` (m, m') that was in every one of them."""
         prepared, self.noise = data.prepared, data.noise
         self._prepared, self._light = prepared, light
-        sizes = prepared.left.sensor_size, prepared.right.sensor_size
+        self._sides = sides = prepared.left, prepared.right
+        sizes, counts = ([getattr(side, name) for side in sides] for name in ("sensor_size", "pattern_count"))
         edges = [np.linspace(0, size, min(_TILES, size) + 1).astype(np.intp) for size in sizes]
         self._strips, self._starts = [slice(*ends) for ends in pairwise(edges[0])], edges[1][:-1]
         self.pixels: FloatArray = np.outer(*(np.diff(edge) for edge in edges)).astype(np.float64)
-        counts = prepared.left.pattern_count, prepared.right.pattern_count
-        self.own, self.leave_out, self.shots, self.free, self.fitted = (np.zeros(counts) for _ in range(5))
-        self.pairs: dict[tuple[int, int], Pair] = {}
-        self._seen: dict[tuple[int, int], FloatArray] = {}
-        self.same: dict[int, list[tuple[tuple[int, int], int]]] = {}
-        self.clipped: dict[tuple[tuple[int, int], int], int] = {}
-        self.squares, self._early, self.total, self._powers = (np.zeros(sizes) for _ in range(4))
-        # Arrays of one frame, because to make them anew takes longer than to fill them.
-        self._residual, self._squared = np.zeros(sizes), np.zeros(sizes)
+        self.leave_out, self.shots, self.free, self.fitted, self.rest, self.side, self.contrast = np.zeros((7, *counts))
+        self.powers: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+        self.same: dict[int, list[tuple[int, int, int]]] = {}
+        self.clipped: dict[tuple[int, int, int], int] = {}
+        # Two arrays of one frame are kept, because to make them anew takes longer than to fill them.
+        self.squares, self._early, self.total, self._powers, self._residual, self._squared = np.zeros((6, *sizes))
         self.weights = data.weights
         if light is not None:
-            self.weights = self.weights - prepared.left.common.T @ prepared.as_solved(light) @ prepared.right.common
-        self._grams = [[_gram(slab.matrix) for slab in side.slabs] for side in (prepared.left, prepared.right)]
-        self._rough = [
-            [float(np.square(np.diff(slab.matrix, 2, axis=0)).sum()) for slab in side.slabs]
-            for side in (prepared.left, prepared.right)
-        ]
+            self.weights = self.weights - sides[0].common.T @ prepared.as_solved(light) @ sides[1].common
+        self._grams = [[np.linalg.eigh(slab.matrix.T @ slab.matrix) for slab in side.slabs] for side in sides]
+        self._rough = [[sum_of_squares(np.diff(slab.matrix, 2, axis=0)) for slab in side.slabs] for side in sides]
         self._noises: list[FloatArray] = []
-        total = max(counts[0] * counts[1], 1)
         for number, measurement in enumerate(data.measurements_again()):
-            if 2 * number < total <= 2 * number + 2:
+            if number == (self.noise.variance.size - 1) // 2:
                 self._early = self.squares.copy()
             self._add(measurement, data.coefficients.get((measurement.row, measurement.column)))
         self.energy, self.residual = self._tiles(self._powers), self._tiles(self.squares)
@@ -213,23 +184,23 @@ class Residuals:
         self._powers += np.multiply(frame, frame, out=self._squared)
         # Behind a mask with a constant term most of the light contributes nothing to the image.
         self.shots[pattern] = float(self._squared.sum()) if prepared.centre else measurement.power
-        (turn, values), (other_turn, other_values) = (self._grams[side][index] for side, index in enumerate(pattern))
-        known = np.outer(values, other_values)
+        (values, turn), (other_values, other_turn) = (self._grams[side][index] for side, index in enumerate(pattern))
+        known = np.clip(np.outer(values, other_values), 0.0, 1.0)
         alone = known > 1 - 1e-6
         self.free[pattern] = residual.size - np.count_nonzero(alone)
-        self.own[pattern] = self.leave_out[pattern] = sum_of_squares(residual)
+        self.leave_out[pattern] = sum_of_squares(residual)
         if not alone.all():
             if coefficients is None or self._light is not None:
                 coefficients = left.matrix.T @ frame @ right.matrix
-            seen = turn.T @ coefficients @ other_turn - known * (turn.T @ own @ other_turn)
-            self._seen[pattern] = turn @ seen @ other_turn.T
-            self.fitted[pattern] = float(np.vdot(own, self._seen[pattern]))
+            fit, read = (turn.T @ each @ other_turn for each in (own, coefficients))
+            seen = read - known * fit
+            self.fitted[pattern] = float(np.vdot(fit, seen))
             self.leave_out[pattern] += float(np.sum(np.square(seen[~alone]) / (1 - known[~alone])))
         self._noises.append(self._noise_tiles(measurement, residual, pattern))
-        for half, (digest, cut) in enumerate(zip(measurement.digests, measurement.clipped, strict=True)):
-            self.same.setdefault(digest, []).append((pattern, half))
-            if cut:
-                self.clipped[pattern, half] = cut
+        signs = (1, -1) if measurement.shots == 2 else (0,)
+        for sign, digest, cut in zip(signs, measurement.digests, measurement.clipped, strict=False):
+            self.same.setdefault(digest, []).append((*pattern, sign))
+            self.clipped |= {(*pattern, sign): cut} if cut else {}
         others = self.noise.variance.size - 1
         if measurement.shots == 2 and others:
             some = slice(None, None, max(min(residual.shape) // _PAIR_ROWS, 1))
@@ -243,77 +214,47 @@ class Residuals:
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
                 inverse = np.linalg.inv(normal)
-                powers = np.asarray(inverse @ (halves @ beyond), dtype=np.float64)
-                errors = np.asarray(np.sqrt(variance * np.diag(inverse)), dtype=np.float64)
+                powers, errors = inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse))
             rest = beyond - powers @ halves
-            side = float(rest @ left_over) / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
-            contrast = float(difference.sum() / max(float(total.sum()), TINY))
-            self.pairs[pattern] = Pair(powers, errors, sum_of_squares(rest), rest.size, side, contrast)
-
-    def without(self, patterns: Sequence[tuple[int, int]]) -> float:
-        """Return the energy by which the residual falls if some ``patterns`` are left out of the fit.
-
-        That is e^T (I - A A^T)^-1 e of their residuals e, A being their part of the model's orthonormal columns: |e|^2
-        + <z, x> with z = A^T e and (I - A^T A) x = z, by conjugate gradients (Hestenes and Stiefel 1952). Directions
-        that no other pattern sees have no curvature: the steps end there, which scipy's cg would not do.
-        """
-        grams = {each: [slab.matrix.T @ slab.matrix for slab in self._prepared.slabs(each)] for each in patterns}
-        seen = np.zeros_like(self.weights)
-        for each in patterns:
-            seen[self._prepared.places(each)] += self._seen.get(each, 0.0)
-        found, rest, step, squared = np.zeros_like(seen), seen.copy(), seen.copy(), sum_of_squares(seen)
-        for _ in range(_STEPS):
-            moved = step.copy()
-            for each, (left, right) in grams.items():
-                places = self._prepared.places(each)
-                moved[places] -= left @ step[places] @ right
-            curvature = float(np.vdot(step, moved))
-            if curvature <= 1e-9 * sum_of_squares(step):
-                break
-            found, rest = found + squared / curvature * step, rest - squared / curvature * moved
-            before, squared = squared, sum_of_squares(rest)
-            step = rest + squared / max(before, TINY) * step
-        return sum(float(self.own[each]) for each in patterns) + float(np.vdot(seen, found))
+            self.powers[pattern], self.rest[pattern], self.compared = (powers, errors), sum_of_squares(rest), rest.size
+            self.side[pattern] = rest @ left_over / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
+            self.contrast[pattern] = difference.sum() / max(float(total.sum()), TINY)
 
     def _noise_tiles(self, measurement: Measurement, residual: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """Return (3, tiles) mean squares of second differences, mean light, and pixels of tiles of one residual."""
+        """Return (2, tiles) mean squares of second differences, and mean light, of tiles of one residual."""
         tiles = -(-_NOISE_TILES * _NOISE_TILE // (residual.shape[1] * self.noise.variance.size))
         first = max(len(residual) - tiles * _NOISE_TILE - 2, 0) // 2
         rows = slice(first, first + tiles * _NOISE_TILE + 2)
-        rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1))
-        light = measurement.light[rows][1:-1, 1:-1]
+        rough = np.square(np.diff(np.diff(residual[rows], 2, axis=0), 2, axis=1)) / 36
         size = 36 * (len(residual) - 2) * (residual.shape[1] - 2)
         spare = 1 - self._rough[0][pattern[0]] * self._rough[1][pattern[1]] / max(size, 1)
         if min(rough.shape) < 1 or spare <= 0.1:
-            return np.zeros((3, 0))
-        starts = [np.arange(max(length // _NOISE_TILE, 1)) * _NOISE_TILE for length in rough.shape]
-        sums = [np.add.reduceat(np.add.reduceat(each, starts[0], 0), starts[1], 1).ravel() for each in (rough, light)]
-        counts = np.outer(*(np.diff([*start, length]) for start, length in zip(starts, rough.shape, strict=True)))
-        pixels = counts.ravel().astype(np.float64)
-        return np.stack([sums[0] / (36 * spare * pixels), sums[1] / pixels, pixels])
+            return np.zeros((2, 0))
+        (down, high), (across, wide) = ((n := max(size // _NOISE_TILE, 1), size // n) for size in rough.shape)
+        both = np.stack([rough / spare, measurement.light[rows][1:-1, 1:-1]])[:, : down * high, : across * wide]
+        self._tile_pixels = high * wide
+        return np.asarray(both.reshape(2, down, high, across, wide).mean(axis=(2, 4)).reshape(2, -1))
 
     @cached_property
     def noise_test(self) -> NoiseTest | None:
         """The measured noise; None of frames that are too small."""
-        found, light, pixels = np.concatenate(self._noises, axis=1)
-        if not found.size or not found.any():
+        found, light = np.concatenate(self._noises, axis=1)
+        if not found.any():
             return None
-        freedom = pixels / _CORRELATED
+        freedom = self._tile_pixels / _CORRELATED
+        spread = float(np.sqrt(2 / freedom))
         stated = np.maximum(self.noise.of(light, self.noise.shots), TINY)
         ratios = found / stated / (1 - 2 / (9 * freedom)) ** 3
         ratio = float(np.median(ratios))
-        spread = np.sqrt(2 / freedom)
-        error = float(ratio * np.sqrt(np.pi / 2) * spread.mean() / np.sqrt(len(found)))
+        error = float(ratio * np.sqrt(np.pi / 2 / len(found))) * spread
         kept = np.abs(found / stated / ratio - 1) < 5 * spread
-        weights = 1 / np.square(ratio * stated * spread)[kept]
-        columns = np.stack([light[kept], np.ones(int(kept.sum()))], axis=1)
-        normal = columns.T @ (weights[:, None] * columns)
-        still = float(self.noise.of(0.0, self.noise.shots))
-        own = float(self.noise.of(1.0, self.noise.shots)) - still
-        known = kept.sum() >= 8 and np.linalg.cond(normal / np.sqrt(np.outer(*2 * [np.diag(normal)]))) < 1e6
-        if known and (spread_of_slope := float(np.sqrt(np.linalg.inv(normal)[0, 0])) / own) < _SLOPE_KNOWN * ratio:
-            slope = np.linalg.solve(normal, columns.T @ (weights * found[kept]))[0]
-            return NoiseTest(ratio, error, float(slope) / own, spread_of_slope)
+        weights, light = 1 / (ratio * stated[kept] * spread), light[kept]
+        still, one = (float(self.noise.of(value, self.noise.shots)) for value in (0.0, 1.0))
+        if kept.sum() >= 8 and light.std() > 1e-3 * np.abs(light).max():
+            (slope, _), covariance = np.polyfit(light, found[kept], 1, w=weights, cov="unscaled")
+            slope_error = float(np.sqrt(covariance[0, 0])) / (one - still)
+            if slope_error < _SLOPE_KNOWN * ratio:
+                return NoiseTest(ratio, error, float(slope) / (one - still), slope_error)
         # By the stated read noise: ratio = gain (1 - share) + gain^2 share, the read noise having a share of the noise.
         share = min(still / max(float(np.median(stated)), TINY), 1.0)
         gain = 2 * ratio / (1 - share + float(np.sqrt((1 - share) ** 2 + 4 * share * ratio)))
@@ -342,8 +283,7 @@ class Residuals:
         ``ratio`` is that of measured to stated noise.
         """
         count = self.noise.variance.size
-        sides = (self._prepared.left, self._prepared.right)
-        taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in sides]
+        taken = [sum(np.square(slab.matrix).sum(axis=1) for slab in side.slabs) for side in self._sides]
         freedom = np.maximum(count - np.outer(*taken), 1e-3)
         variance = np.maximum(self.noise.of(self.noise.light / count, self.noise.shots), TINY)
         whole = self.squares, ratio * variance * freedom, freedom
@@ -356,11 +296,10 @@ class Residuals:
             away = _deviations((np.cbrt(squares / own) - 1 + spread) / np.sqrt(spread))
             usual = np.median((squares / own).ravel()[:: max(own.size // _SAMPLE, 1)])
             beyond[name] = np.where(away > _PLACE, squares - usual * own, 0.0)
-        change = tiles[0] - 2 * self._tiles(self._early)
-        far = np.abs(_deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))) > _PLACE
-        beyond["half"] = np.where(far, np.abs(change), 0.0)
-        far = np.abs(_deviations(self.total / np.sqrt(whole[1]))) > _PLACE
-        beyond["mean"] = np.where(far, np.maximum(self.squares - whole[1], 0.0), 0.0)
+        change, means = tiles[0] - 2 * self._tiles(self._early), _deviations(self.total / np.sqrt(whole[1]))
+        changes = _deviations(change / tiles[1] / np.sqrt(2 / tiles[2]))
+        beyond["half"] = np.where(np.abs(changes) > _PLACE, np.abs(change), 0.0)
+        beyond["mean"] = np.where(np.abs(means) > _PLACE, np.maximum(self.squares - whole[1], 0.0), 0.0)
         least = _PLACE_ENERGY * float(whole[1].sum())
         found = [Place(_words(name, each), float(each.sum())) for name, each in beyond.items() if each.sum() > least]
         return sorted(found, key=lambda place: -place.energy)
@@ -376,14 +315,7 @@ def noise_chance(noise: FrameNoise, pixels: float) -> float:
 
     The energy of normal noise of variance v in n data varies by sqrt(2 n) v.
     """
-    total = max(float(noise.variance.sum()), TINY)
-    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels)) / total
-
-
-def _gram(slab: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvectors and eigenvalues, 0 to 1, of U^T U of a ``slab`` U (m, c)."""
-    values, vectors = np.linalg.eigh(slab.T @ slab)
-    return vectors, np.clip(values, 0.0, 1.0)
+    return CHANCE * float(np.sqrt(2 * np.square(noise.variance).sum() / pixels) / max(noise.variance.sum(), TINY))
 
 
 def _deviations(values: FloatArray) -> FloatArray:
@@ -399,5 +331,5 @@ def _words(name: str, beyond: FloatArray) -> str:
         return f"sensor {name} {spans[0]}"
     if name in ("pixel", "mean"):
         return f"{np.count_nonzero(beyond)} pixels in rows {spans[0]}, columns {spans[1]}"
-    when = " in one half of the session" if name == "half" else ""
-    return f"tile rows {spans[0]}, columns {spans[1]} of {beyond.shape[0]} x {beyond.shape[1]} tiles{when}"
+    words = f"tile rows {spans[0]}, columns {spans[1]} of {beyond.shape[0]} x {beyond.shape[1]} tiles"
+    return f"{words} in one half of the session" if name == "half" else words
