@@ -93,6 +93,8 @@ class FrameCheck:
         self._number = {(shot.row, shot.column, shot.sign): index for index, shot in enumerate(self._shots)}
         spare = float(self._variance.sum()) * sums.squares.size * data.prepared.spare
         self._excess = float(sums.squares.sum()) - spare - beside
+        # Errors of the factors differ from dot to dot, as those of a wrong frame do.
+        self._doubt = float(np.sqrt(1 + beside / max(spare, TINY)))
         single = all(((side != 0).sum(axis=1) == 1).all() for side in data.shots.patterns)
         self._exclusive = single and not self._signed and self._variance.size > 1
         self.picture = self._check_picture(lam) if self._exclusive else None
@@ -170,10 +172,10 @@ class FrameCheck:
         found = self.picture
         if found is None:
             return
-        foreign = np.flatnonzero(found.foreign > _FOREIGN)
+        foreign = np.flatnonzero(found.foreign > _FOREIGN * self._doubt)
         if len(foreign):
             yield self._fault("picture", foreign, "show another picture than the frames around, dot by dot")
-        disturbed = np.flatnonzero(found.disturbed > _DISTURBED)
+        disturbed = np.flatnonzero(found.disturbed > _DISTURBED * self._doubt)
         # Gloss is seen in some frames, too, but its light has no image: no frame is at fault.
         if len(disturbed) and not len(foreign) and self._excess < OFF**2 * float(self._sums.shots.sum()):
             strongest = disturbed[np.argsort(-found.disturbed[disturbed])][:8]

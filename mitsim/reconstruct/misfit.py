@@ -226,7 +226,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     stated = float(noise.variance.sum()) * noise.light.size * prepared.spare
     lam = solution.lam if data.solver.linear else _LAMBDA_BESIDE * prepared.problem(data.frames).scale
     sums, change = Residuals(data), 0.0
-    if (common := _common_light(data, sums, stated + beside)) is not None:
+    if (common := _common_light(data, sums, stated, beside)) is not None:
         sums = Residuals(data, common)
         moved = prepared.image(Propagation(data.model, lam).gain * (data.weights - sums.weights))
         change = float(np.sqrt(sum_of_squares(moved) / max(sum_of_squares(image), TINY)))
@@ -281,9 +281,11 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
     return FrameCheck(data, Residuals(data), lam, 1.0, beside).faults()
 
 
-def _common_light(data: Accumulation, sums: Residuals, expected: float) -> FloatArray | None:
-    """Return the light (m, m') that is the same in all measurements; None where it is no more than chance, or explains
-    less than most of the residual beyond the ``expected`` energy.
+def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: float) -> FloatArray | None:
+    """Return the light (m, m') that is the same in all measurements; None if chance or errors of the factors explain it.
+
+    It must have more energy than the factors' errors (``beside``), which are common to all frames, and most of the
+    residual beyond that of the ``stated`` noise and of these errors.
 
     The light is even, as of a black level that is wrong, or that of an even scene, as of a lamp in the room. The sum of
     all residuals has it times the energy K |F|^2 less that in the model's range.
@@ -303,7 +305,7 @@ def _common_light(data: Accumulation, sums: Residuals, expected: float) -> Float
     side = np.einsum("fi,ij,fj->f", lights[0], sums.total, lights[1], optimize=True) / scale
     found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=_IN_RANGE) @ side
     least = max(2 * CHANCE**2 * float(data.noise.variance.mean()), (UNEXPLAINED / 4) ** 2 * float(sums.energy.sum()))
-    if found @ side < max(least, _MOSTLY * (float(sums.squares.sum()) - expected)):
+    if found @ side < max(least, beside, _MOSTLY * (float(sums.squares.sum()) - stated - beside)):
         return None
     return np.asarray((lights[0] * (found / scale)[:, None]).T @ lights[1])
 
