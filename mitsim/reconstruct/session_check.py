@@ -4,13 +4,15 @@ Three redundancies hold for every good session. The two frames of a pair add up 
 responses of one side are the shadow of one mask that moves (:mod:`mitsim.reconstruct.moving_shadow`). Both sides share
 the lamp and the time.
 
-Therefore the sum S_k of each pair is fitted over all pixels and in time::
+Therefore the sum s_k of each pair, projected on the common vector as its response u_k is, is fitted over the sensor's
+rows (or columns) y and in time::
 
-    S_k = S + c_k U + d_k R_k + l R_(k-1) + s_k . grad U + a_k . (1, y, x)
+    s_k = s + c_k u + d_k u_k + l u_(k-1) + m_k u' + a_k + b_k y
 
-with S the usual sum, U the response to uniform light, and R_k that to pattern k. c is the lamp's power, d the unequal
-power of both halves, l the lag, s the camera's motion in pixels, and a the ambient light. The change of ambient light
-within a pair is measured in the response, across the common vector. Only three acts change the factors: the sign of a
+with s the side's usual sum and u the response to uniform light. c is the lamp's power, d the unequal power of the two
+frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Light that this projection does not
+show changes no factor. The change of ambient light within a pair is measured in the response, across the common
+vector. Only three acts change the factors: the sign of a
 response is turned, one frame of a pair replaces both, and responses are divided by the lamp's power. Each is accepted
 if the moving shadow, estimated afterwards, agrees. Every other fault is refused or counts in the stated error.
 """
@@ -22,19 +24,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, UNIFORM, Half, Side
-from mitsim.reconstruct.estimate_factors import (
-    LARGEST_ERROR,
-    AmbientLight,
-    Estimate,
-    PairLight,
-    StripeSums,
-    block_means,
-    factors_of_sums,
-)
+from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.picture_check import robust_scatter
 
@@ -87,6 +82,8 @@ _POWER = "frames are of different power; use a steadier lamp, or pairs"
 """Reason of errors by a lamp that no sums show."""
 _REPLACED = "a frame of a pair is wrong; take it again"
 """Reason of the noise that is larger where one frame replaces a pair."""
+_STEP = 5.0
+"""Variance of the lamp's step from one side to the other, in that of the power of one pair."""
 _UNKNOWN = 1e30
 """Variance of a number that nothing shows."""
 
@@ -254,12 +251,6 @@ def _shrunk(
     return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
 
 
-def _scatter(values: FloatArray, variances: FloatArray) -> bool:
-    """Return True if ``values`` differ by more than their ``variances``."""
-    away = np.square(values - np.median(values)) / variances
-    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / away.size))
-
-
 # ---- The check -------------------------------------------------------------------------------------------------------
 
 
@@ -272,13 +263,14 @@ class _Side:
         self.side: Side = SIDES[axis]
         self.vectors, self.misfits = sums.vectors.copy(), sums.misfits.copy()
         self.extras: dict[str, float] = {}
-        self.square = float(np.dot(sums.common, sums.common))
-        if sums.pairs:
-            self.pairs = PairLight.together(sums.pairs)
         self.light = AmbientLight(sums.common, len(self.vectors))
         self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
-        self.noise = self.variance * len(self.vectors) / self.square
+        self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
+        # The uniform frames of this side against the mean of both sides': their power, and their place in pixels.
+        self.shapes = np.stack([self.uniform, np.gradient(self.uniform)])
+        own = np.linalg.lstsq(self.shapes.T, self.vectors[:, 0], rcond=None)[0]
+        self.power, self.place = own * np.sign(own[0])
 
     @property
     def size(self) -> float:
@@ -293,12 +285,56 @@ class _Side:
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
-    def add_motion(self, moves: FloatArray, variances: FloatArray, ends: FloatArray) -> None:
-        """Count ``moves`` (N,) [pixels] of these ``variances`` against either end of the session."""
-        beyond = [np.average(np.square(moves - end) - variances, weights=1 / variances) for end in ends]
-        # Differences of neighbours: those of every second pixel do not see the finest detail.
-        words = f"camera or mask move by {abs(ends[1] - ends[0]):.2g} pixels; fasten them"
-        self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
+    def add_motion(self, places: FloatArray, variances: FloatArray, times: FloatArray) -> None:
+        """Count ``places`` (N,) [pixels] of patterns at ``times``, if they differ by more than their ``variances``,
+        against either end of the session; the other side's uniform frames are as far on the other side of 0."""
+        few, late = max(2, len(times) // 8), np.argsort(times)
+        ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
+        away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
+        if away.mean() > 1 + _SURE * np.sqrt(2 / away.size):
+            beyond = [np.average(np.square(places - end) - variances, weights=1 / variances) for end in ends]
+            words = f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them"
+            # Differences of neighbours: those of every second pixel do not see the finest detail.
+            self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
+
+    def fit_sums(self) -> npt.NDArray[np.bool_]:
+        """Fit the sums of all pairs; return (N,) whether pairs do not fit."""
+        shapes = self.shapes
+        if not self.sums.centre:
+            shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
+        inverse = np.linalg.pinv(shapes)
+        responses = self.sums.vectors.T.copy()
+        responses[0] = 0.0  # the uniform pattern has one lit frame
+        values, parts = self.sums.lights.T @ inverse, responses @ inverse
+        rest, responses = self.sums.lights.T - values @ shapes, responses - parts @ shapes
+        rest -= np.median(rest, axis=0)
+        sizes = np.maximum(np.square(responses).sum(axis=1), 1 / _UNKNOWN)
+        self.ratios = (rest * responses).sum(axis=1) / sizes
+        rest -= self.ratios[:, None] * responses
+        # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
+        values -= self.ratios[:, None] * parts
+        self.powers, self.places = (values[:, :2] - values[0, :2] + (self.power, self.place)).T
+        squares, spare = np.square(rest).sum(axis=1), max(len(self.uniform) - len(shapes) - 1, 1)
+        noise = min(float(np.median(squares)) / spare, self.noise / len(self.vectors))
+        noise = max(noise, 1e-13 * float(np.square(self.uniform).mean()))
+        self.ratio_variances = noise / sizes
+        variances = noise * (np.square(inverse[:, :2]).sum(axis=0) + np.square(parts[:, :2]) / sizes[:, None])
+        self.power_variances, self.place_variances = variances.T
+        # Deviations along the common vector are errors of the response's vector, whatever their cause.
+        beyond = squares - noise * spare * (1 + np.pi / 4 / len(squares))  # the usual sum is a median
+        self.excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
+        measure = squares / (noise * spare)
+        middle = max(float(np.median(measure)), 1.0)
+        bad = measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / spare))
+        return np.asarray(bad | self.odd() | (np.abs(self.ratios) > _ALONE))  # power 0 cannot be divided out
+
+    def odd(self) -> npt.NDArray[np.bool_]:
+        """Return (N,) whether responses show light that no stripes cast."""
+        least = _UNEXPLAINED * np.maximum(self.sums.energies, np.median(self.sums.energies))
+        middle = float(np.median(self.misfits))
+        # Few misfits hardly show their scatter, which is that of squares of noise at least.
+        scatter = max(robust_scatter(self.misfits), float(np.sqrt(2 * self.variance * max(middle, 0.0))))
+        return np.asarray(self.misfits - middle > np.maximum(least, _DEVIATIONS * scatter))
 
 
 class _Check:
@@ -307,10 +343,12 @@ class _Check:
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
         self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
-        self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
+        self.paired, self.centre = all(own.sums.lights.size for own in self.sides), sums[0].centre
         self.found = CheckedSession(sums)
         self.refused: list[tuple[Half, str]] = []
-        self.lag = self.moved = 0.0
+        self.times, self.last = np.zeros((2, 2, self.count))
+        for place, (side, index, sign) in enumerate(taken.order):
+            self.times[SIDES.index(side), index], self.last[SIDES.index(side), index] = place / len(taken.order), sign
         self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -328,14 +366,19 @@ class _Check:
     def result(self) -> CheckedSession:
         found = self.found
         if self.paired:
-            bad = self._fit_sums()
+            bad = np.stack([own.fit_sums() for own in self.sides])
             if self.taken.saturated and bad.any():
                 return found
+            for side, index, _ in self.taken.wrong:
+                bad[SIDES.index(side), index] = True
+            self.good = ~bad
+            lag = self._subtract_lag()
             if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
+                moved = max(np.ptp([*own.places[self.good[own.axis]], -own.place]) for own in self.sides)
                 raise MitsimError(
                     f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
-                    f"others do; check their order, that nothing moves ({self.moved:.1g} pixels), that no frame holds "
-                    f"light of the one before ({self.lag:.1%}), and that numbers are in proportion to light"
+                    f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds "
+                    f"light of the one before ({lag:.1%}), and that numbers are in proportion to light"
                 )
             for own in self.sides:
                 if bad[own.axis, 0]:  # all others hang on it
@@ -353,92 +396,29 @@ class _Check:
         self._judge()
         return found
 
-    # ---- sums of pairs -----------------------------------------------------------------------------------------------
-
-    def _fit_sums(self) -> npt.NDArray[np.bool_]:
-        """Fit the sums of all pairs; return (2, N) whether pairs do not fit."""
-        order = self.taken.order
-        self.times, before = np.zeros((2, 2, self.count))
-        for place, ((side, index, _), last) in enumerate(zip(order, [None, *order], strict=False)):
-            self.times[SIDES.index(side), index] += place / 2 / len(order)
-            if last and last[:2] == (side, index):
-                before[SIDES.index(side), index] = last[2]
-        sums = np.stack([own.pairs.blocks.astype(np.float64) for own in self.sides])
-        lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
-        bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
-        if self.centre:
-            sums -= sums.mean(axis=3, keepdims=True)
-            sums -= sums.mean(axis=2, keepdims=True)
-        shape = sums.shape[2:]
-        along = [block_means(own.uniform) for own in self.sides]
-        moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
-        fixed = [np.outer(*along), np.outer(moved[0], along[1]), np.outer(along[0], moved[1])]
-        if not self.centre:
-            (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
-            fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
-        patterned = np.arange(self.count) > 0  # the uniform pattern has one lit frame
-        shown = [block_means(own.sums.vectors) * patterned for own in self.sides]
-        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
-        # Least squares: all is projected on the shapes first, and the rest on the responses.
-        usual = np.median(sums, axis=(0, 1)).ravel()
-        sums, responses = (each.reshape(2, self.count, -1) for each in (sums, np.stack([left, right])))
-        shapes = np.stack(fixed).reshape(len(fixed), -1)
-        inverse = np.linalg.pinv(shapes)
-        sums = sums - usual
-        sums -= np.median(sums - sums @ inverse @ shapes, axis=(0, 1))
-        values, parts = sums @ inverse, responses @ inverse
-        rest, responses = sums - values @ shapes, responses - parts @ shapes
-        sizes = np.maximum(np.square(responses).sum(axis=2), 1 / _UNKNOWN)
-        self.ratios = (rest * responses).sum(axis=2) / sizes
-        rest -= self.ratios[..., None] * responses
-        self.values = values - self.ratios[..., None] * parts
-        area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
-        squared = np.square(rest).mean(axis=2)
-        noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
-        noise = max(noise, 1e-13 * float(np.square(usual).mean()))
-        self.ratio_variances = noise * bright / sizes
-        self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
-        # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
-        lags = (2 * before * self.ratios)[sizes > np.quantile(sizes, 0.75)]
-        self.lag = float(np.median(lags))
-        self.lag *= self.count >= 16 and abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
-        self.ratios -= self.lag * before / 2
-        late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
-        moves = self.values[..., 1:3].reshape(-1, 2)
-        self.ends = np.stack([np.median(moves[part], axis=0) for part in (late[:few], late[-few:])])
-        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
-        # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        self.excess, relative = np.zeros((2, 2, self.count))
-        for own in self.sides:
-            frames, common, rows = rest[own.axis].reshape(-1, *shape), along[1 - own.axis], shape[own.axis]
-            vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
-            energies = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
-            expected = noise / (common @ common) * len(own.vectors) * (1 - (len(fixed) + 1) / rows)
-            expected = max(expected * (1 + np.pi / 4 / self.count), 1e-300)  # the usual sum is a median
-            beyond, deviation = energies - expected, expected * np.sqrt(2 * self.count / rows)
-            self.excess[own.axis], relative[own.axis] = beyond * (beyond.sum() > _SURE * deviation), energies / expected
-        bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
-        for side, index, _ in self.taken.wrong:
-            bad[SIDES.index(side), index] = True
-        for measure in (squared / noise, relative):
-            middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / min(shape)))
-        self.good = ~bad
-        return np.asarray(bad)
-
     # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
+
+    def _subtract_lag(self) -> float:
+        """Subtract and return the lag: a frame that holds light of the one before makes all pairs unequal alike."""
+        ratios, variances = (
+            np.stack([getattr(own, name) for own in self.sides]) for name in ("ratios", "ratio_variances")
+        )
+        lags = (-2 * self.last * ratios)[variances < np.median(variances)]  # wide stripes show it best
+        lag = float(np.median(lags))
+        lag *= self.count >= 16 and abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
+        for own, last in zip(self.sides, self.last, strict=True):
+            own.ratios += lag * last / 2
+            # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
+            words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
+            own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
+        return lag
 
     def _correct(self) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
         for own, good in zip(self.sides, self.good, strict=True):
-            own.add(_UNKNOWN_LIGHT, float(self.excess[own.axis][good].sum()))
+            own.add(_UNKNOWN_LIGHT, float(own.excess[good].sum()))
             self._subtract_ambient(own, good)
-            # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
-            words = f"each frame holds {self.lag:.1%} of the one before; wait longer between frames"
-            own.add(words, self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
-            if _scatter(moves[self.good], variances[self.good]):
-                own.add_motion(moves[own.axis][good], variances[own.axis][good], self.ends[:, own.axis])
+            own.add_motion(own.places[good], own.place_variances[good], self.times[own.axis][good])
         if not self.taken.unsteady:
             self._divide()
 
@@ -463,18 +443,24 @@ class _Check:
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
         usable = self.good
-        unit = 1 / max(1 - float(np.mean(self.values[:, 0, 0])), 0.1)
-        sure = usable & (np.square(self.ratios) > _SURE**2 * self.ratio_variances)
-        powers = (1 + self.values[..., 0] * unit) / (1 - np.where(sure, np.square(self.ratios), 0.0))
-        variances, degree = self.variances[..., 0] * unit**2, min(3, self.count // 2)
-        away = np.abs(powers - np.median(powers[usable]))
-        usual = usable & (away <= _DEVIATIONS * robust_scatter(powers[usable]) + 1e-12)
-        trend = np.polynomial.Polynomial.fit(self.times[usual], powers[usual], degree)(self.times)
+        measured, variances, ratios, ratio_variances = (
+            np.stack([getattr(own, name) for own in self.sides])
+            for name in ("powers", "power_variances", "ratios", "ratio_variances")
+        )
+        sure = usable & (np.square(ratios) > _SURE**2 * ratio_variances)
+        powers = measured / (1 - np.where(sure, np.square(ratios), 0.0))
+        # The trend is a line, and a median over a quarter of a side's pairs next in time, which follows steps.
+        late = [place for place in np.argsort(self.times, axis=None) if usable.flat[place]]
+        line = np.polyval(np.polyfit(self.times.flat[late], powers.flat[late], 1), self.times)
+        around = np.pad((powers - line).flat[late], self.count // 8, mode="reflect")
+        around = np.median(sliding_window_view(around, self.count // 8 * 2 + 1), axis=1)
+        trend = line + np.interp(self.times, self.times.flat[late], around)
         powers, trend = powers / np.mean(trend), trend / np.mean(trend)
-        trend = 1 + _shrunk(trend - 1, variances * (degree + 1) / usual.sum(), usual)[0]
+        # The step from one side to the other is known as well as the uniform frames are.
+        trend = 1 + _shrunk(trend - 1, variances * _STEP, usable)[0]
         own_power, left, shaken = _shrunk(powers - trend, variances, usable)
         # A single frame of other power changes both alike.
-        ratios, left_ratio, uneven = _shrunk(self.ratios, self.ratio_variances, usable, np.square(own_power))
+        ratios, left_ratio, uneven = _shrunk(ratios, ratio_variances, usable, np.square(own_power))
         left_ratio[:, 0] = 0.0
         powers, ratios, flicker = trend + own_power * usable, ratios * usable, float(np.sqrt(shaken + uneven))
         mean = float(np.sqrt(np.mean(powers[:, 0])))
@@ -501,7 +487,7 @@ class _Check:
                 self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
         if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
             self.found.lamp = lamp = {
-                "drift": float(trend.flat[np.argmax(self.times)] - trend.flat[np.argmin(self.times)]),
+                "drift": float(line.flat[late[-1]] - line.flat[late[0]]),
                 "flicker": flicker,
                 "drift_cost": float(np.sqrt(drift_cost)),
                 "flicker_cost": float(np.sqrt(flicker_cost)),
@@ -521,10 +507,9 @@ class _Check:
         known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
         reason = "the two do not add up to what others do"
         reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
-        own.misfits[index] = np.median(own.misfits)
         distances = np.abs(self.times[own.axis] - self.times[own.axis, index])
         near = np.argsort(np.where(self.good[own.axis], distances, np.inf))[:_NEAR]
-        away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
+        away = own.sums.lights[:, index] - np.median(own.sums.lights[:, near], axis=1)
         misfits = dict[int, float]()
         for wrong in known or (1, -1):
             own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
@@ -533,8 +518,10 @@ class _Check:
         sign = min(misfits, key=lambda wrong: misfits[wrong])
         decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
         if len(known) == 2 or not decided or misfits[sign] > 1:
-            self._refuse(own, index, reason)
+            if known or not own.odd()[index]:  # :meth:`_check_shadow` refuses those of odd light
+                self._refuse(own, index, reason)
             return
+        own.misfits[index] = np.median(own.misfits)
         own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
         # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
         own.add(_REPLACED, 1.5 * own.noise)
@@ -543,18 +530,10 @@ class _Check:
 
     def _compare_sides(self) -> None:
         """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
-        for half, reason in self.taken.wrong.items():
-            self.refused.append((half, reason))
-        found = []
+        self.refused += self.taken.wrong.items()
+        apart = abs(self.sides[0].power - self.sides[1].power)
         for own in self.sides:
             self._subtract_ambient(own, np.ones(self.count, dtype=bool))
-            shapes = np.stack([own.uniform, np.gradient(own.uniform)])
-            found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
-            moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
-            if moved**2 > (_SURE * 2) ** 2 * noise:
-                own.add_motion(np.full(1, moved), np.full(1, noise), np.array([0.0, moved]))
-        apart = abs(abs(found[0][0]) - abs(found[1][0]))
-        for own in self.sides:
             own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
@@ -590,11 +569,7 @@ class _Check:
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
             self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
-        least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
-        middle = float(np.median(own.misfits))
-        # Few misfits hardly show their scatter, which is that of squares of noise at least.
-        scatter = max(robust_scatter(own.misfits), float(np.sqrt(2 * own.variance * max(middle, 0.0))))
-        odd = own.misfits - middle > np.maximum(least, _DEVIATIONS * scatter)
+        odd = own.odd()
         if odd.sum() > max(2, MOST_FAULTS * self.count):
             raise MitsimError(
                 f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
@@ -617,10 +592,8 @@ class _Check:
         share = shadow.lines[line] / len(shadow.lines)
         own.add(words, share * own.size * (shadow.lines[line] > _LINE))
         if not self.paired:
-            moves, variances = shadow.moves()
-            if _scatter(moves[1:], variances[1:]):
-                few = max(2, self.count // 8)
-                own.add_motion(moves[1:], variances[1:], np.array([np.median(moves[:few]), np.median(moves[-few:])]))
+            places, variances = shadow.moves()
+            own.add_motion(places[1:], variances[1:], self.times[own.axis][1:])
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
