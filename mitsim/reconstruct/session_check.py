@@ -24,7 +24,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -297,8 +296,9 @@ class _Side:
             # Differences of neighbours: those of every second pixel do not see the finest detail.
             self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
 
-    def fit_sums(self) -> npt.NDArray[np.bool_]:
-        """Fit the sums of all pairs; return (N,) whether pairs do not fit."""
+    def fit_sums(self) -> tuple[FloatArray, ...]:
+        """Fit the sums of all pairs; return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power,
+        place and unequal power of both frames, and the variances of these three."""
         shapes = self.shapes
         if not self.sums.centre:
             shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
@@ -309,24 +309,23 @@ class _Side:
         rest, responses = self.sums.lights.T - values @ shapes, responses - parts @ shapes
         rest -= np.median(rest, axis=0)
         sizes = np.maximum(np.square(responses).sum(axis=1), 1 / _UNKNOWN)
-        self.ratios = (rest * responses).sum(axis=1) / sizes
-        rest -= self.ratios[:, None] * responses
-        # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
-        values -= self.ratios[:, None] * parts
-        self.powers, self.places = (values[:, :2] - values[0, :2] + (self.power, self.place)).T
+        ratios = (rest * responses).sum(axis=1) / sizes
+        rest -= ratios[:, None] * responses
+        values -= ratios[:, None] * parts
         squares, spare = np.square(rest).sum(axis=1), max(len(self.uniform) - len(shapes) - 1, 1)
         noise = min(float(np.median(squares)) / spare, self.noise / len(self.vectors))
         noise = max(noise, 1e-13 * float(np.square(self.uniform).mean()))
-        self.ratio_variances = noise / sizes
-        variances = noise * (np.square(inverse[:, :2]).sum(axis=0) + np.square(parts[:, :2]) / sizes[:, None])
-        self.power_variances, self.place_variances = variances.T
+        # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
+        measured = *(values[:, :2] - values[0, :2] + (self.power, self.place)).T, ratios
+        shared = np.square(parts[:, :2].T) / sizes
+        variances = noise * np.stack([*(np.square(inverse[:, :2]).sum(axis=0)[:, None] + shared), 1 / sizes])
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
         beyond = squares - noise * spare * (1 + np.pi / 4 / len(squares))  # the usual sum is a median
-        self.excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
+        excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
         measure = squares / (noise * spare)
         middle = max(float(np.median(measure)), 1.0)
         bad = measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / spare))
-        return np.asarray(bad | self.odd() | (np.abs(self.ratios) > _ALONE))  # power 0 cannot be divided out
+        return bad | self.odd() | (np.abs(ratios) > _ALONE), excess, *measured, *variances  # no division by power 0
 
     def odd(self) -> npt.NDArray[np.bool_]:
         """Return (N,) whether responses show light that no stripes cast."""
@@ -366,17 +365,18 @@ class _Check:
     def result(self) -> CheckedSession:
         found = self.found
         if self.paired:
-            bad = np.stack([own.fit_sums() for own in self.sides])
+            bad, excess, *sums = np.stack([own.fit_sums() for own in self.sides], axis=1)
             if self.taken.saturated and bad.any():
                 return found
             for side, index, _ in self.taken.wrong:
                 bad[SIDES.index(side), index] = True
-            self.good = ~bad
+            self.good = bad == 0
+            self.powers, self.places, self.ratios, *self.variances = sums
             lag = self._subtract_lag()
             if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
-                moved = max(np.ptp([*own.places[self.good[own.axis]], -own.place]) for own in self.sides)
+                moved = np.ptp(np.where(self.good, self.places, 0.0), axis=1).max()
                 raise MitsimError(
-                    f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
+                    f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not add up to what "
                     f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds "
                     f"light of the one before ({lag:.1%}), and that numbers are in proportion to light"
                 )
@@ -385,12 +385,16 @@ class _Check:
                     self._refuse(own, 0, "the two do not add up to what others do")
             if self.refused:
                 self._judge()
-            self._correct()
+            self._correct(excess)
             for own in self.sides:
                 for index in np.flatnonzero(bad[own.axis]):
                     self._use_one_frame(own, int(index))
         else:
-            self._compare_sides()
+            self.refused += self.taken.wrong.items()
+            apart = abs(self.sides[0].power - self.sides[1].power)
+            for own in self.sides:
+                self._subtract_ambient(own, np.ones(self.count, dtype=bool))
+                own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
         for own in self.sides:
             self._check_shadow(own)
         self._judge()
@@ -400,25 +404,24 @@ class _Check:
 
     def _subtract_lag(self) -> float:
         """Subtract and return the lag: a frame that holds light of the one before makes all pairs unequal alike."""
-        ratios, variances = (
-            np.stack([getattr(own, name) for own in self.sides]) for name in ("ratios", "ratio_variances")
-        )
-        lags = (-2 * self.last * ratios)[variances < np.median(variances)]  # wide stripes show it best
+        variances = self.variances[2]
+        lags = (-2 * self.last * self.ratios)[variances < np.median(variances)]  # wide stripes show it best
         lag = float(np.median(lags))
         lag *= self.count >= 16 and abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
-        for own, last in zip(self.sides, self.last, strict=True):
-            own.ratios += lag * last / 2
+        self.ratios += lag * self.last / 2
+        for own in self.sides:
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
         return lag
 
-    def _correct(self) -> None:
+    def _correct(self, excess: FloatArray) -> None:
         """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
         for own, good in zip(self.sides, self.good, strict=True):
-            own.add(_UNKNOWN_LIGHT, float(own.excess[good].sum()))
+            own.add(_UNKNOWN_LIGHT, float(excess[own.axis][good].sum()))
             self._subtract_ambient(own, good)
-            own.add_motion(own.places[good], own.place_variances[good], self.times[own.axis][good])
+            places, variances, times = (each[own.axis][good] for each in (self.places, self.variances[1], self.times))
+            own.add_motion(places, variances, times)
         if not self.taken.unsteady:
             self._divide()
 
@@ -442,34 +445,29 @@ class _Check:
 
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
-        usable = self.good
-        measured, variances, ratios, ratio_variances = (
-            np.stack([getattr(own, name) for own in self.sides])
-            for name in ("powers", "power_variances", "ratios", "ratio_variances")
-        )
-        sure = usable & (np.square(ratios) > _SURE**2 * ratio_variances)
-        powers = measured / (1 - np.where(sure, np.square(ratios), 0.0))
-        # The trend is a line, and a median over a quarter of a side's pairs next in time, which follows steps.
-        late = [place for place in np.argsort(self.times, axis=None) if usable.flat[place]]
-        line = np.polyval(np.polyfit(self.times.flat[late], powers.flat[late], 1), self.times)
-        around = np.pad((powers - line).flat[late], self.count // 8, mode="reflect")
-        around = np.median(sliding_window_view(around, self.count // 8 * 2 + 1), axis=1)
-        trend = line + np.interp(self.times, self.times.flat[late], around)
-        powers, trend = powers / np.mean(trend), trend / np.mean(trend)
+        usable, times, (variances, _, ratio_variances) = self.good, self.times, self.variances
+        sure = usable & (np.square(self.ratios) > _SURE**2 * ratio_variances)
+        powers, usual = self.powers / (1 - np.where(sure, np.square(self.ratios), 0.0)), usable
+        for _ in range(2):  # the second time without single frames of other power
+            line = np.polyval(np.polyfit(times[usual], powers[usual], 1), times)
+            away = powers - line - np.median((powers - line)[usable])
+            usual = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
+        powers, line = powers / np.mean(line), line / np.mean(line)
         # The step from one side to the other is known as well as the uniform frames are.
-        trend = 1 + _shrunk(trend - 1, variances * _STEP, usable)[0]
-        own_power, left, shaken = _shrunk(powers - trend, variances, usable)
+        powers, left, _ = _shrunk(powers - 1, _STEP * variances, usable)
+        powers = 1 + powers * usable
         # A single frame of other power changes both alike.
-        ratios, left_ratio, uneven = _shrunk(ratios, ratio_variances, usable, np.square(own_power))
-        left_ratio[:, 0] = 0.0
-        powers, ratios, flicker = trend + own_power * usable, ratios * usable, float(np.sqrt(shaken + uneven))
+        single = np.square(powers - line) * (powers != 1)
+        ratios, left_ratio, uneven = _shrunk(self.ratios, ratio_variances, usable, single)
+        left_ratio[:, 0], ratios = 0.0, ratios * usable
+        flicker = float(np.sqrt(_shrunk(powers - line, variances, usable)[2] + uneven))
         mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
-        bent = own_power[:, 0] / trend[:, 0]
+        bent = powers[:, 0] / line[:, 0] - 1
         bent = np.abs(bent).min() * (bent[0] * bent[1] > 0)
         bent *= bent > max(_SLIGHT / 2, 3 * flicker)
         drift_cost = flicker_cost = 0.0
-        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, trend, usable, strict=True):
+        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, line, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
             d = c * ratio
             drift_cost += np.square(slow - 1) @ energies / size
@@ -477,7 +475,7 @@ class _Check:
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
             lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
-            own.add(_LAMP, float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
+            own.add(_LAMP, float(lost[keep].sum()) + np.square(line - 1).max() / 4 * own.size)
             own.add(_BENT, bent**2 / 2 * own.size)
             parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
@@ -485,9 +483,9 @@ class _Check:
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
-        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
+        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and np.ptp([powers, ratios]):
             self.found.lamp = lamp = {
-                "drift": float(line.flat[late[-1]] - line.flat[late[0]]),
+                "drift": float(line.flat[np.argmax(times)] - line.flat[np.argmin(times)]),
                 "flicker": flicker,
                 "drift_cost": float(np.sqrt(drift_cost)),
                 "flicker_cost": float(np.sqrt(flicker_cost)),
@@ -527,14 +525,6 @@ class _Check:
         own.add(_REPLACED, 1.5 * own.noise)
         cost = float(np.sqrt(1.5 * own.noise / own.size))
         self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
-
-    def _compare_sides(self) -> None:
-        """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
-        self.refused += self.taken.wrong.items()
-        apart = abs(self.sides[0].power - self.sides[1].power)
-        for own in self.sides:
-            self._subtract_ambient(own, np.ones(self.count, dtype=bool))
-            own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
