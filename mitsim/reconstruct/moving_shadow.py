@@ -83,9 +83,7 @@ class MovingShadow:
         modes = _modes(self._angles, _step(columns, self._angles, len(vectors)), n)
         turned = modes.conj().transpose(0, 2, 1)
         # Squared length of each pattern's stripes beyond the modes.
-        parts = np.concatenate([turned.real, turned.imag], axis=1)
-        shown = (parts.reshape(-1, n) @ signs).reshape(*parts.shape[:2], count)
-        own = np.maximum(n / count - np.square(shown).sum(axis=1), 1e-9)
+        own = np.maximum(n / count - np.square(np.abs(np.matmul(turned, signs))).sum(axis=1), 1e-9)
         left = np.zeros_like(spectra)
         for index in [0, *[*unknown] * _FITS]:
             spectra[:, index] -= left[:, index] / own[:, index]
@@ -157,14 +155,7 @@ def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
     n = columns.shape[1]
     length = 8 * n
     power = np.square(np.abs(np.fft.fft(columns, length, axis=1)))
-    rows = np.arange(len(angles))
-
-    def sums(steps: FloatArray) -> FloatArray:
-        places = np.rint(-np.outer(steps, angles) * (length / (2 * np.pi))).astype(np.int64) % length
-        return np.asarray(power[rows, places].sum(axis=1))
-
     most = int(_FARTHEST * pixels)
-    coarse = np.arange(-most, most + 1) / n
-    best = coarse[int(np.argmax(sums(coarse)))]
-    fine = best + np.linspace(-1, 1, 41) / n
-    return float(fine[int(np.argmax(sums(fine)))])
+    steps = np.linspace(-most, most, 40 * most + 1) / n
+    places = np.rint(-np.outer(steps, angles) * (length / (2 * np.pi))).astype(np.int64) % length
+    return float(steps[int(np.argmax(power[np.arange(len(angles)), places].sum(axis=1)))])

@@ -40,8 +40,6 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
-_LIKELY = 4.0
-"""The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
@@ -85,8 +83,6 @@ _REPLACED = "a frame of a pair is wrong; take it again"
 """Reason of the noise that is larger where one frame replaces a pair."""
 _STEP = 5.0
 """Variance of the lamp's step from one side to the other, in that of the power of one pair."""
-_UNKNOWN = 1e30
-"""Variance of a number that nothing shows."""
 
 
 def frame_words(half: Half) -> str:
@@ -249,7 +245,7 @@ def _shrunk(
     sure = pooled * (pooled > _SURE * deviation)
     prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / (prior + variances)
-    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
+    return weight * values, np.where(prior > 0, weight * variances, sure), sure
 
 
 # ---- The check -------------------------------------------------------------------------------------------------------
@@ -310,7 +306,7 @@ class _Side:
         values, parts = self.sums.lights.T @ inverse, responses @ inverse
         rest, responses = self.sums.lights.T - values @ shapes, responses - parts @ shapes
         rest -= np.median(rest, axis=0)
-        sizes = np.maximum(np.square(responses).sum(axis=1), 1 / _UNKNOWN)
+        sizes = np.maximum(np.square(responses).sum(axis=1), 1e-30)
         ratios = (rest * responses).sum(axis=1) / sizes
         rest -= ratios[:, None] * responses
         values -= ratios[:, None] * parts
@@ -344,7 +340,7 @@ class _Check:
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
         self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
-        self.paired, self.centre = all(own.sums.lights.size for own in self.sides), sums[0].centre
+        self.paired = all(own.sums.lights.size for own in self.sides)
         self.found = CheckedSession(sums)
         self.refused: list[tuple[Half, str]] = []
         self.times, self.last = np.zeros((2, 2, self.count))
@@ -358,74 +354,70 @@ class _Check:
     def _refuse(self, own: _Side, index: int, reason: str) -> None:
         self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _mend(self, own: _Side, index: int, sign: int | None, *words: str, cost: float = 0.0) -> None:
-        halves = [half for half in self._halves(own, index) if sign in (None, half[2])]
-        kind, detail, repair = words
-        names = [self.taken.name(half) for half in halves]
+    def _mend(
+        self, own: _Side, index: int, sign: int | None, kind: str, detail: str, repair: str, cost: float = 0.0
+    ) -> None:
+        names = [self.taken.name(half) for half in self._halves(own, index) if sign in (None, half[2])]
         self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
 
     def result(self) -> CheckedSession:
-        found = self.found
-        if self.paired:
-            bad, excess, *sums = np.stack([own.fit_sums() for own in self.sides], axis=1)
-            if self.taken.saturated and bad.any():
-                return found
-            for side, index, _ in self.taken.wrong:
-                bad[SIDES.index(side), index] = True
-            self.good = bad == 0
-            self.powers, self.places, self.ratios, *self.variances = sums
-            lag = self._subtract_lag()
-            if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
-                moved = np.ptp(np.where(self.good, self.places, 0.0), axis=1).max()
-                raise MitsimError(
-                    f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not add up to what "
-                    f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds "
-                    f"light of the one before ({lag:.1%}), and that numbers are in proportion to light"
-                )
-            for own in self.sides:
-                if bad[own.axis, 0]:  # all others hang on it
-                    self._refuse(own, 0, "the two do not add up to what others do")
-            if self.refused:
-                self._judge()
-            self._correct(excess)
-            for own in self.sides:
-                for index in np.flatnonzero(bad[own.axis]):
-                    self._use_one_frame(own, int(index))
-        else:
+        if not self.paired:
             self.refused += self.taken.wrong.items()
             apart = abs(self.sides[0].power - self.sides[1].power)
             for own in self.sides:
                 self._subtract_ambient(own, np.ones(self.count, dtype=bool))
                 own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
+        elif not self._correct_pairs():
+            return self.found
         for own in self.sides:
             self._check_shadow(own)
         self._judge()
-        return found
+        return self.found
 
-    # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
+    # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light -------------------------------------
 
-    def _subtract_lag(self) -> float:
-        """Subtract and return the lag: a frame that holds light of the one before makes all pairs unequal alike."""
-        variances = self.variances[2]
-        lags = (-2 * self.last * self.ratios)[variances < np.median(variances)]  # wide stripes show it best
+    def _correct_pairs(self) -> bool:
+        """Fit the sums of pairs, correct the responses, and count what is left as errors; return False if the sums
+        show only that frames are saturated."""
+        bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
+        if self.taken.saturated and bad.any():
+            return False
+        for side, index, _ in self.taken.wrong:
+            bad[SIDES.index(side), index] = True
+        self.good = bad == 0
+        self.powers, places, self.ratios, *self.variances = measured
+        # A frame that holds light of the one before makes all pairs unequal alike; wide stripes show it best.
+        wide = self.variances[2] < np.median(self.variances[2])
+        lags = (-2 * self.last * self.ratios)[wide]
         lag = float(np.median(lags))
         lag *= self.count >= 16 and abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
         self.ratios += lag * self.last / 2
+        if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
+            moved = np.ptp(np.where(self.good, places, 0.0), axis=1).max()
+            raise MitsimError(
+                f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not add up to what "
+                f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds light of "
+                f"the one before ({lag:.1%}), and that numbers are in proportion to light"
+            )
         for own in self.sides:
+            if bad[own.axis, 0]:  # all others hang on it
+                self._refuse(own, 0, "the two do not add up to what others do")
+        if self.refused:
+            self._judge()
+        for own, good, where, variances, times in zip(
+            self.sides, self.good, places, self.variances[1], self.times, strict=True
+        ):
+            own.add(_UNKNOWN_LIGHT, float(excess[own.axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
-        return lag
-
-    def _correct(self, excess: FloatArray) -> None:
-        """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        for own, good in zip(self.sides, self.good, strict=True):
-            own.add(_UNKNOWN_LIGHT, float(excess[own.axis][good].sum()))
             self._subtract_ambient(own, good)
-            places, variances, times = (each[own.axis][good] for each in (self.places, self.variances[1], self.times))
-            own.add_motion(places, variances, times)
+            own.add_motion(where[good], variances[good], times[good])
         if not self.taken.unsteady:
             self._divide()
+        for axis, index in zip(*np.nonzero(bad), strict=True):
+            self._use_one_frame(self.sides[axis], int(index))
+        return True
 
     def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
@@ -501,29 +493,26 @@ class _Check:
 
     def _use_one_frame(self, own: _Side, index: int) -> None:
         """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
-        known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
-        reason = "the two do not add up to what others do"
-        reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
-        distances = np.abs(self.times[own.axis] - self.times[own.axis, index])
-        near = np.argsort(np.where(self.good[own.axis], distances, np.inf))[:_NEAR]
-        away = own.sums.lights[:, index] - np.median(own.sums.lights[:, near], axis=1)
-        misfits = dict[int, float]()
+        known = {half[2]: why for half, why in self.taken.wrong.items() if half[:2] == (own.side, index)}
+        reason = f"is wrong: {next(iter(known.values()))}" if known else "the two do not add up to what others do"
+        apart = np.abs(self.times[own.axis] - self.times[own.axis, index]) + ~self.good[own.axis]
+        usual = np.median(own.sums.lights[:, np.argsort(apart)[:_NEAR]], axis=1)
+        away, misfits = own.sums.lights[:, index] - usual, dict[int, float]()
         for wrong in known or (1, -1):
             own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
             shadow = MovingShadow(own.vectors, self.signs)
             misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
         sign = min(misfits, key=lambda wrong: misfits[wrong])
-        decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
-        if len(known) == 2 or not decided or misfits[sign] > 1:
-            if known or not own.odd()[index]:  # :meth:`_check_shadow` refuses those of odd light
-                self._refuse(own, index, reason)
-            return
-        own.misfits[index] = np.median(own.misfits)
-        own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
-        # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-        own.add(_REPLACED, 1.5 * own.noise)
-        cost = float(np.sqrt(1.5 * own.noise / own.size))
-        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
+        decided = len(known) == 1 or (not known and shadow.predicts and 2 * misfits[sign] < misfits[-sign])
+        if decided and misfits[sign] <= 1:
+            own.misfits[index] = np.median(own.misfits)
+            own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
+            # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
+            own.add(_REPLACED, 1.5 * own.noise)
+            cost = float(np.sqrt(1.5 * own.noise / own.size))
+            self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost)
+        elif known or not own.odd()[index]:  # the moving shadow's check refuses those of odd light
+            self._refuse(own, index, reason)
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
@@ -553,7 +542,7 @@ class _Check:
         for index in foreign:
             self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
         for index in [0] if turned.all() else np.flatnonzero(turned).tolist():
-            if not shadow.predicts and not turned.all():
+            if not shadow.predicts:
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
@@ -563,7 +552,7 @@ class _Check:
         light = np.square(own.vectors).sum(axis=1)
         around = np.stack([np.roll(light, 1), np.roll(light, -1)])
         lower, upper = around.min(axis=0), around.max(axis=0)
-        strange = (light < _DARK[self.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
+        strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
         for row in (rows := np.flatnonzero(strange))[:1]:
             word = "row" if own.axis == 0 else "column"
             words = f"sensor {word} {row} shows no light, or too much; check the sensor"
