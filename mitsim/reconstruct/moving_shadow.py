@@ -91,25 +91,24 @@ class MovingShadow:
             rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
             left = rest @ signs
         self._spectra, self._left, self._own = spectra, left, own
-        tiny = np.finfo(np.float64).tiny
         squares = np.square(np.abs(spectra))
         deviations = (np.square(np.abs(left)) / own).sum(axis=0)
         self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.sum(axis=0).mean())) or 1.0
         self.deviations = deviations / self._unit
-        self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
+        self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), 1e-300)
         self.shares, variances = self.along(spectra)
         self.sure = self.shares / np.sqrt(variances)
         self.by_turning = 2 * (self.shares - 1) / (variances * len(own))
-        enough = len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0]
-        self.predicts = enough and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
+        unlike = float(np.quantile(self.unlike, 0.1))
+        self.predicts = len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and unlike < _PREDICTED
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
         seen = (kept * np.square(np.abs(columns)).mean(axis=1, keepdims=True)).sum(axis=0)
         known = kept.mean(axis=0) > _KNOWN
-        self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, tiny), 0.0)
+        self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, 1e-300), 0.0)
 
     def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Return (N,) the sizes of the ``shapes`` (frequencies, N) in the deviations, and their variances."""
-        size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
+        size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), 1e-300)
         # The deviation at each frequency is complex: half of its noise is along the shape.
         return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
 

@@ -87,8 +87,7 @@ _STEP = 5.0
 
 def frame_words(half: Half) -> str:
     """Return which frame of a session a ``half`` is, in words."""
-    side, index, sign = half
-    return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
+    return f"{half[0]} stripes {half[1]}" + f" of sign {half[2]:+d}" * (half[2] != UNIFORM)
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -290,9 +289,9 @@ class _Side:
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
         if away.mean() > 1 + _SURE * np.sqrt(2 / away.size):
             beyond = [np.average(np.square(places - end) - variances, weights=1 / variances) for end in ends]
-            words = f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them"
             # Differences of neighbours: those of every second pixel do not see the finest detail.
-            self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
+            energy = float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum())
+            self.add(f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them", energy)
 
     def fit_sums(self) -> tuple[FloatArray, ...]:
         """Fit the sums of all pairs; return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power,
@@ -354,11 +353,9 @@ class _Check:
     def _refuse(self, own: _Side, index: int, reason: str) -> None:
         self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _mend(
-        self, own: _Side, index: int, sign: int | None, kind: str, detail: str, repair: str, cost: float = 0.0
-    ) -> None:
+    def _mend(self, own: _Side, index: int, sign: int | None, words: tuple[str, str, str], cost: float = 0.0) -> None:
         names = [self.taken.name(half) for half in self._halves(own, index) if sign in (None, half[2])]
-        self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
+        self.found.faults.append(SessionFault(names, own.side, index, sign, *words, cost))
 
     def result(self) -> CheckedSession:
         if not self.paired:
@@ -374,7 +371,7 @@ class _Check:
         self._judge()
         return self.found
 
-    # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light -------------------------------------
+    # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
     def _correct_pairs(self) -> bool:
         """Fit the sums of pairs, correct the responses, and count what is left as errors; return False if the sums
@@ -387,8 +384,7 @@ class _Check:
         self.good = bad == 0
         self.powers, places, self.ratios, *self.variances = measured
         # A frame that holds light of the one before makes all pairs unequal alike; wide stripes show it best.
-        wide = self.variances[2] < np.median(self.variances[2])
-        lags = (-2 * self.last * self.ratios)[wide]
+        lags = (-2 * self.last * self.ratios)[self.variances[2] < np.median(self.variances[2])]
         lag = float(np.median(lags))
         lag *= self.count >= 16 and abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
         self.ratios += lag * self.last / 2
@@ -399,20 +395,17 @@ class _Check:
                 f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds light of "
                 f"the one before ({lag:.1%}), and that numbers are in proportion to light"
             )
-        for own in self.sides:
-            if bad[own.axis, 0]:  # all others hang on it
-                self._refuse(own, 0, "the two do not add up to what others do")
+        for axis in np.flatnonzero(bad[:, 0]):  # all others hang on it
+            self._refuse(self.sides[axis], 0, "the two do not add up to what others do")
         if self.refused:
             self._judge()
-        for own, good, where, variances, times in zip(
-            self.sides, self.good, places, self.variances[1], self.times, strict=True
-        ):
-            own.add(_UNKNOWN_LIGHT, float(excess[own.axis][good].sum()))
+        for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
+            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
             words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
             own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
             self._subtract_ambient(own, good)
-            own.add_motion(where[good], variances[good], times[good])
+            own.add_motion(places[axis][good], self.variances[1][axis][good], self.times[axis][good])
         if not self.taken.unsteady:
             self._divide()
         for axis, index in zip(*np.nonzero(bad), strict=True):
@@ -476,7 +469,7 @@ class _Check:
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
-                self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
+                self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
         if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and np.ptp([powers, ratios]):
             drift = float(line.flat[np.argmax(times)] - line.flat[np.argmin(times)])
             remaining = sum(own.extras[_LAMP] / own.size for own in self.sides)
@@ -509,8 +502,8 @@ class _Check:
             own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
             # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
             own.add(_REPLACED, 1.5 * own.noise)
-            cost = float(np.sqrt(1.5 * own.noise / own.size))
-            self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost)
+            words = "replaced", reason, "the other frame of its pair replaces it"
+            self._mend(own, index, sign, words, float(np.sqrt(1.5 * own.noise / own.size)))
         elif known or not own.odd()[index]:  # the moving shadow's check refuses those of odd light
             self._refuse(own, index, reason)
 
@@ -546,24 +539,22 @@ class _Check:
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             sign = None if self.paired else 1
-            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
+            self._mend(own, index, sign, ("exchanged", detail, "they count in their right order"))
         for index in np.flatnonzero(own.odd()):
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
-        around = np.stack([np.roll(light, 1), np.roll(light, -1)])
-        lower, upper = around.min(axis=0), around.max(axis=0)
+        lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
         strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
-        for row in (rows := np.flatnonzero(strange))[:1]:
-            word = "row" if own.axis == 0 else "column"
-            words = f"sensor {word} {row} shows no light, or too much; check the sensor"
+        rows = np.flatnonzero(strange)
+        if len(rows):
+            words = f"sensor {('row', 'column')[own.axis]} {rows[0]} shows no light, or too much; check the sensor"
             own.add(words, float(np.maximum(light, lower)[rows].sum()))
         if foreign or len(rows) or not shadow.predicts:
             return
         # The lines at the ends are predicted from one side only.
         line = 1 + int(np.argmax(shadow.lines[1:-1]))
         words = f"line {line} of the {own.side} stripes is not as bright as its neighbours predict; check the projector"
-        share = shadow.lines[line] / len(shadow.lines)
-        own.add(words, share * own.size * (shadow.lines[line] > _LINE))
+        own.add(words, shadow.lines[line] / len(shadow.lines) * own.size * (shadow.lines[line] > _LINE))
         if not self.paired:
             # Only the first line has as many +1 as -1 or more, so that it shows light that all responses share.
             offset = shadow.lines[0] / len(shadow.lines) * own.size
@@ -582,26 +573,22 @@ class _Check:
         that are wrong."""
         found, sides = self.found, self.sides
         energies = {
-            each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for own in sides for each in own.extras
+            why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras
         }
-        order, total = sorted(energies, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
-        doubts = [
-            f"{each}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
-            for each in order
-            if each not in (_LAMP, _REPLACED) and energies[each] > (_MATTERS * self.noise) ** 2
-        ]
+        order, total = sorted(energies, key=lambda why: -energies[why]), float(np.sqrt(sum(energies.values())))
+        least = (_MATTERS * self.noise) ** 2
+        doubts = [why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > least]
         if total > LARGEST_ERROR or (self.refused and doubts):
-            raise MitsimError(
-                f"all frames: {order[0]}: an error of {total:.0%} or more is left in the factors; take the "
-                "session again"
-            )
+            left = f"an error of {total:.0%} or more is left in the factors; take the session again"
+            raise MitsimError(f"all frames: {order[0]}: {left}")
         if self.refused:
             reason = self.refused[0][1]
             names = [self.taken.name(half) for half, why in self.refused if why == reason]
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
             every = "all " * (len(self.refused) > 2 * max(2, MOST_FAULTS * self.count))
             raise MitsimError(f"{every}frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
-        found.doubts += [f"session: {words}" for words in doubts]
+        words = "session: {}; the stated error includes {:.1e} for it"
+        found.doubts += [words.format(why, np.sqrt(energies[why])) for why in doubts]
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
         left, right = (own.result() for own in sides)
         found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))
