@@ -99,12 +99,12 @@ class MovingShadow:
         self.shares, variances = self.along(spectra)
         self.sure = self.shares / np.sqrt(variances)
         self.by_turning = 2 * (self.shares - 1) / (variances * len(own))
-        unlike = float(np.quantile(self.unlike, 0.1))
-        self.predicts = len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0] and unlike < _PREDICTED
+        enough = count >= _ENOUGH[0] and len(vectors) >= _ENOUGH[1]
+        self.predicts = enough and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
         seen = (kept * np.square(np.abs(columns)).mean(axis=1, keepdims=True)).sum(axis=0)
-        known = kept.mean(axis=0) > _KNOWN
-        self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, 1e-300), 0.0)
+        lines = (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, 1e-300)
+        self.lines = lines * (kept.mean(axis=0) > _KNOWN)
 
     def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Return (N,) the sizes of the ``shapes`` (frequencies, N) in the deviations, and their variances."""

@@ -57,8 +57,6 @@ _UNEXPLAINED = 0.05
 of its amplitude."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
-_LEAST = 3.0
-"""The same in deviations of the median pattern."""
 _LINE = 0.15
 """Squared deviation of a line of the stripes from what its neighbours predict, over the mean square, from which it
 counts: good cameras of 32 lines reach 0.003."""
@@ -69,8 +67,6 @@ _NAMED = 12
 """Frames that a message names; the others are counted."""
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 """Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
-_AMBIENT = "ambient light changes between frames; darken the room"
-"""Reason of errors that are left when the change of ambient light is subtracted."""
 _LAMP = "the lamp's power changes; use a steadier one"
 """Reason of errors that are left when responses are divided by the lamp's power."""
 _BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
@@ -397,8 +393,7 @@ class _Check:
             )
         for axis in np.flatnonzero(bad[:, 0]):  # all others hang on it
             self._refuse(self.sides[axis], 0, "the two do not add up to what others do")
-        if self.refused:
-            self._judge()
+        self._judge()
         for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
             own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
@@ -414,8 +409,7 @@ class _Check:
 
     def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        light = own.light
-        for found, effect, scale in zip(own.sums.ambient.T, light.effects, light.variances, strict=True):
+        for found, effect, scale in zip(own.sums.ambient.T, own.light.effects, own.light.variances, strict=True):
             variance = own.variance * scale
             # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
             shared = 0.0 if self.paired else float(np.median(found))
@@ -425,7 +419,7 @@ class _Check:
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
             # In the uniform frames it changes the vector that all responses share.
             common = 2 * max(np.median(changed), good[0] * kept[0] ** 2) / np.square(own.uniform).sum() * own.size
-            own.add(_AMBIENT, float(left.sum() + common) * size)
+            own.add("ambient light changes between frames; darken the room", float(left.sum() + common) * size)
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
@@ -450,9 +444,7 @@ class _Check:
         flicker = float(np.sqrt(_shrunk(powers - line, variances, usable)[2] + uneven))
         mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
-        bent = powers[:, 0] / line[:, 0] - 1
-        bent = np.abs(bent).min() * (bent[0] * bent[1] > 0)
-        bent *= bent > max(_SLIGHT / 2, 3 * flicker)
+        bent = max(float(np.abs(powers[:, 0] / line[:, 0] - 1).min()) - flicker, 0.0)
         drift_cost = flicker_cost = 0.0
         for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, line, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
@@ -522,7 +514,7 @@ class _Check:
             gains = shadow.by_turning * (shadow.by_turning > _TURNED * shadow.deviations)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
-            if gains[best] > max(_LEAST, _TURNED * far.max()):
+            if gains[best] > max(_SURE, _TURNED * far.max()):
                 which = [best] if best else slice(1, None)  # the light decides on the sign of pattern 0
                 own.vectors[:, which] *= -1
                 turned[which] ^= True
@@ -538,18 +530,17 @@ class _Check:
             if not shadow.predicts:
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
-            sign = None if self.paired else 1
-            self._mend(own, index, sign, ("exchanged", detail, "they count in their right order"))
+            self._mend(own, index, None if self.paired else 1, ("exchanged", detail, "they count in their right order"))
         for index in np.flatnonzero(own.odd()):
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
         strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
-        rows = np.flatnonzero(strange)
-        if len(rows):
-            words = f"sensor {('row', 'column')[own.axis]} {rows[0]} shows no light, or too much; check the sensor"
-            own.add(words, float(np.maximum(light, lower)[rows].sum()))
-        if foreign or len(rows) or not shadow.predicts:
+        words = (
+            f"sensor {('row', 'column')[own.axis]} {np.argmax(strange)} shows no light, or too much; check the sensor"
+        )
+        own.add(words, float(np.maximum(light, lower)[strange].sum()))
+        if foreign or strange.any() or not shadow.predicts:
             return
         # The lines at the ends are predicted from one side only.
         line = 1 + int(np.argmax(shadow.lines[1:-1]))
@@ -576,17 +567,18 @@ class _Check:
             why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras
         }
         order, total = sorted(energies, key=lambda why: -energies[why]), float(np.sqrt(sum(energies.values())))
-        least = (_MATTERS * self.noise) ** 2
-        doubts = [why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > least]
+        doubts = [
+            why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > (_MATTERS * self.noise) ** 2
+        ]
         if total > LARGEST_ERROR or (self.refused and doubts):
             left = f"an error of {total:.0%} or more is left in the factors; take the session again"
             raise MitsimError(f"all frames: {order[0]}: {left}")
         if self.refused:
             reason = self.refused[0][1]
             names = [self.taken.name(half) for half, why in self.refused if why == reason]
-            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            listed = ", ".join(names[:_NAMED]) + f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
             every = "all " * (len(self.refused) > 2 * max(2, MOST_FAULTS * self.count))
-            raise MitsimError(f"{every}frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
+            raise MitsimError(f"{every}frames: {listed}: {reason}; take them again")
         words = "session: {}; the stated error includes {:.1e} for it"
         found.doubts += [words.format(why, np.sqrt(energies[why])) for why in doubts]
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
