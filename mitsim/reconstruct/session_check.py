@@ -315,9 +315,8 @@ class _Side:
         # Deviations along the common vector are errors of the response's vector, whatever their cause.
         beyond = squares - noise * spare * (1 + np.pi / 4 / len(squares))  # the usual sum is a median
         excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
-        measure = squares / (noise * spare)
-        middle = max(float(np.median(measure)), 1.0)
-        bad = measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / spare))
+        middle = max(float(np.median(squares)), noise * spare)
+        bad = squares > middle + _DEVIATIONS * max(robust_scatter(squares), middle * np.sqrt(2 / spare))
         return bad | self.odd() | (np.abs(ratios) > _ALONE), excess, *measured, *variances  # no division by power 0
 
     def odd(self) -> npt.NDArray[np.bool_]:
@@ -445,12 +444,12 @@ class _Check:
         mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
         bent = max(float(np.abs(powers[:, 0] / line[:, 0] - 1).min()) - flicker, 0.0)
-        drift_cost = flicker_cost = 0.0
+        costs = {"drift_cost": 0.0, "flicker_cost": 0.0}
         for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, line, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
             d = c * ratio
-            drift_cost += np.square(slow - 1) @ energies / size
-            flicker_cost += (np.square(c - slow) @ energies + d @ d * whole) / size
+            costs["drift_cost"] += np.square(slow - 1) @ energies / size
+            costs["flicker_cost"] += (np.square(c - slow) @ energies + d @ d * whole) / size
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
             lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
@@ -462,16 +461,15 @@ class _Check:
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
-        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and np.ptp([powers, ratios]):
+        if max(costs.values()) > (_MATTERS * self.noise) ** 2 and np.ptp([powers, ratios]):
             drift = float(line.flat[np.argmax(times)] - line.flat[np.argmin(times)])
-            remaining = sum(own.extras[_LAMP] / own.size for own in self.sides)
-            costs = dict(drift_cost=drift_cost, flicker_cost=flicker_cost, remaining=remaining)
+            costs["remaining"] = sum(own.extras[_LAMP] / own.size for own in self.sides)
             costs = {name: float(np.sqrt(value)) for name, value in costs.items()}
             self.found.lamp = dict(drift=drift, flicker=flicker, **costs, corrected=True)
+            cost = np.hypot(costs["drift_cost"], costs["flicker_cost"])
             self.found.doubts.append(
-                f"lamp: its power drifts by {drift:+.1%} over the session and flickers by {flicker:.2%} "
-                f"between frames, a factor error of {np.sqrt(drift_cost + flicker_cost):.1e} if nothing is done; "
-                f"frames are divided by its power, and {costs['remaining']:.1e} is left: use a steadier lamp"
+                f"lamp: its power drifts by {drift:+.1%} over the session and flickers by {flicker:.2%}, an error of "
+                f"{cost:.1e}; factors are divided by it, and {costs['remaining']:.1e} is left: use a steadier lamp"
             )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
@@ -571,8 +569,7 @@ class _Check:
             why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > (_MATTERS * self.noise) ** 2
         ]
         if total > LARGEST_ERROR or (self.refused and doubts):
-            left = f"an error of {total:.0%} or more is left in the factors; take the session again"
-            raise MitsimError(f"all frames: {order[0]}: {left}")
+            raise MitsimError(f"all frames: {order[0]}: it leaves a factor error of {total:.0%}; take them again")
         if self.refused:
             reason = self.refused[0][1]
             names = [self.taken.name(half) for half, why in self.refused if why == reason]
