@@ -461,7 +461,7 @@ class _Check:
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
                 self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
-        if max(costs.values()) > (_MATTERS * self.noise) ** 2 and np.ptp([powers, ratios]):
+        if max(costs.values()) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(powers[usual])):
             drift = float(line.flat[np.argmax(times)] - line.flat[np.argmin(times)])
             costs["remaining"] = sum(own.extras[_LAMP] / own.size for own in self.sides)
             costs = {name: float(np.sqrt(value)) for name, value in costs.items()}
