@@ -62,7 +62,8 @@ _LINE = 0.15
 counts: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
 """Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
-the sign turned; and theirs over the median row's at least."""
+the sign turned; and theirs over the median row's at least. A row that has more
+than ten times the light of either neighbour is hot."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
@@ -545,7 +546,7 @@ class _Check:
         words = f"line {line} of the {own.side} stripes is not as bright as its neighbours predict; check the projector"
         own.add(words, shadow.lines[line] / len(shadow.lines) * own.size * (shadow.lines[line] > _LINE))
         if not self.paired:
-            # Only the first line has as many +1 as -1 or more, so that it shows light that all responses share.
+            # The first line is +1 in all patterns, and every other one as often -1: light that all share is there.
             offset = shadow.lines[0] / len(shadow.lines) * own.size
             own.add(_OFFSET, 4 * offset * (offset > 3 * own.noise * self.count))  # smooth light is seen in part
             places, variances = shadow.moves()
