@@ -36,7 +36,7 @@ from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation
-from mitsim.reconstruct.estimate_factors import PairLight, StripeSums
+from mitsim.reconstruct.estimate_factors import StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
 
 KIND = "calibration"
@@ -201,9 +201,7 @@ class SessionSums:
         arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
         for kind, both in self.sums.items():
             for sums in both:
-                own = {**vars(sums), **(vars(PairLight.together(sums.pairs)) if sums.pairs else {})}
-                del own["side"], own["pairs"]
-                arrays |= {f"{kind}_{sums.side}_{name}": value for name, value in own.items()}
+                arrays |= {f"{kind}_{sums.side}_{name}": value for name, value in vars(sums).items() if name != "side"}
         checkpoint.save("stripes", arrays)
 
     @classmethod
@@ -224,8 +222,7 @@ def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
     single = float(own["misfit"]), float(own["energy"]), int(own["done"])
     sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
     sums.misfits, sums.energies, sums.ambient = own["misfits"], own["energies"], own["ambient"]
-    if "light" in own:
-        sums.pairs = [PairLight(*pair) for pair in zip(own["light"].T, own["blocks"], strict=True)]
+    sums.lights = own["lights"]
     return sums
 
 

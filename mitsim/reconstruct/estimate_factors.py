@@ -34,9 +34,6 @@ LARGEST_ERROR = 0.1
 """Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
 _NUMBERS_AT_ONCE = 2**15
 """Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
-_BLOCKS = 96
-"""Blocks a side, at most, whose mean light is kept of every pair: 29 KiB a pair at 512 pixels, where a block is as wide
-as a feature of the anchor camera's mask."""
 _NEGATIVE = 0.1
 """Sum over the sum of absolute values below which a uniform response counts as negative: noise alone makes 0.01."""
 _TURNS, _TURNED = 30, 1e-13
@@ -105,36 +102,15 @@ class ResponseFit:
     ambient
         (3,) light that the mask does not cast, measured across the common vector: even, and tilted along the response's
         vector and along the common one, whose places are -1 to 1. Zeros where responses are centred.
-    pair
-        of its two frames, where their sum is known.
+    light
+        (m,) the sum of its two frames, projected as the response is; None: not known.
     """
 
     vector: FloatArray
     misfit: float
     energy: float
     ambient: FloatArray
-    pair: PairLight | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class PairLight:
-    """Light of the two frames of a pair, as :mod:`mitsim.reconstruct.session_check` needs it.
-
-    Attributes
-    ----------
-    light
-        (m,) their sum, projected as the response is.
-    blocks
-        (rows, columns) mean of their sum over blocks of pixels, single precision.
-    """
-
-    light: FloatArray
-    blocks: npt.NDArray[np.float32]
-
-    @classmethod
-    def together(cls, pairs: Sequence[PairLight]) -> PairLight:
-        """Return N ``pairs`` as one: light (m, N), blocks (N, rows, columns)."""
-        return cls(np.stack([pair.light for pair in pairs], axis=1), np.stack([pair.blocks for pair in pairs]))
+    light: FloatArray | None = None
 
 
 @dataclass
@@ -157,8 +133,9 @@ class StripeSums:
         responses that are in.
     misfits, energies, ambient
         (N,), (N,) and (N, 3) of each response.
-    pairs
-        of the two frames of each; none where responses are not the differences of two, or their sums are not known.
+    lights
+        (m, N) the sums of the two frames of each response, projected as the response is; (m, 0) where responses are not
+        the differences of two frames, or where the sums are not known.
     """
 
     side: str
@@ -171,11 +148,12 @@ class StripeSums:
     misfits: FloatArray = field(init=False)
     energies: FloatArray = field(init=False)
     ambient: FloatArray = field(init=False)
-    pairs: list[PairLight] = field(default_factory=list)
+    lights: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         self.misfits, self.energies = np.zeros((2, self.vectors.shape[1]))
         self.ambient = np.zeros((self.vectors.shape[1], 3))
+        self.lights = np.zeros((len(self.vectors), 0))
 
     def add(self, response: npt.ArrayLike) -> None:
         """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
@@ -200,16 +178,11 @@ class StripeSums:
         checked = _response(response, f"{self.side} response {number}", shape, self.centre)
         return self._fit_checked(checked, np.asarray(response), light)
 
-    def _pair_light(self, light: FloatArray) -> PairLight:
-        """Return the ``light`` of a pair."""
-        blocks = block_means(block_means(light).T).T.astype(np.float32)
-        vector = (light if self.side == "horizontal" else light.T) @ (self.common / np.dot(self.common, self.common))
-        return PairLight(vector - vector.mean() if self.centre else vector, blocks)
-
     def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
         """The same of a ``response`` that is checked and centred, and of it as it was ``given``."""
         across = self.side == "horizontal"
-        vector = (response if across else response.T) @ (self.common / np.dot(self.common, self.common))
+        common = self.common / np.dot(self.common, self.common)
+        vector = (response if across else response.T) @ common
         rows, columns = (vector, self.common) if across else (self.common, vector)
         misfit = energy = 0.0
         step = max(1, _NUMBERS_AT_ONCE // response.shape[1])
@@ -220,8 +193,10 @@ class StripeSums:
             energy += sum_of_squares(block)
         # Both factors' means are zero if centred, so that light of no mask is not in their vectors.
         shown = AmbientLight(self.common, len(vector)).measure(given if across else given.T)
-        pair = None if light is None else self._pair_light(light)
-        return ResponseFit(vector, misfit, energy, shown * (not self.centre), pair)
+        if light is not None:
+            light = (light if across else light.T) @ common
+            light -= light.mean() * self.centre
+        return ResponseFit(vector, misfit, energy, shown * (not self.centre), light)
 
     def put(self, seen: ResponseFit) -> None:
         """Count in what was ``seen`` of the next response."""
@@ -230,8 +205,9 @@ class StripeSums:
         self.energy += seen.energy
         self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
         self.ambient[self.done] = seen.ambient
-        if seen.pair is not None:
-            self.pairs.append(seen.pair)
+        if seen.light is not None:
+            self.lights = self.lights if self.lights.size else np.zeros_like(self.vectors)
+            self.lights[:, self.done] = seen.light
         self.done += 1
 
 
@@ -413,7 +389,7 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
     return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
 
 
-# ---- Light that is no mask's, and means over blocks of pixels ----
+# ---- Light that is no mask's ----
 
 
 class AmbientLight:
@@ -454,14 +430,6 @@ class AmbientLight:
     def energies(self, sizes: FloatArray) -> FloatArray:
         """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
-
-
-def block_means(values: FloatArray) -> FloatArray:
-    """Return means of ``values`` over blocks of neighbours along their first axis, at most ``_BLOCKS`` blocks."""
-    size = -(-len(values) // _BLOCKS)
-    whole = len(values) // size * size
-    means = values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if size > 1 else values[:whole]
-    return means if whole == len(values) else np.concatenate([means, values[whole:].mean(axis=0, keepdims=True)])
 
 
 # ---- Whether the factors can be used ----

@@ -83,9 +83,7 @@ class MovingShadow:
         modes = _modes(self._angles, _step(columns, self._angles, len(vectors)), n)
         turned = modes.conj().transpose(0, 2, 1)
         # Squared length of each pattern's stripes beyond the modes.
-        parts = np.concatenate([turned.real, turned.imag], axis=1)
-        shown = (parts.reshape(-1, n) @ signs).reshape(*parts.shape[:2], count)
-        own = np.maximum(n / count - np.square(shown).sum(axis=1), 1e-9)
+        own = np.maximum(n / count - np.square(np.abs(np.matmul(turned, signs))).sum(axis=1), 1e-9)
         left = np.zeros_like(spectra)
         for index in [0, *[*unknown] * _FITS]:
             spectra[:, index] -= left[:, index] / own[:, index]
@@ -93,25 +91,24 @@ class MovingShadow:
             rest = columns - np.matmul(modes, np.matmul(turned, columns[..., None]))[..., 0]
             left = rest @ signs
         self._spectra, self._left, self._own = spectra, left, own
-        tiny = np.finfo(np.float64).tiny
         squares = np.square(np.abs(spectra))
         deviations = (np.square(np.abs(left)) / own).sum(axis=0)
         self._unit = (float(np.median(deviations)) + _ROUNDING * float(squares.sum(axis=0).mean())) or 1.0
         self.deviations = deviations / self._unit
-        self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), tiny)
+        self.unlike = np.square(np.abs(left / own)).sum(axis=0) / np.maximum(squares.sum(axis=0), 1e-300)
         self.shares, variances = self.along(spectra)
         self.sure = self.shares / np.sqrt(variances)
         self.by_turning = 2 * (self.shares - 1) / (variances * len(own))
-        enough = len(vectors) >= _ENOUGH[1] and count >= _ENOUGH[0]
+        enough = count >= _ENOUGH[0] and len(vectors) >= _ENOUGH[1]
         self.predicts = enough and float(np.quantile(self.unlike, 0.1)) < _PREDICTED
         kept = np.maximum(1 - np.square(np.abs(modes)).sum(axis=2), 1e-9)
         seen = (kept * np.square(np.abs(columns)).mean(axis=1, keepdims=True)).sum(axis=0)
-        known = kept.mean(axis=0) > _KNOWN
-        self.lines = np.where(known, (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, tiny), 0.0)
+        lines = (np.square(np.abs(rest)) / kept).sum(axis=0) / np.maximum(seen, 1e-300)
+        self.lines = lines * (kept.mean(axis=0) > _KNOWN)
 
     def along(self, shapes: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Return (N,) the sizes of the ``shapes`` (frequencies, N) in the deviations, and their variances."""
-        size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), np.finfo(np.float64).tiny)
+        size = np.maximum((np.square(np.abs(shapes)) * self._own).sum(axis=0), 1e-300)
         # The deviation at each frequency is complex: half of its noise is along the shape.
         return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
 
@@ -157,14 +154,7 @@ def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
     n = columns.shape[1]
     length = 8 * n
     power = np.square(np.abs(np.fft.fft(columns, length, axis=1)))
-    rows = np.arange(len(angles))
-
-    def sums(steps: FloatArray) -> FloatArray:
-        places = np.rint(-np.outer(steps, angles) * (length / (2 * np.pi))).astype(np.int64) % length
-        return np.asarray(power[rows, places].sum(axis=1))
-
     most = int(_FARTHEST * pixels)
-    coarse = np.arange(-most, most + 1) / n
-    best = coarse[int(np.argmax(sums(coarse)))]
-    fine = best + np.linspace(-1, 1, 41) / n
-    return float(fine[int(np.argmax(sums(fine)))])
+    steps = np.linspace(-most, most, 40 * most + 1) / n
+    places = np.rint(-np.outer(steps, angles) * (length / (2 * np.pi))).astype(np.int64) % length
+    return float(steps[int(np.argmax(power[np.arange(len(angles)), places].sum(axis=1)))])

@@ -4,13 +4,15 @@ Three redundancies hold for every good session. The two frames of a pair add up 
 responses of one side are the shadow of one mask that moves (:mod:`mitsim.reconstruct.moving_shadow`). Both sides share
 the lamp and the time.
 
-Therefore the sum S_k of each pair is fitted over all pixels and in time::
+Therefore the sum s_k of each pair, projected on the common vector as its response u_k is, is fitted over the sensor's
+rows (or columns) y and in time::
 
-    S_k = S + c_k U + d_k R_k + l R_(k-1) + s_k . grad U + a_k . (1, y, x)
+    s_k = s + c_k u + d_k u_k + l u_(k-1) + m_k u' + a_k + b_k y
 
-with S the usual sum, U the response to uniform light, and R_k that to pattern k. c is the lamp's power, d the unequal
-power of both halves, l the lag, s the camera's motion in pixels, and a the ambient light. The change of ambient light
-within a pair is measured in the response, across the common vector. Only three acts change the factors: the sign of a
+with s the side's usual sum and u the response to uniform light. c is the lamp's power, d the unequal power of the two
+frames, l the lag, m the camera's motion in pixels, and a, b the ambient light. Light that this projection does not
+show changes no factor. The change of ambient light within a pair is measured in the response, across the common
+vector. Only three acts change the factors: the sign of a
 response is turned, one frame of a pair replaces both, and responses are divided by the lamp's power. Each is accepted
 if the moving shadow, estimated afterwards, agrees. Every other fault is refused or counts in the stated error.
 """
@@ -26,15 +28,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, UNIFORM, Half, Side
-from mitsim.reconstruct.estimate_factors import (
-    LARGEST_ERROR,
-    AmbientLight,
-    Estimate,
-    PairLight,
-    StripeSums,
-    block_means,
-    factors_of_sums,
-)
+from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.picture_check import robust_scatter
 
@@ -46,8 +40,6 @@ _DEVIATIONS = 8.0
 """Robust deviations from the other pairs that make a fault: noise alone goes so far in one session of 10^12."""
 _SURE = 5.0
 """Standard deviations at which a pooled number counts as measured."""
-_LIKELY = 4.0
-"""The same from which its variance counts in the stated error."""
 _ALONE = 0.9
 """Unequal power d / c from which only one frame of a pair has light."""
 _SLIGHT = 0.02
@@ -65,36 +57,34 @@ _UNEXPLAINED = 0.05
 of its amplitude."""
 _TURNED = 0.7
 """Part of its deviation that turning a pattern's sign must remove from all patterns."""
-_LEAST = 3.0
-"""The same in deviations of the median pattern."""
 _LINE = 0.15
 """Squared deviation of a line of the stripes from what its neighbours predict, over the mean square, from which it
 counts: good cameras of 32 lines reach 0.003."""
 _DARK, _LIT = (0.02, 0.3), 0.1
 """Light of a dead sensor row over that of its neighbours at most, and in centred frames, where it has their mean with
-the sign turned; and theirs over the median row's at least."""
+the sign turned; and theirs over the median row's at least. A row that has more
+than ten times the light of either neighbour is hot."""
 _NAMED = 12
 """Frames that a message names; the others are counted."""
 _UNKNOWN_LIGHT = "pairs add up to light that changes in an unknown way; check ambient light, lamp and sensor"
 """Reason of errors by ambient light of unknown shape, bands, or pixels that change."""
-_AMBIENT = "ambient light changes between frames; darken the room"
-"""Reason of errors that are left when the change of ambient light is subtracted."""
 _LAMP = "the lamp's power changes; use a steadier one"
 """Reason of errors that are left when responses are divided by the lamp's power."""
 _BENT = "numbers are not in proportion to light; switch gamma and other processing off, expose for less"
 """Reason of errors by an exponent or by clipping."""
 _POWER = "frames are of different power; use a steadier lamp, or pairs"
 """Reason of errors by a lamp that no sums show."""
+_OFFSET = "the uniform frame does not fit those of patterns; keep lamp and ambient light steady, or take pairs"
+"""Reason of light that all responses share, because it is in their uniform frame alone."""
 _REPLACED = "a frame of a pair is wrong; take it again"
 """Reason of the noise that is larger where one frame replaces a pair."""
-_UNKNOWN = 1e30
-"""Variance of a number that nothing shows."""
+_STEP = 5.0
+"""Variance of the lamp's step from one side to the other, in that of the power of one pair."""
 
 
 def frame_words(half: Half) -> str:
     """Return which frame of a session a ``half`` is, in words."""
-    side, index, sign = half
-    return f"{side} stripes {index} of sign {sign:+d}" if sign != UNIFORM else f"{side} stripes {index}"
+    return f"{half[0]} stripes {half[1]}" + f" of sign {half[2]:+d}" * (half[2] != UNIFORM)
 
 
 # ---- Results ---------------------------------------------------------------------------------------------------------
@@ -251,13 +241,7 @@ def _shrunk(
     sure = pooled * (pooled > _SURE * deviation)
     prior = np.maximum(np.maximum(least, sure), np.where(beyond > _SURE**2 * variances, beyond, 0.0))
     weight = prior / (prior + variances)
-    return weight * values, np.where(prior > 0, weight * variances, pooled * (pooled > _LIKELY * deviation)), sure
-
-
-def _scatter(values: FloatArray, variances: FloatArray) -> bool:
-    """Return True if ``values`` differ by more than their ``variances``."""
-    away = np.square(values - np.median(values)) / variances
-    return bool(away.mean() > 1 + _SURE * np.sqrt(2 / away.size))
+    return weight * values, np.where(prior > 0, weight * variances, sure), sure
 
 
 # ---- The check -------------------------------------------------------------------------------------------------------
@@ -272,13 +256,14 @@ class _Side:
         self.side: Side = SIDES[axis]
         self.vectors, self.misfits = sums.vectors.copy(), sums.misfits.copy()
         self.extras: dict[str, float] = {}
-        self.square = float(np.dot(sums.common, sums.common))
-        if sums.pairs:
-            self.pairs = PairLight.together(sums.pairs)
         self.light = AmbientLight(sums.common, len(self.vectors))
         self.misfits -= self.light.energies(sums.ambient)  # ambient light that changes within pairs is no noise
         self.variance = float(np.median(self.misfits)) / max(len(self.vectors) * (len(sums.common) - 1), 1)
-        self.noise = self.variance * len(self.vectors) / self.square
+        self.noise = self.variance * len(self.vectors) / float(np.dot(sums.common, sums.common))
+        # The uniform frames of this side against the mean of both sides': their power, and their place in pixels.
+        self.shapes = np.stack([self.uniform, np.gradient(self.uniform)])
+        own = np.linalg.lstsq(self.shapes.T, self.vectors[:, 0], rcond=None)[0]
+        self.power, self.place = own * np.sign(own[0])
 
     @property
     def size(self) -> float:
@@ -293,12 +278,55 @@ class _Side:
     def add(self, reason: str, energy: float) -> None:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
-    def add_motion(self, moves: FloatArray, variances: FloatArray, ends: FloatArray) -> None:
-        """Count ``moves`` (N,) [pixels] of these ``variances`` against either end of the session."""
-        beyond = [np.average(np.square(moves - end) - variances, weights=1 / variances) for end in ends]
-        # Differences of neighbours: those of every second pixel do not see the finest detail.
-        words = f"camera or mask move by {abs(ends[1] - ends[0]):.2g} pixels; fasten them"
-        self.add(words, float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum()))
+    def add_motion(self, places: FloatArray, variances: FloatArray, times: FloatArray) -> None:
+        """Count ``places`` (N,) [pixels] of patterns at ``times``, if they differ by more than their ``variances``,
+        against either end of the session; the other side's uniform frames are as far on the other side of 0."""
+        few, late = max(2, len(times) // 8), np.argsort(times)
+        ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
+        away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
+        if away.mean() > 1 + _SURE * np.sqrt(2 / away.size):
+            beyond = [np.average(np.square(places - end) - variances, weights=1 / variances) for end in ends]
+            # Differences of neighbours: those of every second pixel do not see the finest detail.
+            energy = float(max(beyond)) * float(np.square(np.diff(self.vectors, axis=0)).sum())
+            self.add(f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them", energy)
+
+    def fit_sums(self) -> tuple[FloatArray, ...]:
+        """Fit the sums of all pairs; return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power,
+        place and unequal power of both frames, and the variances of these three."""
+        shapes = self.shapes
+        if not self.sums.centre:
+            shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
+        inverse = np.linalg.pinv(shapes)
+        responses = self.sums.vectors.T.copy()
+        responses[0] = 0.0  # the uniform pattern has one lit frame
+        values, parts = self.sums.lights.T @ inverse, responses @ inverse
+        rest, responses = self.sums.lights.T - values @ shapes, responses - parts @ shapes
+        rest -= np.median(rest, axis=0)
+        sizes = np.maximum(np.square(responses).sum(axis=1), 1e-30)
+        ratios = (rest * responses).sum(axis=1) / sizes
+        rest -= ratios[:, None] * responses
+        values -= ratios[:, None] * parts
+        squares, spare = np.square(rest).sum(axis=1), max(len(self.uniform) - len(shapes) - 1, 1)
+        noise = min(float(np.median(squares)) / spare, self.noise / len(self.vectors))
+        noise = max(noise, 1e-13 * float(np.square(self.uniform).mean()))
+        # Steady ambient light of any shape is in all sums, and not in the uniform response, which sets the zero.
+        measured = *(values[:, :2] - values[0, :2] + (self.power, self.place)).T, ratios
+        shared = np.square(parts[:, :2].T) / sizes
+        variances = noise * np.stack([*(np.square(inverse[:, :2]).sum(axis=0)[:, None] + shared), 1 / sizes])
+        # Deviations along the common vector are errors of the response's vector, whatever their cause.
+        beyond = squares - noise * spare * (1 + np.pi / 4 / len(squares))  # the usual sum is a median
+        excess = beyond * (beyond.sum() > _SURE * noise * np.sqrt(2 * spare * len(squares)))
+        middle = max(float(np.median(squares)), noise * spare)
+        bad = squares > middle + _DEVIATIONS * max(robust_scatter(squares), middle * np.sqrt(2 / spare))
+        return bad | self.odd() | (np.abs(ratios) > _ALONE), excess, *measured, *variances  # no division by power 0
+
+    def odd(self) -> npt.NDArray[np.bool_]:
+        """Return (N,) whether responses show light that no stripes cast."""
+        least = _UNEXPLAINED * np.maximum(self.sums.energies, np.median(self.sums.energies))
+        middle = float(np.median(self.misfits))
+        # Few misfits hardly show their scatter, which is that of squares of noise at least.
+        scatter = max(robust_scatter(self.misfits), float(np.sqrt(2 * self.variance * max(middle, 0.0))))
+        return np.asarray(self.misfits - middle > np.maximum(least, _DEVIATIONS * scatter))
 
 
 class _Check:
@@ -307,10 +335,12 @@ class _Check:
     def __init__(self, sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken: SessionConditions) -> None:
         self.signs, self.taken, self.count = signs, taken, signs.shape[1]
         self.sides = [_Side(sums[axis], sums[1 - axis], axis) for axis in (0, 1)]
-        self.paired, self.centre = all(own.pairs for own in sums), sums[0].centre
+        self.paired = all(own.sums.lights.size for own in self.sides)
         self.found = CheckedSession(sums)
         self.refused: list[tuple[Half, str]] = []
-        self.lag = self.moved = 0.0
+        self.times, self.last = np.zeros((2, 2, self.count))
+        for place, (side, index, sign) in enumerate(taken.order):
+            self.times[SIDES.index(side), index], self.last[SIDES.index(side), index] = place / len(taken.order), sign
         self.noise = float(np.sqrt(sum(own.noise * self.count / own.size for own in self.sides)))
 
     def _halves(self, own: _Side, index: int) -> list[Half]:
@@ -319,133 +349,67 @@ class _Check:
     def _refuse(self, own: _Side, index: int, reason: str) -> None:
         self.refused += [(half, reason) for half in self._halves(own, index)]
 
-    def _mend(self, own: _Side, index: int, sign: int | None, *words: str, cost: float = 0.0) -> None:
-        halves = [half for half in self._halves(own, index) if sign in (None, half[2])]
-        kind, detail, repair = words
-        names = [self.taken.name(half) for half in halves]
-        self.found.faults.append(SessionFault(names, own.side, index, sign, kind, detail, repair, cost))
+    def _mend(self, own: _Side, index: int, sign: int | None, words: tuple[str, str, str], cost: float = 0.0) -> None:
+        names = [self.taken.name(half) for half in self._halves(own, index) if sign in (None, half[2])]
+        self.found.faults.append(SessionFault(names, own.side, index, sign, *words, cost))
 
     def result(self) -> CheckedSession:
-        found = self.found
-        if self.paired:
-            bad = self._fit_sums()
-            if self.taken.saturated and bad.any():
-                return found
-            if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
-                raise MitsimError(
-                    f"all frames: the two frames of {bad.sum()} of {2 * self.count} patterns do not add up to what "
-                    f"others do; check their order, that nothing moves ({self.moved:.1g} pixels), that no frame holds "
-                    f"light of the one before ({self.lag:.1%}), and that numbers are in proportion to light"
-                )
+        if not self.paired:
+            self.refused += self.taken.wrong.items()
+            apart = abs(self.sides[0].power - self.sides[1].power)
             for own in self.sides:
-                if bad[own.axis, 0]:  # all others hang on it
-                    self._refuse(own, 0, "the two do not add up to what others do")
-            if self.refused:
-                self._judge()
-            self._correct()
-            for own in self.sides:
-                for index in np.flatnonzero(bad[own.axis]):
-                    self._use_one_frame(own, int(index))
-        else:
-            self._compare_sides()
+                self._subtract_ambient(own, np.ones(self.count, dtype=bool))
+                own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
+        elif not self._correct_pairs():
+            return self.found
         for own in self.sides:
             self._check_shadow(own)
         self._judge()
-        return found
+        return self.found
 
-    # ---- sums of pairs -----------------------------------------------------------------------------------------------
+    # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
-    def _fit_sums(self) -> npt.NDArray[np.bool_]:
-        """Fit the sums of all pairs; return (2, N) whether pairs do not fit."""
-        order = self.taken.order
-        self.times, before = np.zeros((2, 2, self.count))
-        for place, ((side, index, _), last) in enumerate(zip(order, [None, *order], strict=False)):
-            self.times[SIDES.index(side), index] += place / 2 / len(order)
-            if last and last[:2] == (side, index):
-                before[SIDES.index(side), index] = last[2]
-        sums = np.stack([own.pairs.blocks.astype(np.float64) for own in self.sides])
-        lit = sums.mean(axis=(0, 1))  # noise of light is larger where there is more
-        bright = float(np.mean(lit**3) / (np.mean(lit) * np.mean(lit**2))) if lit.min() >= 0 else 1.0
-        if self.centre:
-            sums -= sums.mean(axis=3, keepdims=True)
-            sums -= sums.mean(axis=2, keepdims=True)
-        shape = sums.shape[2:]
-        along = [block_means(own.uniform) for own in self.sides]
-        moved = [block_means(np.gradient(own.uniform)) for own in self.sides]
-        fixed = [np.outer(*along), np.outer(moved[0], along[1]), np.outer(along[0], moved[1])]
-        if not self.centre:
-            (y, x), (one, same) = ([make(k) for k in shape] for make in (lambda k: np.linspace(-1, 1, k), np.ones))
-            fixed += [np.outer(one, same), np.outer(y, same), np.outer(one, x)]
-        patterned = np.arange(self.count) > 0  # the uniform pattern has one lit frame
-        shown = [block_means(own.sums.vectors) * patterned for own in self.sides]
-        left, right = np.einsum("ik,j->kij", shown[0], along[1]), np.einsum("i,jk->kij", along[0], shown[1])
-        # Least squares: all is projected on the shapes first, and the rest on the responses.
-        usual = np.median(sums, axis=(0, 1)).ravel()
-        sums, responses = (each.reshape(2, self.count, -1) for each in (sums, np.stack([left, right])))
-        shapes = np.stack(fixed).reshape(len(fixed), -1)
-        inverse = np.linalg.pinv(shapes)
-        sums = sums - usual
-        sums -= np.median(sums - sums @ inverse @ shapes, axis=(0, 1))
-        values, parts = sums @ inverse, responses @ inverse
-        rest, responses = sums - values @ shapes, responses - parts @ shapes
-        sizes = np.maximum(np.square(responses).sum(axis=2), 1 / _UNKNOWN)
-        self.ratios = (rest * responses).sum(axis=2) / sizes
-        rest -= self.ratios[..., None] * responses
-        self.values = values - self.ratios[..., None] * parts
-        area = np.prod([len(own.vectors) for own in self.sides]) / usual.size
-        squared = np.square(rest).mean(axis=2)
-        noise = min(float(np.median(squared)), min(own.variance for own in self.sides) / area)
-        noise = max(noise, 1e-13 * float(np.square(usual).mean()))
-        self.ratio_variances = noise * bright / sizes
-        self.variances = noise * bright * (np.square(inverse).sum(axis=0) + np.square(parts) / sizes[..., None])
-        # A frame that holds light of the one before makes all pairs unequal alike; widest stripes show it best.
-        lags = (2 * before * self.ratios)[sizes > np.quantile(sizes, 0.75)]
-        self.lag = float(np.median(lags))
-        self.lag *= self.count >= 16 and abs(self.lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
-        self.ratios -= self.lag * before / 2
-        late, few = np.argsort(self.times, axis=None), max(4, self.count // 8)
-        moves = self.values[..., 1:3].reshape(-1, 2)
-        self.ends = np.stack([np.median(moves[part], axis=0) for part in (late[:few], late[-few:])])
-        self.moved = float(np.abs(self.ends[1] - self.ends[0]).max())
-        # Deviations along the common vector are errors of the response's vector, whatever their cause.
-        self.excess, relative = np.zeros((2, 2, self.count))
-        for own in self.sides:
-            frames, common, rows = rest[own.axis].reshape(-1, *shape), along[1 - own.axis], shape[own.axis]
-            vectors = (frames @ common if own.axis == 0 else common @ frames) / (common @ common)
-            energies = np.square(vectors).sum(axis=1) * len(own.vectors) / rows
-            expected = noise / (common @ common) * len(own.vectors) * (1 - (len(fixed) + 1) / rows)
-            expected = max(expected * (1 + np.pi / 4 / self.count), 1e-300)  # the usual sum is a median
-            beyond, deviation = energies - expected, expected * np.sqrt(2 * self.count / rows)
-            self.excess[own.axis], relative[own.axis] = beyond * (beyond.sum() > _SURE * deviation), energies / expected
-        bad = np.abs(self.ratios) > _ALONE  # one frame is black, so that power cannot be divided out
+    def _correct_pairs(self) -> bool:
+        """Fit the sums of pairs, correct the responses, and count what is left as errors; return False if the sums
+        show only that frames are saturated."""
+        bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
+        if self.taken.saturated and bad.any():
+            return False
         for side, index, _ in self.taken.wrong:
             bad[SIDES.index(side), index] = True
-        for measure in (squared / noise, relative):
-            middle = max(float(np.median(measure)), 1.0)
-            bad |= measure > middle + _DEVIATIONS * max(robust_scatter(measure), middle * np.sqrt(2 / min(shape)))
-        self.good = ~bad
-        return np.asarray(bad)
-
-    # ---- what the sums show of lamp, lag, bend, motion and ambient light ---------------------------------------------
-
-    def _correct(self) -> None:
-        """Subtract ambient light, divide by the lamp's power, and count what is left as errors."""
-        for own, good in zip(self.sides, self.good, strict=True):
-            own.add(_UNKNOWN_LIGHT, float(self.excess[own.axis][good].sum()))
-            self._subtract_ambient(own, good)
+        self.good = bad == 0
+        self.powers, places, self.ratios, *self.variances = measured
+        # A frame that holds light of the one before makes all pairs unequal alike; wide stripes show it best.
+        lags = (-2 * self.last * self.ratios)[self.variances[2] < np.median(self.variances[2])]
+        lag = float(np.median(lags))
+        lag *= self.count >= 16 and abs(lag) > _SURE * 1.25 * robust_scatter(lags) / np.sqrt(lags.size)
+        self.ratios += lag * self.last / 2
+        if bad.sum() > max(2, MOST_FAULTS * 2 * self.count):
+            moved = np.ptp(np.where(self.good, places, 0.0), axis=1).max()
+            raise MitsimError(
+                f"all frames: the two frames of {bad.sum():.0f} of {2 * self.count} patterns do not add up to what "
+                f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds light of "
+                f"the one before ({lag:.1%}), and that numbers are in proportion to light"
+            )
+        for axis in np.flatnonzero(bad[:, 0]):  # all others hang on it
+            self._refuse(self.sides[axis], 0, "the two do not add up to what others do")
+        self._judge()
+        for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
+            own.add(_UNKNOWN_LIGHT, float(excess[axis][good].sum()))
             # A lagging frame has 1 - 1.5 l of its response and -l / 2 of the one before; a factor is its root.
-            words = f"each frame holds {self.lag:.1%} of the one before; wait longer between frames"
-            own.add(words, self.lag**2 * (0.75**2 + 0.5**2) * own.size)
-            moves, variances = self.values[..., 1 + own.axis], self.variances[..., 1 + own.axis]
-            if _scatter(moves[self.good], variances[self.good]):
-                own.add_motion(moves[own.axis][good], variances[own.axis][good], self.ends[:, own.axis])
+            words = f"each frame holds {lag:.1%} of the one before; wait longer between frames"
+            own.add(words, lag**2 * (0.75**2 + 0.5**2) * own.size)
+            self._subtract_ambient(own, good)
+            own.add_motion(places[axis][good], self.variances[1][axis][good], self.times[axis][good])
         if not self.taken.unsteady:
             self._divide()
+        for axis, index in zip(*np.nonzero(bad), strict=True):
+            self._use_one_frame(self.sides[axis], int(index))
+        return True
 
     def _subtract_ambient(self, own: _Side, good: npt.NDArray[np.bool_]) -> None:
         """Subtract the change of ambient light within pairs from the vectors."""
-        light = own.light
-        for found, effect, scale in zip(own.sums.ambient.T, light.effects, light.variances, strict=True):
+        for found, effect, scale in zip(own.sums.ambient.T, own.light.effects, own.light.variances, strict=True):
             variance = own.variance * scale
             # Without pairs, all responses share the uniform and dark frames, a third of their noise at most.
             shared = 0.0 if self.paired else float(np.median(found))
@@ -455,107 +419,84 @@ class _Check:
             size, changed = float(np.square(effect).sum()), np.square(kept)[good]
             # In the uniform frames it changes the vector that all responses share.
             common = 2 * max(np.median(changed), good[0] * kept[0] ** 2) / np.square(own.uniform).sum() * own.size
-            own.add(_AMBIENT, float(left.sum() + common) * size)
+            own.add("ambient light changes between frames; darken the room", float(left.sum() + common) * size)
 
     def _divide(self) -> None:
         """Divide vectors by the lamp's power in their frames, c + d in Y+ and c - d in Y-.
 
         D' = c D + d U and S = c U + d D are measured, and S = (c - d^2 / c) U + (d / c) D' is fitted.
         """
-        usable = self.good
-        unit = 1 / max(1 - float(np.mean(self.values[:, 0, 0])), 0.1)
-        sure = usable & (np.square(self.ratios) > _SURE**2 * self.ratio_variances)
-        powers = (1 + self.values[..., 0] * unit) / (1 - np.where(sure, np.square(self.ratios), 0.0))
-        variances, degree = self.variances[..., 0] * unit**2, min(3, self.count // 2)
-        away = np.abs(powers - np.median(powers[usable]))
-        usual = usable & (away <= _DEVIATIONS * robust_scatter(powers[usable]) + 1e-12)
-        trend = np.polynomial.Polynomial.fit(self.times[usual], powers[usual], degree)(self.times)
-        powers, trend = powers / np.mean(trend), trend / np.mean(trend)
-        trend = 1 + _shrunk(trend - 1, variances * (degree + 1) / usual.sum(), usual)[0]
-        own_power, left, shaken = _shrunk(powers - trend, variances, usable)
+        usable, times, (variances, _, ratio_variances) = self.good, self.times, self.variances
+        sure = usable & (np.square(self.ratios) > _SURE**2 * ratio_variances)
+        powers, usual = self.powers / (1 - np.where(sure, np.square(self.ratios), 0.0)), usable
+        for _ in range(2):  # the second time without single frames of other power
+            line = np.polyval(np.polyfit(times[usual], powers[usual], 1), times)
+            away = powers - line - np.median((powers - line)[usable])
+            usual = usable & (np.abs(away) <= _DEVIATIONS * robust_scatter(away[usable]) + 1e-12)
+        powers, line = powers / np.mean(line), line / np.mean(line)
+        # The step from one side to the other is known as well as the uniform frames are.
+        powers, left, _ = _shrunk(powers - 1, _STEP * variances, usable)
+        powers = 1 + powers * usable
         # A single frame of other power changes both alike.
-        ratios, left_ratio, uneven = _shrunk(self.ratios, self.ratio_variances, usable, np.square(own_power))
-        left_ratio[:, 0] = 0.0
-        powers, ratios, flicker = trend + own_power * usable, ratios * usable, float(np.sqrt(shaken + uneven))
+        single = np.square(powers - line) * (powers != 1)
+        ratios, left_ratio, uneven = _shrunk(self.ratios, ratio_variances, usable, single)
+        left_ratio[:, 0], ratios = 0.0, ratios * usable
+        flicker = float(np.sqrt(_shrunk(powers - line, variances, usable)[2] + uneven))
         mean = float(np.sqrt(np.mean(powers[:, 0])))
         # Two uniform frames that differ from the sums alike show no lamp: numbers are not in proportion to light.
-        bent = own_power[:, 0] / trend[:, 0]
-        bent = np.abs(bent).min() * (bent[0] * bent[1] > 0)
-        bent *= bent > max(_SLIGHT / 2, 3 * flicker)
-        drift_cost = flicker_cost = 0.0
-        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, trend, usable, strict=True):
+        bent = max(float(np.abs(powers[:, 0] / line[:, 0] - 1).min()) - flicker, 0.0)
+        costs = {"drift_cost": 0.0, "flicker_cost": 0.0}
+        for own, c, ratio, slow, keep in zip(self.sides, powers, ratios, line, usable, strict=True):
             size, whole, energies = own.size, float(np.square(own.uniform).sum()), np.square(own.vectors).sum(axis=0)
             d = c * ratio
-            drift_cost += np.square(slow - 1) @ energies / size
-            flicker_cost += (np.square(c - slow) @ energies + d @ d * whole) / size
+            costs["drift_cost"] += np.square(slow - 1) @ energies / size
+            costs["flicker_cost"] += (np.square(c - slow) @ energies + d @ d * whole) / size
             own.vectors = (own.vectors - np.outer(own.uniform / mean**2, d)) / c * mean
             lost = own.noise * (1 / np.square(c) - 1).clip(0) + left[own.axis] * energies + left_ratio[own.axis] * whole
             # The factors are those of the mean power; a capture may have any that the session had.
-            own.add(_LAMP, float(lost[keep].sum()) + np.square(trend - 1).max() / 4 * own.size)
+            own.add(_LAMP, float(lost[keep].sum()) + np.square(line - 1).max() / 4 * own.size)
             own.add(_BENT, bent**2 / 2 * own.size)
             parts = np.stack([(1 + sign * ratio) * c / slow - 1 for sign in (1, -1)])
             parts[1, 0] = 0.0  # the uniform pattern has one lit frame
             wrong = np.abs(parts) > np.maximum(max(_SLIGHT, _DEVIATIONS * flicker), 4 * np.abs(parts[::-1]))
             for half, index in zip(*np.nonzero(wrong & keep), strict=True):
                 detail = f"it has {1 + parts[half, index]:.3g} of its light"
-                self._mend(own, int(index), 1 - 2 * int(half), "power", detail, "its response is divided by that")
-        if max(drift_cost, flicker_cost) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(trend)):
-            self.found.lamp = lamp = {
-                "drift": float(trend.flat[np.argmax(self.times)] - trend.flat[np.argmin(self.times)]),
-                "flicker": flicker,
-                "drift_cost": float(np.sqrt(drift_cost)),
-                "flicker_cost": float(np.sqrt(flicker_cost)),
-                "remaining": float(np.sqrt(sum(own.extras[_LAMP] / own.size for own in self.sides))),
-                "corrected": True,
-            }
+                self._mend(own, int(index), 1 - 2 * int(half), ("power", detail, "its response is divided by that"))
+        if max(costs.values()) > (_MATTERS * self.noise) ** 2 and (flicker or np.ptp(powers[usual])):
+            drift = float(line.flat[np.argmax(times)] - line.flat[np.argmin(times)])
+            costs["remaining"] = sum(own.extras[_LAMP] / own.size for own in self.sides)
+            costs = {name: float(np.sqrt(value)) for name, value in costs.items()}
+            self.found.lamp = dict(drift=drift, flicker=flicker, **costs, corrected=True)
+            cost = np.hypot(costs["drift_cost"], costs["flicker_cost"])
             self.found.doubts.append(
-                f"lamp: its power drifts by {lamp['drift']:+.1%} over the session and flickers by {flicker:.2%} "
-                f"between frames, a factor error of {np.sqrt(drift_cost + flicker_cost):.1e} if nothing is done; "
-                f"frames are divided by its power, and {lamp['remaining']:.1e} is left: use a steadier lamp"
+                f"lamp: its power drifts by {drift:+.1%} over the session and flickers by {flicker:.2%}, an error of "
+                f"{cost:.1e}; factors are divided by it, and {costs['remaining']:.1e} is left: use a steadier lamp"
             )
 
     # ---- the moving shadow -------------------------------------------------------------------------------------------
 
     def _use_one_frame(self, own: _Side, index: int) -> None:
         """Replace a response by twice one of its frames less the usual sum, if the moving shadow agrees."""
-        known = [half[2] for half in self.taken.wrong if half[:2] == (own.side, index)]
-        reason = "the two do not add up to what others do"
-        reason = f"is wrong: {self.taken.wrong[own.side, index, known[0]]}" if known else reason
-        own.misfits[index] = np.median(own.misfits)
-        distances = np.abs(self.times[own.axis] - self.times[own.axis, index])
-        near = np.argsort(np.where(self.good[own.axis], distances, np.inf))[:_NEAR]
-        away = own.pairs.light[:, index] - np.median(own.pairs.light[:, near], axis=1)
-        misfits = dict[int, float]()
+        known = {half[2]: why for half, why in self.taken.wrong.items() if half[:2] == (own.side, index)}
+        reason = f"is wrong: {next(iter(known.values()))}" if known else "the two do not add up to what others do"
+        apart = np.abs(self.times[own.axis] - self.times[own.axis, index]) + ~self.good[own.axis]
+        usual = np.median(own.sums.lights[:, np.argsort(apart)[:_NEAR]], axis=1)
+        away, misfits = own.sums.lights[:, index] - usual, dict[int, float]()
         for wrong in known or (1, -1):
             own.vectors[:, index] = own.sums.vectors[:, index] - wrong * away
             shadow = MovingShadow(own.vectors, self.signs)
             misfits[wrong] = min(float(shadow.deviations[index]) / _WRONG, float(shadow.unlike[index]) / _UNLIKE)
         sign = min(misfits, key=lambda wrong: misfits[wrong])
-        decided = known or (shadow.predicts and 2 * misfits[sign] < misfits[-sign])
-        if len(known) == 2 or not decided or misfits[sign] > 1:
+        decided = len(known) == 1 or (not known and shadow.predicts and 2 * misfits[sign] < misfits[-sign])
+        if decided and misfits[sign] <= 1:
+            own.misfits[index] = np.median(own.misfits)
+            own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
+            # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
+            own.add(_REPLACED, 1.5 * own.noise)
+            words = "replaced", reason, "the other frame of its pair replaces it"
+            self._mend(own, index, sign, words, float(np.sqrt(1.5 * own.noise / own.size)))
+        elif known or not own.odd()[index]:  # the moving shadow's check refuses those of odd light
             self._refuse(own, index, reason)
-            return
-        own.vectors[:, index] = own.sums.vectors[:, index] - sign * away
-        # Twice one frame less the usual sum has the noise of both halves once more, and that of the sum.
-        own.add(_REPLACED, 1.5 * own.noise)
-        cost = float(np.sqrt(1.5 * own.noise / own.size))
-        self._mend(own, index, sign, "replaced", reason, "the other frame of its pair replaces it", cost=cost)
-
-    def _compare_sides(self) -> None:
-        """Count the difference of both sides' uniform responses where no sums show the lamp and motion."""
-        for half, reason in self.taken.wrong.items():
-            self.refused.append((half, reason))
-        found = []
-        for own in self.sides:
-            self._subtract_ambient(own, np.ones(self.count, dtype=bool))
-            shapes = np.stack([own.uniform, np.gradient(own.uniform)])
-            found.append(np.linalg.lstsq(shapes.T, own.vectors[:, 0], rcond=None)[0])
-            moved, noise = 2 * found[-1][1], own.noise / len(own.vectors) / np.square(shapes[1]).sum()
-            if moved**2 > (_SURE * 2) ** 2 * noise:
-                own.add_motion(np.full(1, moved), np.full(1, noise), np.array([0.0, moved]))
-        apart = abs(abs(found[0][0]) - abs(found[1][0]))
-        for own in self.sides:
-            own.add(_POWER, (apart / 2) ** 2 * own.size * (apart > _SLIGHT))
 
     def _check_shadow(self, own: _Side) -> None:
         """Turn the signs of patterns whose two frames are exchanged; refuse patterns that are foreign."""
@@ -572,7 +513,7 @@ class _Check:
             gains = shadow.by_turning * (shadow.by_turning > _TURNED * shadow.deviations)
             far[[0, *foreign]] = gains[foreign] = 0.0
             best = int(np.argmax(gains))
-            if gains[best] > max(_LEAST, _TURNED * far.max()):
+            if gains[best] > max(_SURE, _TURNED * far.max()):
                 which = [best] if best else slice(1, None)  # the light decides on the sign of pattern 0
                 own.vectors[:, which] *= -1
                 turned[which] ^= True
@@ -581,46 +522,35 @@ class _Check:
             else:
                 break
         else:
-            raise MitsimError(f"all frames: many of the {own.side} stripes are in no order; check their order")
+            foreign = [*range(self.count)]
         for index in foreign:
             self._refuse(own, index, f"they show other {own.side} stripes than the other patterns predict")
         for index in [0] if turned.all() else np.flatnonzero(turned).tolist():
-            if not shadow.predicts and not turned.all():
+            if not shadow.predicts:
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
-            sign = None if self.paired else 1
-            self._mend(own, index, sign, "exchanged", detail, "they count in their right order")
-        least = _UNEXPLAINED * np.maximum(own.sums.energies, np.median(own.sums.energies))
-        middle = float(np.median(own.misfits))
-        # Few misfits hardly show their scatter, which is that of squares of noise at least.
-        scatter = max(robust_scatter(own.misfits), float(np.sqrt(2 * own.variance * max(middle, 0.0))))
-        odd = own.misfits - middle > np.maximum(least, _DEVIATIONS * scatter)
-        if odd.sum() > max(2, MOST_FAULTS * self.count):
-            raise MitsimError(
-                f"all frames: {odd.sum()} of {self.count} {own.side} stripes show light that no stripes cast; check "
-                "ambient light, lamp and sensor, and take the session again"
-            )
-        for index in np.flatnonzero(odd).tolist():
+            self._mend(own, index, None if self.paired else 1, ("exchanged", detail, "they count in their right order"))
+        for index in np.flatnonzero(own.odd()):
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
-        around = np.pad(light, 1, constant_values=np.inf)
-        around = np.minimum(around[:-2], around[2:])
-        rows = np.flatnonzero((light < _DARK[self.centre] * around) & (around > _LIT * np.median(light)))
-        for row in rows[:1]:
-            word = "row" if own.axis == 0 else "column"
-            own.add(f"sensor {word} {row} shows no light; check the sensor", float(around[rows].sum()))
-        if foreign or len(rows) or not shadow.predicts:
+        lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
+        strange = (light < _DARK[own.sums.centre] * lower) & (lower > _LIT * np.median(light)) | (_LIT * light > upper)
+        words = (
+            f"sensor {('row', 'column')[own.axis]} {np.argmax(strange)} shows no light, or too much; check the sensor"
+        )
+        own.add(words, float(np.maximum(light, lower)[strange].sum()))
+        if foreign or strange.any() or not shadow.predicts:
             return
         # The lines at the ends are predicted from one side only.
         line = 1 + int(np.argmax(shadow.lines[1:-1]))
         words = f"line {line} of the {own.side} stripes is not as bright as its neighbours predict; check the projector"
-        share = shadow.lines[line] / len(shadow.lines)
-        own.add(words, share * own.size * (shadow.lines[line] > _LINE))
+        own.add(words, shadow.lines[line] / len(shadow.lines) * own.size * (shadow.lines[line] > _LINE))
         if not self.paired:
-            moves, variances = shadow.moves()
-            if _scatter(moves[1:], variances[1:]):
-                few = max(2, self.count // 8)
-                own.add_motion(moves[1:], variances[1:], np.array([np.median(moves[:few]), np.median(moves[-few:])]))
+            # The first line is +1 in all patterns, and every other one as often -1: light that all share is there.
+            offset = shadow.lines[0] / len(shadow.lines) * own.size
+            own.add(_OFFSET, 4 * offset * (offset > 3 * own.noise * self.count))  # smooth light is seen in part
+            places, variances = shadow.moves()
+            own.add_motion(places[1:], variances[1:], self.times[own.axis][1:])
             shown = np.square(own.vectors + own.vectors[:, :1]).sum(axis=0)
             squares, variances = np.square(shadow.powers()[0]), shadow.powers()[1]
             counted = (squares > _SLIGHT**2) | (np.median(squares / variances) > 4)
@@ -633,25 +563,22 @@ class _Check:
         that are wrong."""
         found, sides = self.found, self.sides
         energies = {
-            each: sum(own.extras.get(each, 0.0) / own.size for own in sides) for own in sides for each in own.extras
+            why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras
         }
-        order, total = sorted(energies, key=lambda each: -energies[each]), float(np.sqrt(sum(energies.values())))
+        order, total = sorted(energies, key=lambda why: -energies[why]), float(np.sqrt(sum(energies.values())))
         doubts = [
-            f"{each}; the stated error includes {np.sqrt(energies[each]):.1e} for it"
-            for each in order
-            if each not in (_LAMP, _REPLACED) and energies[each] > (_MATTERS * self.noise) ** 2
+            why for why in order if why not in (_LAMP, _REPLACED) and energies[why] > (_MATTERS * self.noise) ** 2
         ]
         if total > LARGEST_ERROR or (self.refused and doubts):
-            raise MitsimError(
-                f"all frames: {order[0]}: an error of {total:.0%} or more is left in the factors; take the "
-                "session again"
-            )
+            raise MitsimError(f"all frames: {order[0]}: it leaves a factor error of {total:.0%}; take them again")
         if self.refused:
             reason = self.refused[0][1]
             names = [self.taken.name(half) for half, why in self.refused if why == reason]
-            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-            raise MitsimError(f"frames: {', '.join(names[:_NAMED])}{more}: {reason}; take them again")
-        found.doubts += [f"session: {words}" for words in doubts]
+            listed = ", ".join(names[:_NAMED]) + f" and {len(names) - _NAMED} more" * (len(names) > _NAMED)
+            every = "all " * (len(self.refused) > 2 * max(2, MOST_FAULTS * self.count))
+            raise MitsimError(f"{every}frames: {listed}: {reason}; take them again")
+        words = "session: {}; the stated error includes {:.1e} for it"
+        found.doubts += [words.format(why, np.sqrt(energies[why])) for why in doubts]
         found.faults.sort(key=lambda fault: (SIDES.index(fault.side), fault.index))
         left, right = (own.result() for own in sides)
         found.sums, found.extra = (left, right), (sum(sides[0].extras.values()), sum(sides[1].extras.values()))

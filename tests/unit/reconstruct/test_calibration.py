@@ -290,13 +290,20 @@ def test_responses_that_are_missing_are_counted() -> None:
             estimate_factors(*sides, H)
 
 
-def test_a_large_sensor_s_light_is_kept_by_blocks() -> None:
-    """1030 rows in blocks of eleven, of the sum of both frames; the last block has seven."""
-    rows, light = 1030, np.tile(np.arange(1030.0)[:, None], (1, 4))
-    sums, _ = stripe_sums(np.ones((rows, 4)), np.ones((rows, 4)), 2)
-    pair = sums.fit_response(light / 2, 1, light).pair
-    means = np.array([np.arange(first, min(first + 11, rows)).mean() for first in range(0, rows, 11)])
-    np.testing.assert_allclose(pair.blocks, np.tile(means[:, None], (1, 4)), rtol=1e-6)
+@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("side", [0, 1])
+def test_the_light_of_a_pair_is_projected_as_its_response_is(side: int, centre: bool) -> None:
+    """(Planted: the sum is projected on the other side's vector; its mean is left in where responses are centred.)"""
+    rng = np.random.default_rng(3)
+    one, other = rng.random((2, 30, 30))
+    both = stripe_sums(np.outer(one[0], one[1]), np.outer(one[0], one[1]), 2, centre)
+    own = both[side]
+    seen = own.fit_response(one - other, 1, one + other)
+    again = own.fit_response(one + other, 1)
+    np.testing.assert_allclose(seen.light, again.vector, atol=1e-12)
+    own.put(seen)
+    np.testing.assert_array_equal(own.lights, np.stack([np.zeros(30), seen.light], axis=1))
+    assert not both[1 - side].lights.size
 
 
 @pytest.mark.parametrize("side", [0, 1])

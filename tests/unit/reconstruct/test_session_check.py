@@ -366,15 +366,20 @@ def test_numbers_that_are_not_in_proportion_to_light_count(power: float) -> None
     assert holds(found) and any("not in proportion to light" in words for words in found.doubts)
 
 
-def test_bands_are_refused() -> None:
-    """(Planted: pairs are compared with the median pair alone, which has bands too.)"""
+@pytest.mark.parametrize("size", [0.01, 0.05])
+def test_bands_count_or_are_refused(size: float) -> None:
+    """Bands change the response's vector as they change the sum. (Planted: what sums have beyond noise is left out.)"""
     rng = np.random.default_rng(4)
 
     def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
-        return frame * (1 + 0.01 * np.sin(np.arange(PIXELS[0]) / 4 + 6.3 * rng.random()))[:, None]
+        return frame * (1 + size * np.sin(np.arange(PIXELS[0]) / 4 + 6.3 * rng.random()))[:, None]
 
-    with pytest.raises(MitsimError, match=r"^all frames: "):
-        checked(frames(change))
+    if size > 0.02:
+        with pytest.raises(MitsimError, match=r"^all frames: "):
+            checked(frames(change))
+        return
+    found = checked(frames(change))
+    assert holds(found) and any("pairs add up to light that changes" in words for words in found.doubts)
 
 
 # ---- Without pairs ---------------------------------------------------------------------------------------------------
@@ -416,6 +421,33 @@ def test_sides_of_different_power_without_pairs_count() -> None:
     shown = frames()
     with pytest.raises(MitsimError, match=r"^all frames: "):
         checked({**shown, ("vertical", 0, 1): 0.7 * shown["vertical", 0, 1]}, pairs=False)
+
+
+def test_a_clipped_uniform_frame_without_pairs_is_refused() -> None:
+    """Frames of patterns are half as bright, so that the uniform frames alone are clipped, for both sides alike.
+    (Planted: the first line, which alone shows what all responses share, is not looked at.)"""
+    clipped = {(side, 0, 1): np.minimum(light((side, 0, 1)), 0.8) for side in SIDES}
+    with pytest.raises(MitsimError, match=r"^all frames: the uniform frame does not fit those of patterns"):
+        checked({**frames(), **clipped}, pairs=False)
+
+
+def test_light_that_only_the_uniform_frames_have_counts_without_pairs() -> None:
+    """(Planted: the first line is not looked at.)"""
+    y, x = np.meshgrid(*(np.linspace(-1, 1, length) for length in PIXELS), indexing="ij")
+    cloud = {(side, 0, 1): frames()[side, 0, 1] + 0.01 * np.exp(-8 * (x**2 + y**2)) for side in SIDES}
+    found = checked({**frames(), **cloud}, pairs=False)
+    assert holds(found) and any("the uniform frame does not fit" in words for words in found.doubts)
+
+
+def test_hot_sensor_columns_without_pairs_count() -> None:
+    """Differences of pairs have none of it. (Planted: dark rows alone are looked at.)"""
+
+    def change(frame: np.ndarray, time: float, half: Half) -> np.ndarray:
+        return frame + 2.0 * (np.arange(PIXELS[1]) == 30)
+
+    with pytest.raises(MitsimError, match=r"^all frames: .*sensor column 30 shows no light, or too much"):
+        checked(frames(change), pairs=False)
+    assert not checked(frames(change)).faults
 
 
 # ---- The moving shadow -----------------------------------------------------------------------------------------------
