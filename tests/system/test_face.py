@@ -408,7 +408,7 @@ for arguments, _ in json.loads(sys.argv[1]):
     print(json.dumps([code, err.getvalue(), heavy]))
 """
     command = [sys.executable, "-c", program, json.dumps(TYPOS)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=600)
     for (arguments, fragment), line in zip(TYPOS, done.stdout.splitlines(), strict=True):
         code, message, heavy = json.loads(line)
         assert code == 2 and message.startswith("mitsim: ") and message.count("\n") == 1, (arguments, message)
