@@ -5,6 +5,7 @@ variant must not be used after switching.
 """
 
 import ctypes
+import gc
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -32,6 +33,12 @@ def pytest_configure() -> None:
             os.sched_setaffinity(0, own)
     if width := os.environ.get("MITSIM_VECTOR_WIDTH"):
         set_vector_width(int(width))
+
+
+def pytest_collection_finish() -> None:
+    """Exempt all collected tests from the garbage collector, which would go over them again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 def set_vector_width(width: int) -> None:
@@ -215,6 +222,21 @@ def kept_plans(variant: str) -> Iterator[None]:
     """For modules of which no test is about planning: see :mod:`tests.kept_plans`."""
     with plans_kept():
         yield
+
+
+@pytest.fixture(scope="module")
+def trees() -> Iterator[None]:
+    """Keep the syntax trees of sources for one module, and collect no garbage meanwhile.
+
+    They take hundreds of megabytes and have no cycles. The collector takes longer to go over them than the parser does
+    to make them.
+    """
+    from tests.test_architecture import parsed
+
+    gc.disable()
+    yield
+    parsed.cache_clear()
+    gc.enable()
 
 
 @pytest.fixture
