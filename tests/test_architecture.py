@@ -451,8 +451,9 @@ def test_a_refusal_imports_nothing_heavy(refusing: Path, lines: tuple[str, ...],
     leaves its folder.)"""
     before = sorted(refusing.rglob("*"))
     program = f"""
-import sys
+import functools, sys, typer.main
 from mitsim.cli import run
+typer.main.get_command = functools.cache(typer.main.get_command)  # commands are built once, not for every line
 for line in {lines!r}:
     sys.argv = ["mitsim", *line.split()]
     try:
