@@ -44,7 +44,8 @@ def pytest_collection_finish() -> None:
 def set_vector_width(width: int) -> None:
     """Let Dr.Jit compile for vectors of 4, 8 or 16 floats, as it does on processors with SSE, AVX2 and AVX-512.
 
-    MITSIM_VECTOR_WIDTH=4 make test tries the suite so. A width that this processor lacks is emulated by LLVM.
+    ``MITSIM_VECTOR_WIDTH=4 pytest tests/unit`` tries tests so. LLVM emulates a width that this processor lacks.
+    Programs that tests start keep the processor's own width: their frames differ in the last bits from those made here.
     """
     from mitsim.core.environment import load_variant
 
