@@ -5,6 +5,7 @@ variant must not be used after switching.
 """
 
 import ctypes
+import gc
 import itertools
 import os
 from collections.abc import Callable, Iterator
@@ -34,10 +35,17 @@ def pytest_configure() -> None:
         set_vector_width(int(width))
 
 
+def pytest_collection_finish() -> None:
+    """Exempt all collected tests from the garbage collector, which would go over them again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 def set_vector_width(width: int) -> None:
     """Let Dr.Jit compile for vectors of 4, 8 or 16 floats, as it does on processors with SSE, AVX2 and AVX-512.
 
-    MITSIM_VECTOR_WIDTH=4 make test tries the suite so. A width that this processor lacks is emulated by LLVM.
+    ``MITSIM_VECTOR_WIDTH=4 pytest tests/unit`` tries tests so. LLVM emulates a width that this processor lacks.
+    Programs that tests start keep the processor's own width: their frames differ in the last bits from those made here.
     """
     from mitsim.core.environment import load_variant
 
@@ -215,6 +223,21 @@ def kept_plans(variant: str) -> Iterator[None]:
     """For modules of which no test is about planning: see :mod:`tests.kept_plans`."""
     with plans_kept():
         yield
+
+
+@pytest.fixture(scope="module")
+def trees() -> Iterator[None]:
+    """Keep the syntax trees of sources for one module, and collect no garbage meanwhile.
+
+    They take hundreds of megabytes and have no cycles. The collector takes longer to go over them than the parser does
+    to make them.
+    """
+    from tests.test_architecture import parsed
+
+    gc.disable()
+    yield
+    parsed.cache_clear()
+    gc.enable()
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tokenize
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -23,6 +23,7 @@ import mitsim
 from mitsim.core.configuration import shipped_path
 from tests.exchanged import made
 
+pytestmark = pytest.mark.usefixtures("trees")
 PACKAGE = Path(mitsim.__file__).parent
 FLOORS = (
     "version",
@@ -81,13 +82,6 @@ CHECKS_A_REQUEST = (
 def parsed(source: str) -> ast.Module:
     """The tree of a text, which several tests walk; nobody changes it."""
     return ast.parse(source)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _trees_are_let_go() -> Iterator[None]:
-    """All trees together take hundreds of megabytes, over which every later collection of garbage would go."""
-    yield
-    parsed.cache_clear()
 
 
 @cache
@@ -457,8 +451,9 @@ def test_a_refusal_imports_nothing_heavy(refusing: Path, lines: tuple[str, ...],
     leaves its folder.)"""
     before = sorted(refusing.rglob("*"))
     program = f"""
-import sys
+import functools, sys, typer.main
 from mitsim.cli import run
+typer.main.get_command = functools.cache(typer.main.get_command)  # commands are built once, not for every line
 for line in {lines!r}:
     sys.argv = ["mitsim", *line.split()]
     try:

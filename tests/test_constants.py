@@ -13,9 +13,10 @@ import tokenize
 
 import pytest
 
-from tests.test_architecture import modules
+from tests.test_architecture import modules, parsed
 from tests.test_docstrings import room_of
 
+pytestmark = pytest.mark.usefixtures("trees")
 NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
 NO_REASON = re.compile(r"#\s*(-{2,}|noqa|type:|fmt:|pragma)")
 
@@ -63,7 +64,7 @@ def constants(source: str) -> list[tuple[str, bool]]:
             beside = any(line in comments for line in range(node.lineno, node.end_lineno + 1))
             found.extend((name, below or beside or alone(node.lineno - 1)) for name in names)
 
-    walk(ast.parse(source).body)
+    walk(parsed(source).body)
     return found
 
 

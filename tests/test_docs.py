@@ -29,6 +29,7 @@ from tests.conftest import write_small_scene
 from tests.exchanged import made
 from tests.robustness import Recorder, Row, page_of
 from tests.test_architecture import FLOORS
+from tests.test_verbs import verbs
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -118,15 +119,6 @@ def command_lines() -> list[tuple[str, str]]:
         spans = re.findall(r"`mitsim ([a-z][^`]*)`", prose_of(page))
         found += [(page, " ".join(line.split())) for line in [*lines, *spans]]
     return found
-
-
-def verbs() -> dict[str, Any]:
-    import typer
-
-    from mitsim.cli import app
-
-    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    return commands
 
 
 def blocks(page: str, language: str) -> list[str]:

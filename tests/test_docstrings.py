@@ -19,6 +19,7 @@ from numpydoc.docscrape import NumpyDocString
 
 from tests.test_architecture import modules, parsed
 
+pytestmark = pytest.mark.usefixtures("trees")
 IN_TEXT = 2
 """The most parameters that a sentence may name; chosen: more are easier found in a list."""
 

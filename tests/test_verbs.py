@@ -10,6 +10,7 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,9 @@ ANYWAY = {("sense", "output")}
 """Of the verb and option, what a method of the result is for."""
 
 
+@cache
 def verbs() -> dict[str, Any]:
+    """Return all commands by name. Typer takes longer to build them than to parse a line."""
     import typer
 
     from mitsim.cli import app

@@ -152,7 +152,7 @@ def test_rgb_and_spectral_see_the_grey_of_mono(small_scene: Callable[..., Path])
         for variant in ("llvm_ad_rgb", "llvm_ad_spectral")
     }
     for variant, child in children.items():
-        out, err = child.communicate(timeout=120)
+        out, err = child.communicate(timeout=600)
         assert child.returncode == 0, err
         for estimator, (mean, error) in json.loads(out.splitlines()[-1]).items():
             # 24 batches: the t distribution of 23 degrees has its 5 sigma at 6.8.

@@ -40,18 +40,18 @@ def running(least: int | str, *arguments: object, session: bool = False) -> subp
     folder = Path(str(arguments[arguments.index("-o") + 1]))
     command = [sys.executable, "-m", "mitsim", *map(str, arguments)]
     process = started(command, session)
-    limit = time.monotonic() + 120
+    limit = time.monotonic() + 600
     wanted, count = (least, 1) if isinstance(least, str) else ("frame_*.exr", least)
     while (len(list(folder.glob(wanted))) < count or not folder.exists()) and process.poll() != 0:
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < limit
+        assert time.monotonic() < limit, "the program hangs"
         time.sleep(0.001)
     return process
 
 
 def ended(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
     """The process once it is over, with all that it said."""
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=600)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 

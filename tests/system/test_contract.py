@@ -440,7 +440,7 @@ def on_a_terminal(
         patch.setattr(sys, "stderr", file)
         with pytest.raises(SystemExit):
             cli.run()
-    reader.join(timeout=10)
+    reader.join(timeout=120)
     os.close(master)
     return capsys.readouterr().out, b"".join(seen).decode()
 

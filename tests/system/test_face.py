@@ -395,8 +395,9 @@ def test_typos_are_refused_before_the_renderer_is_imported(tmp_path: Path) -> No
     """The renderer takes a second of processor time, numpy and what else reads, locks and watches 0.2 s; nothing of
     that is needed to see an argument wrong."""
     program = """
-import contextlib, io, json, sys
+import contextlib, functools, io, json, sys, typer.main
 from mitsim import cli
+typer.main.get_command = functools.cache(typer.main.get_command)  # commands are built once, not for every line
 for arguments, _ in json.loads(sys.argv[1]):
     sys.argv, err = ["mitsim", *arguments], io.StringIO()
     with contextlib.redirect_stderr(err):
@@ -408,7 +409,7 @@ for arguments, _ in json.loads(sys.argv[1]):
     print(json.dumps([code, err.getvalue(), heavy]))
 """
     command = [sys.executable, "-c", program, json.dumps(TYPOS)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=600)
     for (arguments, fragment), line in zip(TYPOS, done.stdout.splitlines(), strict=True):
         code, message, heavy = json.loads(line)
         assert code == 2 and message.startswith("mitsim: ") and message.count("\n") == 1, (arguments, message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -67,13 +68,17 @@ def test_a_bench_of_ones_own_leads_to_an_image(
 
 
 def walk(call: Callable[..., Any], heading: str) -> None:
-    """The commands under a ``heading``, which print what the page has: words, and figures to a tenth, which search and
-    iterations keep on any machine."""
+    """Run the commands under a ``heading``. They print what the page has: words, and figures to a tenth.
+
+    Lambda is left out, because it is sought at a flat minimum. Kernels of BLAS for other processors move it by a sixth,
+    and the image and its stated error, which are compared, by less than a tenth.
+    """
     figures.put_inputs(heading, Path())
     for example in examples(PAGE, heading):
         outcome = call(*example.arguments, "--quiet", pictures=True)
         assert outcome.code == example.status, outcome.err
-        for reported, now in figures.pairs(example.output, outcome.out + outcome.err):
+        texts = (re.sub(r"lambda [\d.e+-]+", "lambda", text) for text in (example.output, outcome.out + outcome.err))
+        for reported, now in figures.pairs(*texts):
             assert float(now) == pytest.approx(float(reported), rel=0.1), example.arguments
 
 

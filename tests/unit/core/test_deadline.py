@@ -13,7 +13,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job, Limits, within
 from mitsim.core.worker import OutOfTime
 
-LIMIT, LATE, END = 0.1, 5.0, 10.0
+LIMIT, LATE, END = 0.1, 60.0, 120.0
 """Seconds allowed; by which a loaded machine has surely given the main thread its turn; and after which work ends by
 itself where no alarm ends it, so that a test fails and does not hang."""
 

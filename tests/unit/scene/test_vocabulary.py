@@ -53,7 +53,7 @@ def test_what_a_variant_lacks_is_refused_where_it_stands(tmp_path: Path, name: s
             assert expected["capture"] in line and f"type: got {plugin!r} in <{tag}" in line and f"{path}:" in line
 
 
-@pytest.mark.parametrize(("tag", "plugin"), [("bsdf", "hair"), ("integrator", "ptracer"), ("shape", "ply")])
+@pytest.mark.parametrize(("tag", "plugin"), [("bsdf", "hair"), ("integrator", "ptracer"), ("rfilter", "box")])
 def test_a_few_plugins_in_mono(tmp_path: Path, variant: str, tag: str, plugin: str) -> None:
     assert as_it_should(tag, plugin, variant, found := outcome(scene(tmp_path, tag, plugin), variant)), found
 

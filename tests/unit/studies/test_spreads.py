@@ -1,7 +1,5 @@
 """Repeated times: spreads, differences that noise may hide, and a budget of wall time that is kept."""
 
-import time
-
 import pytest
 
 from mitsim.studies.accuracy_findings import ROUNDS, Budget, Extra, Spread, Timed, times
@@ -65,6 +63,4 @@ def test_repeats_go_round_by_round_and_stop_with_the_time() -> None:
     Budget(60.0).repeat([slow, fast])
     assert order == ["fast", "slow"] * (ROUNDS - 1) and len(slow.seconds) == len(fast.seconds) == ROUNDS
     never = Timed(lambda: pytest.fail("no time is left for it"), [5.0])
-    started = time.perf_counter()
     Budget(1.0).repeat([never])
-    assert time.perf_counter() - started < 1

@@ -42,9 +42,12 @@ class Alone(SensorPoints):
     index: int = 0
 
     def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
+        import drjit as dr
+
         assert self.of_several is not None
-        side = self.of_several.anchors
-        return self.of_several.at(row + self.index // side, column + self.index % side, rng)
+        # Opaque numbers, so that all anchors share one compiled kernel.
+        down, right = (dr.opaque(type(row), place) for place in divmod(self.index, self.of_several.anchors))
+        return self.of_several.at(row + down, column + right, rng)
 
 
 @pytest.fixture(scope="module")

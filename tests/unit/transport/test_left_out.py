@@ -1,6 +1,6 @@
 """Light that no tracer finds is measured: by a plane mirror that light meets twice, in closed form; not by windows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,12 +191,12 @@ def test_a_plan_is_flagged_that_leaves_light_out(shared_scene: Callable[..., Pat
     assert plan.systematic_error > 0.05
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
-def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path], order: Sequence[int]) -> None:
-    """A ball of glass, not a mirror out of the way, nor the pane that all light passes; 2^18 paths, seed 0."""
+def test_it_is_told_over_which_mirror(shared_scene: Callable[..., Path]) -> None:
+    """A ball of glass, not a mirror out of the way before it, nor the pane behind it that all light passes; 2^18 paths,
+    seed 0."""
     ball = BALL.replace('value="5"', 'value="60"')
-    shapes = [ball, MIRROR.replace('x="-40" z="315"', 'x="-300" z="315"'), slab(200, 4)]
-    path = shared_scene(f"named{order[0]}", extra="\n".join(shapes[place] for place in order), sheet_z=WALL)
+    shapes = MIRROR.replace('x="-40" z="315"', 'x="-300" z="315"'), ball, slab(200, 4)
+    path = shared_scene("named", extra="\n".join(shapes), sheet_z=WALL)
     bench = open_bench(path)
     _, place = left_out_of(bench, 0, 2**18).unseen(NONE, NONE)
     assert place is not None

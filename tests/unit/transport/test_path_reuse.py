@@ -174,7 +174,7 @@ def test_a_shared_path_tells_as_much_as_several(shared_scene: Callable[..., Path
     assert shared < own / 5
 
 
-@pytest.mark.parametrize("name", ["matt walls", "bent wall", "fins"])
+@pytest.mark.parametrize("name", ["bent wall", "fins"])
 def test_diffuse_surfaces_need_no_look_at_their_material(
     shared_scene: Callable[..., Path], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
