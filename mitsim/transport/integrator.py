@@ -472,14 +472,22 @@ def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi
 
     Of a first turn only :func:`matt_part` counts, and after a mirror all is followed, because the camera's side finds
     nothing there.
+
+    Parameters
+    ----------
+    paths, si
+        their state, and the surfaces that they have met.
+    correction
+        factor of the shading normals there.
     """
     later = dr.select(paths.scattered > 0, projector_part(si, correction), matt_part(si))
     return dr.select(paths.depth == paths.scattered, later, 1)
 
 
 def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
-    """Return the part of the light over a turn, but for its first, that is followed from the projector, where a shading
-    normal multiplies it by a ``correction``; the rest is followed from the camera, on whose side no such factor is.
+    """Return the part of the light over a turn at ``si``, but for its first, that is followed from the projector.
+
+    A shading normal multiplies it by a ``correction``. The rest is followed from the camera, whose side has no factor.
 
     Grazing light is met in proportion to its cosine, and multiplied by its inverse: the variance would have no end.
     """
