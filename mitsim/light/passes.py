@@ -135,8 +135,9 @@ class Tracers(Grids):
 
     @property
     def _steep(self) -> bool:
-        """Whether shading normals may make light of the projector's side heavy."""
-        return self.divides and self.physics.interreflection and self.bench.loaded.smoothed
+        """Whether shading normals or hair may make light of the projector's side heavy."""
+        loaded = self.bench.loaded
+        return self.physics.interreflection and ((self.divides and loaded.smoothed) or loaded.hairy)
 
     def _points(self, anchors: int, spread: bool = False) -> SensorPoints:
         return SensorPoints(self.physics.geometry.half_width, anchors, spread, self.settings.depth)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -78,6 +78,11 @@ class LoadedScene:
     def pixels(self) -> ProjectorGrid:
         """The projector's grid; of a scene without one, MitsimError says why."""
         return self.grid or locate_projector(str(self.path), _only_projector(self.path, self.scene), self.camera)
+
+    @cached_property
+    def hairy(self) -> bool:
+        """Return True if a surface is hair, but for those in instances."""
+        return any(shape.bsdf() and holds_hair(shape.bsdf().flags()) for shape in self.scene.shapes())
 
     @cached_property
     def smoothed(self) -> bool:
@@ -194,6 +199,12 @@ def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
     mirrors = any(own & mirror for own in flags) or unfit.instances is not None
     hidden = any(shape.class_name() == "Instance" for shape in scene.shapes())
     return mirrors, hidden or any(mi.has_flag(own, mi.BSDFFlags.Glossy) for own in flags)
+
+
+def holds_hair(flags: Any) -> Any:
+    """Return True if the ``flags`` of a material, a number or one per lane, are those of hair or of what holds it."""
+    both = int(mi.BSDFFlags.NonSymmetric) | int(mi.BSDFFlags.Null)
+    return (flags & both) == both
 
 
 def _faces_one_way(scene: mi.Scene) -> bool:

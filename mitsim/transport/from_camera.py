@@ -44,6 +44,7 @@ from mitsim.transport.integrator import (
     Turn,
     camera_part,
     is_delta,
+    matt_part,
     projector_part,
     tilt,
 )
@@ -271,7 +272,7 @@ class CameraPaths(PathIntegrator[State]):
         else:
             value = bsdf.eval(mi.BSDFContext(), si, toward, active)
         light = self._irradiance(paths, value * connection.weight * passed)
-        light *= self._part(paths, paths.kept * paths.turned)
+        light *= self._part(paths, paths.kept * paths.turned * (matt_part(si) if self.rules.steep else 1))
         self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
     def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
@@ -320,8 +321,9 @@ class CameraPaths(PathIntegrator[State]):
                 going = paths.part > 0
         if self.rules.steep:
             leaving = dr.select(before_sensor, 1, tilt(si, -paths.ray.d))
-            turned = projector_part(tilt(si, si.to_world(turn.sample.wo)) / leaving)
-            paths.kept = dr.select(turn.delta, 1, dr.select(passing, paths.kept, paths.kept * paths.turned))
+            turned = projector_part(si, tilt(si, si.to_world(turn.sample.wo)) / leaving)
+            kept = paths.kept * paths.turned * matt_part(si)
+            paths.kept = dr.select(turn.delta, 1, dr.select(passing, paths.kept, kept))
             paths.turned = dr.select(turn.delta, 1, dr.select(passing, paths.turned, turned))
             # Light that only later turns may leave to this side is little: few paths go on for it.
             idle = ~going & (turned == 1)

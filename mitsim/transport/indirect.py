@@ -35,8 +35,7 @@ from mitsim.transport.integrator import (
     PathIntegrator,
     PathState,
     camera_part,
-    is_divided,
-    projector_part,
+    part_over_turn,
     tilt,
 )
 from mitsim.transport.plugins.base import sobol_point, streams
@@ -175,7 +174,7 @@ class ProjectorPaths(PathIntegrator[PathState]):
         light = reception.irradiance * self.flux * paths.throughput
         caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)
         if self.rules.steep:
-            part *= dr.select(is_divided(paths), projector_part(tilt(si, -paths.ray.d)), 1)
+            part *= part_over_turn(paths, si, tilt(si, -paths.ray.d))
         light *= dr.select(caustic, 1, part)
         held, number = at
         for kind, chosen in (("direct", caustic), ("indirect", ~caustic)):

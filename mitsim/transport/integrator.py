@@ -22,6 +22,7 @@ import numpy as np
 
 from mitsim.core.environment import keep_scenes
 from mitsim.core.job import compiled_kernels
+from mitsim.scene.load import holds_hair
 from mitsim.transport.connect import OpticalSetup, SensorPoints
 from mitsim.transport.records import AMBIENT, DIRECT, INDIRECT, PathSamples
 
@@ -214,8 +215,8 @@ class Paths:
 
     ``mirrors``: over delta reflections and transmissions, from the camera only on its side; ``interreflection``: any
     number of bounces; ``emitters``: other lights of the scene, all of them one class of ambient light, which the camera
-    alone finds; ``steep``: whether light that shading normals make heavy is divided between both sides
-    (:func:`projector_part`).
+    alone finds; ``steep``: whether light that shading normals or hair make heavy is divided between both
+    sides (:func:`projector_part`).
     """
 
     mirrors: bool = False
@@ -395,8 +396,7 @@ class PathIntegrator(ABC, Generic[State]):
             corrected = shading_correction(si, sample.wo, onward, toward)
             weight *= dr.select(dr.isfinite(corrected), dr.abs(corrected), 0)
             if rules.steep:
-                divided = is_divided(paths) & ~turn.delta
-                weight *= dr.select(divided, projector_part(corrected), 1)
+                weight *= dr.select(mirrored | passing, 1, part_over_turn(paths, si, corrected))
         paths.throughput *= weight
 
         # ---- Russian roulette; chains of mirrors are short and full of light, and what only passes a surface goes on
@@ -467,19 +467,40 @@ def tilt(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
     return dr.dot(si.sh_frame.n, direction) / dr.dot(si.n, direction)
 
 
-def is_divided(paths: PathState) -> mi.Bool:
-    """Whether the next turn of ``paths`` from the projector is divided by :func:`projector_part`: not their first, and
-    none after a mirror, where the camera's side finds nothing."""
-    return (paths.scattered > 0) & (paths.depth == paths.scattered)
+def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
+    """Return the part of the light of ``paths`` over their next turn at ``si`` that is followed from the projector.
+
+    Of a first turn only :func:`matt_part` counts, and after a mirror all is followed, because the camera's side finds
+    nothing there.
+
+    Parameters
+    ----------
+    paths, si
+        their state, and the surfaces that they have met.
+    correction
+        factor of the shading normals there.
+    """
+    later = dr.select(paths.scattered > 0, projector_part(si, correction), matt_part(si))
+    return dr.select(paths.depth == paths.scattered, later, 1)
 
 
-def projector_part(correction: mi.Float) -> mi.Float:
-    """Part of the light over a turn, but for its first, that is followed from the projector, where a shading normal
-    multiplies it by a ``correction``; the rest is followed from the camera, on whose side no such factor is.
+def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
+    """Return the part of the light over a turn at ``si``, but for its first, that is followed from the projector.
+
+    A shading normal multiplies it by a ``correction``. The rest is followed from the camera, whose side has no factor.
 
     Grazing light is met in proportion to its cosine, and multiplied by its inverse: the variance would have no end.
     """
-    return dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
+    return matt_part(si) * dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
+
+
+def matt_part(si: mi.SurfaceInteraction3f) -> mi.Float:
+    """Return 0 where the surfaces at ``si`` are hair, whose light is followed from the camera, and 1 elsewhere.
+
+    Mitsuba samples hair for a view. Forward, its values have the inverse cosine of grazing light, and their ratio to
+    the density has no bound: single paths had a third of the light of a quarter million.
+    """
+    return dr.select(holds_hair(si.bsdf().flags()), mi.Float(0), 1)
 
 
 def camera_part(pdf: mi.Float) -> mi.Float:

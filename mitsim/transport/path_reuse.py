@@ -36,7 +36,7 @@ import numpy as np
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Way
 from mitsim.transport.indirect import MEMBERS, SIDE, Emission, IndirectTracer, ProjectorPaths, blocks_of
-from mitsim.transport.integrator import InFlight, camera_part, projector_part, shading_correction, tilt
+from mitsim.transport.integrator import InFlight, camera_part, matt_part, projector_part, shading_correction, tilt
 from mitsim.transport.plugins.base import generator, sobol_point, split_by_line
 from mitsim.transport.records import INDIRECT, PathSamples, Sightings, check_finite
 
@@ -244,12 +244,12 @@ class ReusedPaths(ProjectorPaths):
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
     ) -> ByLine:
         """The same of second surfaces, the part that is followed from here."""
-        kept = self._own_part(tilt(si, toward) / tilt(si, onward))
+        kept = self._own_part(si, tilt(si, toward) / tilt(si, onward))
         return [light * kept for light in self._turn(si, toward, onward, active)]
 
-    def _own_part(self, correction: mi.Float) -> mi.Float | int:
-        """Part of the light over second surfaces of such a ``correction`` that is followed from here."""
-        return projector_part(correction) if self.rules.steep else 1
+    def _own_part(self, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float | int:
+        """Return the part of the light over second surfaces of such a ``correction`` that is followed from here."""
+        return projector_part(si, correction) if self.rules.steep else 1
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
         """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side, by
@@ -327,6 +327,7 @@ class ReusedPaths(ProjectorPaths):
             local = si.to_local(direction)
             reflected, pdf = si.bsdf().eval_pdf(context, si, local, active)
             correction = dr.abs(shading_correction(si, local, direction, toward))
+            correction *= matt_part(si) if self.rules.steep else 1
             return self._factors(mi.unpolarized_spectrum(reflected) * correction), pdf
 
         return send
@@ -341,7 +342,7 @@ class ReusedPaths(ProjectorPaths):
             toward = dr.normalize(si.p - second.p)
             way = dr.gather(Way, self.to_sensor_way, at, active)
             reception = self.setup.received(second, toward, replace(way, open=way.open & active))
-            part = (1 - camera_part(reception.pdf)) * self._own_part(tilt(second, toward))
+            part = (1 - camera_part(reception.pdf)) * self._own_part(second, tilt(second, toward))
             connected = self._factors(reception.irradiance * part)
             beyond, turned = (
                 [dr.gather(mi.Float, each, at, active) for each in lines] for lines in (self.beyond, self.own_turn)

@@ -25,9 +25,10 @@ CLEAR = 32 * 2.0**-24
 single precision, 8e-4 mm at 400 mm, where a point is 1 or 2 of them off. Mitsuba's own 9e-5 is 0.036 mm there, and
 skips a print so close behind glass."""
 _LOOSE = 1500 * 2.0**-24
-"""The same beyond a cylinder or what an instance holds, as far as Mitsuba's own rays start: points of a cylinder lie up
-to 6e-8 D^2 / r off its surface, 1e-3 mm of a radius r of 6 mm at a distance D of 300, and those of an instance 100
-roundings; they would be hidden by their own surface."""
+"""The same beyond what an instance holds, as far as Mitsuba's own rays start: its points lie 100 roundings off, and
+would be hidden by their own surface. Points of a cylinder lie up to 6e-8 D^2 / r off, 1e-3 mm of a radius r of 6 mm at
+a distance D of 300. Its rays are Mitsuba's, which start along the normal: along a grazing ray, this distance is longer
+than the way through a rod of 4 mm, and light would come out of its side."""
 _GRAZING = 0.02
 """Least cosine that this distance is divided by, so that a grazing ray does not skip centimetres."""
 State = TypeVar("State", bound=tuple[object, ...])
@@ -101,7 +102,7 @@ class Passage:
         self.transmits = transmits(scene)
         kinds = {int(shape.shape_type()) for shape in scene.shapes()}
         self._instanced = _has_instances(scene)
-        self._loose = self._instanced or int(mi.ShapeType.Cylinder) in kinds
+        self._round = int(mi.ShapeType.Cylinder) in kinds
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
         """Whether points see each other, and the part of the light that what lies between them lets through.
@@ -229,17 +230,17 @@ class Passage:
         """How far a ray that leaves the surface at ``si`` in a ``direction`` starts from it [mm]."""
         slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
         clear = mi.Float(CLEAR)
-        if self._loose:
-            loose = si.shape.shape_type() == mi.UInt32(int(mi.ShapeType.Cylinder))
-            if self._instanced:
-                loose |= si.instance != dr.zeros(mi.ShapePtr)
-            clear = dr.select(loose, _LOOSE, CLEAR)
+        if self._instanced:
+            clear = dr.select(si.instance != dr.zeros(mi.ShapePtr), _LOOSE, CLEAR)
         return clear * (1 + dr.max(dr.abs(si.p))) / slope
 
     def onward(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
-        """A ray that starts beyond the surface at ``si`` in a ``direction``, on the line through the point itself."""
-        clear = self.clear(si, direction)
-        return mi.Ray3f(si.p + direction * clear, direction, si.time, si.wavelengths)
+        """Return a ray that starts beyond the surface at ``si`` in a ``direction``, on the line through the point; that
+        from a cylinder starts beside the line."""
+        start = si.p + direction * self.clear(si, direction)
+        if self._round:
+            start = dr.select(_is_round(si), si.spawn_ray(direction).o, start)
+        return mi.Ray3f(start, direction, si.time, si.wavelengths)
 
     def leaving(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
         """A ray that leaves the surface at ``si`` in a ``direction``: as Mitsuba has it where no surface transmits."""
@@ -259,9 +260,14 @@ class Passage:
         if self.transmits:
             direction = dr.normalize(target - si.p)
             clear = self.clear(si, direction)
-            ray.o, ray.d = si.p + direction * clear, direction
-            ray.maxt = ray.maxt - clear
+            along = mi.Ray3f(si.p + direction * clear, direction, ray.maxt - clear, ray.time, ray.wavelengths)
+            ray = dr.select(_is_round(si), ray, along) if self._round else along
         return ray
+
+
+def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Return True where the surfaces at ``si`` are cylinders."""
+    return si.shape.shape_type() == mi.UInt32(int(mi.ShapeType.Cylinder))
 
 
 # -------- Flat panes of glass

@@ -34,3 +34,22 @@ def test_a_ray_gets_on_beside_a_long_thin_triangle() -> None:
     assert (behind & found).sum() > 20
     assert (np.array(dr.dot(met.p - ray.o, ray.d))[found] >= 0).all()
     assert np.array_equal(np.array(met.p)[:, ~behind], np.array(plain.p)[:, ~behind])
+
+
+def test_light_inside_a_thin_rod_does_not_come_out_of_its_side() -> None:
+    """A rod of radius 2 at 380 mm: nothing behind it is seen from its points, and rays into it meet it again.
+
+    20000 points of one seed. (Planted: rays that start as far along their direction; 6 % of both.)
+    """
+    rod = {"type": "cylinder", "p0": [-3, -60, 378], "p1": [3, 60, 381], "radius": 2.0, "bsdf": {"type": "dielectric"}}
+    passage, rng = Passage(mi.load_dict({"type": "scene", "rod": rod})), np.random.default_rng(0)
+    aims = np.stack([rng.uniform(-1.8, 1.8, 20000), rng.uniform(-30, 30, 20000), np.full(20000, 379.5)])
+    si = passage.scene.ray_intersect(mi.Ray3f(mi.Point3f(0), dr.normalize(mi.Vector3f(aims))))
+    onward = rng.normal(size=(3, 20000))
+    direction = dr.normalize(mi.Vector3f(onward))
+    inward = np.array(si.is_valid() & (dr.dot(si.n, direction) < 0) & (dr.abs(direction.y) < 0.9))
+    seen, _ = passage.between(si, si.p + 100 * direction, mi.Bool(True))
+    met = passage.scene.ray_intersect(passage.onward(si, direction))
+    assert inward.sum() > 5000
+    assert np.array(seen)[inward].mean() < 1e-3
+    assert (~np.array(met.is_valid()))[inward].mean() < 1e-3
