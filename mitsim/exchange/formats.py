@@ -135,14 +135,13 @@ def check_export(
         able = ", ".join(name for name in FORMATS if name != PNG)
         raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
     for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
+        part = folder if is_mosaic(folder) else folder / line
+        manifest = read_manifest(part, RunManifest)
         if factors is not None:
             read_manifest(factors / line, CalibrationManifest)
+        if format == PNG:
+            _function("png_files.check_pictures")(manifest, projector, str(part))
     check_apart(place, [folder, *([factors] if factors else [])])
-    if projector is not None:
-        from mitsim.exchange.png_files import Raster
-
-        Raster.of(projector)
 
 
 def check_format(

@@ -1,4 +1,4 @@
-"""Runs and factors in, tensors out: a file for PyTorch, and a data set of folders.
+"""Runs and factors in, tensors out: a file for PyTorch.
 
 PyTorch is an extra (`pip install mitsim[torch]`), imported when it is used.
 """
@@ -6,7 +6,6 @@ PyTorch is an extra (`pip install mitsim[torch]`), imported when it is used.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, RunManifest
 from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture, load_run
+from mitsim.core.runs import Capture
 from mitsim.exchange.packed import FACTORS, Calibration, Packed, Run
 
 _PATTERNS = ("P_L", "P_R")
@@ -112,29 +111,3 @@ def measurements(shots: Capture) -> FloatArray:
     columns = shots.patterns[1].shape[1]
     frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
     return np.stack([frames[index] for index in sorted(frames)])
-
-
-class RunDataset:
-    """RUN folders as a map-style data set of PyTorch: item -> (x, y), read when it is asked for.
-
-    x is the truth, (1, n, n') relative to the board, y what was measured, (K K', rows, columns) electrons a second;
-    both of single precision.
-    """
-
-    def __init__(self, folders: Sequence[Path | str]) -> None:
-        """The data set of ``folders``. MitsimError where PyTorch is missing, or one is no complete run with a truth."""
-        self._torch = extra("torch")
-        self.runs = [load_run(folder) for folder in folders]
-        for shots in self.runs:
-            if TRUTH not in shots.files:
-                raise MitsimError(f"{shots.name}: has no {TRUTH}, so it cannot teach; leave it out")
-
-    def __len__(self) -> int:
-        return len(self.runs)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        shots = load_run(self.runs[index].folder or Path())  # anew, so that no item stays in memory
-        if shots.truth is None:
-            raise MitsimError(f"{shots.name}: has no {TRUTH}")
-        pair = shots.truth[None].astype(np.float32), measurements(shots).astype(np.float32)
-        return self._torch.from_numpy(pair[0]), self._torch.from_numpy(pair[1])

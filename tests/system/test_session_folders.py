@@ -211,6 +211,9 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
     frame = place / "run" / "frame_00003.exr"
     shutil.copytree(place / "run", place / "good")
     frame.write_bytes(frame.read_bytes()[:-5])
+    manifest = json.loads((shutil.copytree(place / "good", place / "imported") / "manifest.json").read_text())
+    del manifest["configuration"]["projector_model"]
+    (place / "imported" / "manifest.json").write_text(json.dumps(manifest))
     good = {**IMAGE, "run": "good"}
     for step, words in (
         ({"reconstruct": [good, {**IMAGE, "output": "b"}]}, "checksum differs"),
@@ -218,6 +221,7 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
         ({"reconstruct": [good, {**good, "output": "b", "margin": 900}]}, "margin"),
         ({"reconstruct": [good], "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}]}, "checksum differs"),
         ({"reconstruct": [good], "export": [{"format": "png", "run": "good", "output": "p", "projector": "no"}]}, "no"),
+        ({"reconstruct": [good], "export": [{"format": "png", "run": "imported", "output": "p"}]}, "imported frames"),
         ({"reconstruct": [good], "study": [{"name": "no such"}]}, "no such"),
     ):
         with pytest.raises(ms.MitsimError) as refused:

@@ -10,9 +10,8 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.exchange import tensors
 from mitsim.exchange.formats import export
-from tests.exchanged import COLUMNS, ROWS, SCENE, made
+from tests.exchanged import made
 
 
 def test_a_missing_package_is_told_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,14 +51,3 @@ def test_a_full_disk_is_told_in_a_line(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "\n" not in str(told.value) and not (tmp_path / "run.pt").exists()
-
-
-def test_folders_are_a_data_set(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch")
-    runs = [made(tmp_path / name).run for name in "ab"]
-    data = tensors.RunDataset(runs)
-    x, y = next(iter(torch.utils.data.DataLoader(data, batch_size=2)))
-    assert x.shape == (2, 1, *SCENE) and y.shape == (2, 6, ROWS, COLUMNS) and len(data) == 2
-    (runs[1] / "truth.exr").unlink()
-    with pytest.raises(MitsimError, match="has no truth"):
-        tensors.RunDataset(runs)

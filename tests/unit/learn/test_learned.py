@@ -29,7 +29,7 @@ from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import CLASSES
 from mitsim.learn.networks import LEVELS, WAYS, UNet, has_half
-from mitsim.learn.training import PairDataset, train_network
+from mitsim.learn.training import train_network
 from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -361,13 +361,6 @@ def test_the_rate_goes_over_one_cycle() -> None:
     rates = [training.Trainer.rate(trainer, number) for number in range(1000)]
     assert max(rates) == pytest.approx(1e-3, rel=0.01) and 100 < int(np.argmax(rates)) < 200
     assert rates[0] < 1e-5 and rates[-1] < 1e-8 and np.mean(rates) == pytest.approx(0.5e-3, rel=1e-3)
-
-
-def test_pairs_are_a_data_set_of_torch() -> None:
-    store = FakeStore(8, "dots:2")
-    frames, truths = next(iter(torch.utils.data.DataLoader(PairDataset(store), batch_size=3)))
-    assert frames.shape == (3, 4, 96, 96) and truths.shape == (3, 1, 16, 16)
-    assert_array_equal(truths[1, 0], store.truth(1))
 
 
 @pytest.mark.parametrize(("count", "files"), [(24, 24), (64, 40), (100, 3), (2000, 2000), (1200, 12), (9, 8)])
