@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import reprlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -214,8 +215,11 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any, above: Place = ())
     holder, rule = _holder(model, place[:-1]), problem["msg"][0].lower() + problem["msg"][1:]
     rules = holder.model_json_schema()["properties"].get(place[-1]) if holder and place else None
     allowed = allowed_text(rules).replace("`", "").removesuffix(", null") if rules else "anything"
-    if allowed not in ("anything", "object"):
-        rule = f"give {allowed}"
+    kind = {"int": "a whole number, ", "flo": "a number, "}.get(problem["type"][:3], "")
+    if problem["type"] == "literal_error":
+        rule = f"give {problem['ctx']['expected']}"
+    elif allowed not in ("anything", "object"):
+        rule = "give " + (f"a {allowed}" if re.match("whole|number|list", allowed) else kind + allowed)
     return f"{field or 'contents'}: got {value}; {rule}{_about(model, place[:-1], place[-1:])}"
 
 
