@@ -18,7 +18,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
 from mitsim.exchange.capture_list import CaptureList, RealCapture
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.exchange.real import import_capture
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 from tests.unit.exchange.test_real import known
@@ -71,20 +70,6 @@ def test_folders_come_back_to_the_byte_by_hdf5(coloured: Coloured, tmp_path: Pat
     assert whole(tmp_path / "run 2") == whole(coloured.run)
     assert whole(tmp_path / "cal 2") == whole(coloured.calibration)
     assert payload["frames"] == result["frames"] == 18 and result["holds"] == ["run", "calibration"]
-
-
-def test_a_line_is_read_where_it_lies(coloured: Coloured, tmp_path: Path) -> None:
-    export(coloured.run, "hdf5", tmp_path / "all.h5", coloured.calibration)
-    with open_hdf5(tmp_path / "all.h5", "520nm") as file:
-        assert np.array_equal(file.shots.dn, ms.load_run(coloured.run / "520nm").dn)
-        assert file.factors is not None
-        assert np.array_equal(file.factors.left, ms.load_calibration(coloured.calibration / "520nm").left)
-    for line in (None, "521nm"):
-        with pytest.raises(MitsimError, match=r"638nm, 520nm, 445.5nm; give one"), open_hdf5(tmp_path / "all.h5", line):
-            pass
-    export(coloured.run / "520nm", "hdf5", tmp_path / "one.h5")
-    with pytest.raises(MitsimError, match="no lines; leave it out"), open_hdf5(tmp_path / "one.h5", "520nm"):
-        pass
 
 
 def test_folders_come_back_by_mat(coloured: Coloured, tmp_path: Path) -> None:

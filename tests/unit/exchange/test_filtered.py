@@ -15,7 +15,6 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.reconstruct.colour import behind
 from tests.coloured import WEIGHTS, mosaic_folders
 from tests.unit.exchange.test_coloured import octave, whole
@@ -98,17 +97,6 @@ save('-v7', 'again.mat', '-struct', 'a');
     import_file(tmp_path / "again.mat", tmp_path / "run", tmp_path / "cal")
     same_folders(tmp_path / "run", folders[0])
     assert whole(tmp_path / "cal") == whole(folders[1])
-
-
-def test_frames_and_factors_are_read_where_they_lie(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    export(folders[0], "hdf5", tmp_path / "all.h5", folders[1])
-    with open_hdf5(tmp_path / "all.h5") as file:
-        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is None
-    with open_hdf5(tmp_path / "all.h5", "520nm") as file:
-        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is not None
-        assert np.array_equal(file.factors.left, ms.load_calibration(folders[1] / "520nm").left)
-    with pytest.raises(MitsimError, match="has 638nm, 520nm, 445nm; give one"), open_hdf5(tmp_path / "all.h5", "521nm"):
-        pass
 
 
 def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) -> None:
