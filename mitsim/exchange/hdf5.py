@@ -104,8 +104,10 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
 
 @contextmanager
 def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
-    """Open all of the file ``path`` while the context lasts. MitsimError as :func:`open_folders`, and for a ``channel``,
-    because its frames have one."""
+    """Open all of the file ``path`` while the context lasts.
+
+    MitsimError as :func:`open_folders`, and for a ``channel``, because its frames have one.
+    """
     if channel is not None:
         raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
     with open_folders(path) as (run, calibration):

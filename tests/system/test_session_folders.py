@@ -54,7 +54,7 @@ def test_arguments_are_not_changed(place: Path) -> None:
 
 
 def test_mappings_of_public_functions_are_not_changed(place: Path) -> None:
-    """Every public call that takes mappings leaves them as they were."""
+    """Every public call that takes mappings leaves them as they were. (Planted: `more` that takes checksums in.)"""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     stages, more, effects = {"read": 1.0, "total": 2.0}, {"note": {"a": [1]}}, {"diffraction": False}
@@ -171,7 +171,8 @@ def kill(file: str, *arguments: str) -> None:
 def test_an_image_in_colour_that_was_killed_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
 ) -> None:
-    """By the same call, bit for bit; until then it has no page. Another folder is refused, and stays as it is."""
+    """By the same call, bit for bit; until then it has no page. A refusal leaves nothing. (Planted: colour.json
+    written last.)"""
     run, calibration = folders(tmp_path)
     monkeypatch.chdir(tmp_path)
     kill(file, "reconstruct", str(run), "--calibration", str(calibration))
@@ -200,7 +201,8 @@ def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: s
 
 
 def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
-    """An image that was killed is made by the same call, but no image of other inputs, and it has no page."""
+    """An image that was killed is made by the same call, but no image of other inputs, and it has no page.
+    (Planted: no head before its files.)"""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     image.save("image")
@@ -224,7 +226,7 @@ def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
     ],
 )
 def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change: dict[str, Any]) -> None:
-    """Each wrong kind is refused in one line."""
+    """Each wrong kind is refused in one line. (Planted: entries that are taken as they are.)"""
     tables = {"reconstruct": [{**IMAGE}]}
     ms.run(tables, "out", pictures=False)
     held = json.loads((place / "out" / "session.json").read_text())
@@ -236,7 +238,8 @@ def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change:
 
 
 def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
-    """Folders and files that steps read are looked into before the first of them works."""
+    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests alone; pictures
+    without their projector.)"""
     frame = place / "run" / "frame_00003.exr"
     shutil.copytree(place / "run", place / "good")
     frame.write_bytes(frame.read_bytes()[:-5])
