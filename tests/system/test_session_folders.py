@@ -238,8 +238,8 @@ def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change:
 
 
 def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
-    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests alone; pictures
-    without their projector.)"""
+    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests
+    alone; pictures without their projector.)"""
     frame = place / "run" / "frame_00003.exr"
     shutil.copytree(place / "run", place / "good")
     frame.write_bytes(frame.read_bytes()[:-5])
