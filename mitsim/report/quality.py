@@ -195,7 +195,9 @@ def reconstruct_colours(
         try:
             images = {
                 name: reconstruct(
-                    *(place / name for place in (run, calibration, folder)),
+                    run / name,
+                    calibration / name,
+                    folder / name,
                     overwrite=overwrite,
                     job=job.apart(f"{name} "),
                     **options,
