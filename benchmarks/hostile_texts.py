@@ -524,7 +524,7 @@ def manifests(good: Good) -> Make:
             )
         else:
             path.write_bytes(json_text_changed(text, chance))
-        formats = (("hdf5", ".h5"), ("mat", ".mat"), ("flatcam", ""), ("deepinv", ""), ("torch", ".pt"))
+        formats = (("hdf5", ".h5"), ("mat", ".mat"), ("torch", ".pt"))
         kind, ending = chance.choice(formats)
         listed, png = folder / "patterns.json", str(good.folder / "a.png")
         listed.write_bytes(json_text_changed(shown, chance))
@@ -775,7 +775,7 @@ def steps(good: Good) -> Make:
             "output": chance.choice(("image", "Report.HTML", "./pictures", "\x1b[2J", "a\nb", "\U0001f600", "x" * 300)),
             "run": chance.choice(("cal", "nosuch", ".", "run/manifest.json", "run\u0000")),
             "calibration": chance.choice(("run", "nosuch", "")),
-            "format": chance.choice(("png", "mat", "flatcam", "torch", "deepinv", "xyz", "hdf5")),
+            "format": chance.choice(("png", "mat", "torch", "xyz", "hdf5")),
             "projector": chance.choice(("mp_cl1", "nosuch", "run", "")),
             "chart": chance.choice(("nosuch", "colour_chart")),
         }

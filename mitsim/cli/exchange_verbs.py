@@ -43,7 +43,7 @@ class Exported:
 
     PANEL = OUTPUT
 
-    format: str = option(..., "hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")
+    format: str = option(..., "hdf5, mat, torch or png", metavar="FORMAT")
     output: Path = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE")
     calibration: Path | None = option(
         None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", rich_help_panel=WHAT

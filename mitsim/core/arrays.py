@@ -240,7 +240,9 @@ def checked_hdf5(path: Path, copies: Callable[[Any], float], known: set[object] 
             elif isinstance(item, h5py.Dataset) and item.shape is not None:
                 filters, chunk, kind = item.id.get_create_plist(), item.chunks, item.dtype
                 used = [filters.get_filter(index)[0] for index in range(filters.get_nfilters())]
-                pieces = math.prod(-(-side // part) for side, part in zip(item.shape, chunk or item.shape, strict=True))
+                pieces = (
+                    math.prod(-(-side // part) for side, part in zip(item.shape, chunk, strict=True)) if chunk else 0
+                )
                 # What was never stored is read as the fill value: black frames, of any size.
                 stored = item.id.get_num_chunks() == pieces if chunk else item.id.get_storage_size() >= item.nbytes
                 wrong = {

@@ -227,6 +227,8 @@ MAGIC = b"\x76\x2f\x31\x01"
 """First bytes of every OpenEXR file."""
 _ATTRIBUTE = re.compile(rb"[^\0]{1,255}\0[^\0]{1,255}\0(.{4})", re.DOTALL)
 """Name, type and length of an attribute, after the document "OpenEXR File Layout" (openexr.com)."""
+_CHANNEL = re.compile(rb"[^\0]{1,255}\0([\0-\2])\0{3}.{12}", re.DOTALL)
+"""Name and type of a channel in the attribute `channels`."""
 _HEADER_BYTES = 1 << 18
 """Far more than the header of a frame; a list of channels that fits takes 0.15 s."""
 _LARGEST_RATIO = 1100
@@ -241,11 +243,12 @@ _MOST_CHANNELS = 64
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """Size in pixels and number of channels of a plain scan-line image."""
+    """Size in pixels, number of channels and their types (uint, half, float) of a plain scan-line image."""
 
     width: int
     height: int
     channels: int
+    types: frozenset[str]
 
 
 def read_header(path: Path) -> ExrHeader:
@@ -264,9 +267,10 @@ def read_header(path: Path) -> ExrHeader:
         start = file.read(_HEADER_BYTES)
     if not start.startswith(MAGIC) or len(start) < 8:
         raise ValueError(f"not an OpenEXR file (first bytes {start[:4]!r})")
-    place = 8
+    place, listed = 8, b""
     while attribute := _ATTRIBUTE.match(start, place):
-        place = attribute.end() + int.from_bytes(attribute[1], "little")
+        begin, place = attribute.end(), attribute.end() + int.from_bytes(attribute[1], "little")
+        listed = start[begin:place] if attribute[0].startswith(b"channels\0") else listed
     if start[place : place + 1] != b"\0":
         raise ValueError("its header is damaged, cut short, or over 256 KiB long")
     try:
@@ -296,4 +300,5 @@ def read_header(path: Path) -> ExrHeader:
         smallest = max(smallest - _SMALL, 0) // _LARGEST_RATIO
     if decoded > _MOST_BYTES or smallest >= size:
         raise ValueError(f"claims {width}x{height} pixels of {len(channels)} channels, more than its {size} bytes hold")
-    return ExrHeader(width, height, len(channels))
+    types = frozenset(("uint", "half", "float")[code[0]] for code in _CHANNEL.findall(listed))
+    return ExrHeader(width, height, len(channels), types)

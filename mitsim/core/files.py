@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -89,11 +90,13 @@ def remove_page(folder: Path) -> None:
 
 _PART = ".*.part"
 """What files are called while they are written; a killed process leaves them behind."""
+_UNFINISHED = ".mitsim.part"
+"""Mark of a folder whose files appear together, until they are all there."""
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed processes left half-written in a ``folder`` that this one holds."""
-    for part in folder.glob(_PART):
+    """Remove what killed processes left half-written in a ``folder`` that this one holds, and among its pictures."""
+    for part in (*folder.glob(_PART), *(folder / PICTURES).glob(_PART)):
         part.unlink(missing_ok=True)
 
 
@@ -185,7 +188,11 @@ def output_file(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     MitsimError as for :func:`prepare_output`, and when another process holds the file.
     """
     path = prepare_output(path, overwrite, "file")
-    with _lock(path, _beside(resolve(path), LOCK)):
+    target = resolve(path)
+    with _lock(path, _beside(target, LOCK)):
+        own = re.compile(re.escape(_beside(target, "").name) + r"\.[0-9]+-[0-9]+\.part")
+        for part in filter(lambda each: own.fullmatch(each.name), target.parent.glob(_PART)):  # of killed processes
+            part.unlink(missing_ok=True)
         yield prepare_output(path, overwrite, "file")  # nobody wrote it between the first look and the lock
 
 
@@ -213,18 +220,28 @@ def check_apart(path: Path | str, inputs: Iterable[Path | str]) -> None:
 
 @contextmanager
 def whole_folder(path: Path | str) -> Iterator[Path]:
-    """The new or empty folder ``path``, for files that appear together: after an error none of them is left.
+    """The new or empty folder ``path``, for files that appear together: after an error none of them is left, and what
+    a killed process left is removed by the next.
 
     MitsimError as for :func:`output_folder`.
     """
+    if (Path(path) / _UNFINISHED).is_file():
+        with _lock(Path(path), Path(path) / LOCK):
+            _empty(Path(path))
     with output_folder(path) as folder:
+        (folder / _UNFINISHED).touch()
         try:
             yield folder
         except BaseException:
-            for item in folder.iterdir():
-                if item.name != LOCK:
-                    shutil.rmtree(item) if item.is_dir() and not item.is_symlink() else item.unlink()
+            _empty(folder)
             raise
+        (folder / _UNFINISHED).unlink(missing_ok=True)
+
+
+def _empty(folder: Path) -> None:
+    for item in sorted(folder.iterdir(), key=lambda item: item.name == _UNFINISHED):  # the mark last
+        if item.name != LOCK:
+            shutil.rmtree(item) if item.is_dir() and not item.is_symlink() else item.unlink()
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
-import functools
 import math
+import re
 import reprlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,8 +11,8 @@ from typing import Any, get_args
 
 import pydantic
 
-from mitsim.core.errors import MitsimError, cut
-from mitsim.core.field_docs import meanings
+from mitsim.core.errors import MitsimError, cut, near_name
+from mitsim.core.field_docs import allowed_text, meanings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -159,7 +158,7 @@ def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationErro
     found = [one for one in found if not (one["type"] == "too_short" and _within(one["loc"], found))]
     problems = {_place_in(data, problem): problem for problem in reversed(found)}
     wrong: list[Mistake] = []
-    meant: set[Place] = set()
+    meant, unknown = set[Place](), 0
     missing: dict[Place, list[str]] = {}
     for place, problem in reversed(problems.items()):
         if problem["type"] == "missing":
@@ -167,9 +166,9 @@ def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationErro
             continue
         text = _complaint(model, problem, above)
         if problem["type"] == "extra_forbidden":
-            near = _near_field(model, place)
-            meant.add((*place[:-1], near))
-            wrong.insert(len(meant) - 1, (line_of(place), text))
+            meant |= {(*place[:-1], text.rpartition("did you mean ")[2].rstrip("?"))}
+            wrong.insert(unknown, (line_of(place), text))
+            unknown += 1
         else:
             wrong.append((line_of(place), text))
     for place, names in missing.items():
@@ -201,19 +200,6 @@ def _place_in(data: object, problem: Any) -> Place:
     return place
 
 
-_KINDS = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "string_type": "text in quotes",
-    "bool_type": "true or false",
-    "finite_number": "a finite number",
-}
-"""What is allowed, by pydantic's name of the rule that is broken."""
-_ENDS = "greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"
-"""Rules that the range of a number tells."""
-
-
 def _complaint(model: type[pydantic.BaseModel], problem: Any, above: Place = ()) -> str:
     """Field, value and rule of one problem that pydantic found, in tables that are ``above`` the model's."""
     place = problem["loc"]
@@ -222,21 +208,18 @@ def _complaint(model: type[pydantic.BaseModel], problem: Any, above: Place = ())
         return f"{field}: {problem['ctx']['error']}" if field else str(problem["ctx"]["error"])
     value = _short_text(problem["input"])
     if problem["type"] == "extra_forbidden":
-        near = _near_field(model, place)
         fields = getattr(_holder(model, place[:-1]), "model_fields", ())
-        hint = (
-            f"; did you mean {near}?" if near else f"; known fields: {', '.join(fields)}" if fields else "; remove it"
-        )
+        near = near_name(str(place[-1]), fields).strip()
+        hint = "; " + (near or (f"known fields: {', '.join(fields)}" if fields else "remove it"))
         return f"{field}: got {value}, no such field{hint}"
-    rule, ends = problem["msg"][0].lower() + problem["msg"][1:], _range(model, place)
-    if problem["type"] in _ENDS and ends:
-        rule = f"give {ends}"
-    elif problem["type"] in _KINDS:
-        rule = f"give {_KINDS[problem['type']]}{', ' + ends if ends else ''}"
-    elif problem["type"] == "literal_error":
+    holder, rule = _holder(model, place[:-1]), problem["msg"][0].lower() + problem["msg"][1:]
+    rules = holder.model_json_schema()["properties"].get(place[-1]) if holder and place else None
+    allowed = allowed_text(rules).replace("`", "").removesuffix(", null") if rules else "anything"
+    kind = {"int": "a whole number, ", "flo": "a number, "}.get(problem["type"][:3], "")
+    if problem["type"] == "literal_error":
         rule = f"give {problem['ctx']['expected']}"
-    elif problem["type"] == "string_pattern_mismatch" and "/" in problem["ctx"]["pattern"]:
-        rule = "give a name without folders"
+    elif allowed not in ("anything", "object"):
+        rule = "give " + (f"a {allowed}" if re.match("whole|number|list", allowed) else kind + allowed)
     return f"{field or 'contents'}: got {value}; {rule}{_about(model, place[:-1], place[-1:])}"
 
 
@@ -245,13 +228,6 @@ def _about(model: type[pydantic.BaseModel], place: Place, names: Sequence[str | 
     holder = _holder(model, place)
     meaning = meanings(holder).get(str(names[0])) if holder and len(names) == 1 else None
     return f" ({meaning})" if meaning else ""
-
-
-@functools.cache
-def _near_field(model: type[pydantic.BaseModel], place: Place) -> str:
-    """The field that the unknown name at the end of a ``place`` may mean; empty without one."""
-    fields = getattr(_holder(model, place[:-1]), "model_fields", ())
-    return next(iter(difflib.get_close_matches(str(place[-1]), [*fields], 1)), "")
 
 
 def _holder(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.BaseModel] | None:
@@ -266,24 +242,6 @@ def _holder(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.Base
                 return None
             model = models[0]
     return model
-
-
-def _range(model: Any, location: Place) -> str:
-    """What a number at ``location`` of a model may be, where it has two ends."""
-    marks: list[Any] = []
-    for part in location:
-        holders = (getattr(kind, "model_fields", {}) for kind in (model, *get_args(model)))  # a part may be optional
-        field = next((fields[part] for fields in holders if part in fields), None)
-        if field is None:
-            return ""
-        model, marks = field.annotation, field.metadata
-    ends = {name: getattr(mark, name) for mark in marks for name in ("ge", "gt", "le", "lt") if hasattr(mark, name)}
-    if len(ends) != 2:
-        return ""
-    low, high = (f"{end:g}" for end in ends.values())
-    if low == high:
-        return low
-    return f"{'above ' if 'gt' in ends else ''}{low} to {'below ' if 'lt' in ends else ''}{high}"
 
 
 def _short_text(value: object) -> str:

@@ -476,34 +476,6 @@ def sensor_table(path: Path | str) -> Table:
     return table
 
 
-def paper_sensor(full_well_e: float, gain: float, dynamic_range_db: float) -> SensorModel:
-    """The noise model of Zheng & Asif (arXiv 2111.12862, simulation setup) as a preset of the same chain.
-
-    Y_n = G/F (Poisson(F/G Y) + N(0, s^2)) with s = F 10^(-R/20): a measurement Y (0 to G) is F/G Y
-    electrons, and the output is in the unit of Y. It neither clips at the full well nor quantises, so
-    `full_well_e` is infinite here and F sets only gain and noise; expected electrons are `measurement /
-    model.gain_dn_per_e`. The pitch is the binned one of the paper's camera and plays no part in the noise.
-
-    Parameters
-    ----------
-    full_well_e
-        F, electrons of the largest measurement.
-    gain
-        G, the largest measurement.
-    dynamic_range_db
-        R, of F over the read noise.
-    """
-    return SensorModel(
-        name="paper noise model",
-        pixel_pitch_um=11.72,
-        full_well_e=math.inf,
-        read_noise_e=full_well_e * 10 ** (-dynamic_range_db / 20),
-        quantum_efficiency=1.0,
-        gain_dn_per_e=gain / full_well_e,
-        source=f"arXiv 2111.12862, noise model with F={full_well_e}, G={gain}, R={dynamic_range_db} dB",
-    )
-
-
 # -------- How digital numbers become electrons a second
 
 

@@ -35,47 +35,20 @@ if TYPE_CHECKING:
     from mitsim.exchange.packed import Run
 
 
-@dataclass(frozen=True)
-class Format:
-    """A format that runs are exported to.
-
-    Attributes
-    ----------
-    what
-        that a user gets, in a few words.
-    kind
-        whether it is one file or a folder.
-    calibration
-        whether a calibration is needed, or may be given.
-    writer
-        module of this room and function: from the place, the run (of one line, coloured or behind filters), and its
-        ``calibration`` or, where the format has none, a ``projector``'s name, to sentences on what of the run the
-        format does not hold, or how it is used.
-    filters
-        whether it holds runs behind colour filters.
-    """
-
-    what: str
-    kind: Literal["file", "folder"]
-    calibration: Literal["needed", "optional", "none"]
-    writer: str
-    filters: bool = True
-
-
-FORMATS: dict[str, Format] = {
-    "hdf5": Format("one HDF5 file, all of RUN and CAL", "file", "optional", "hdf5.write_hdf5"),
-    "mat": Format("the paper's variables, for MATLAB and Octave", "file", "optional", "matlab.write_matlab"),
-    "flatcam": Format("FlatCam's variables, for its scripts", "file", "needed", "matlab.write_flatcam", False),
-    "deepinv": Format("tensors of a deepinv physics", "file", "needed", "tensors.write_deepinv"),
-    "torch": Format("tensors for torch.load", "file", "optional", "tensors.write_tensors"),
-    "png": Format("pictures of frames, patterns for a real projector", "folder", "none", "png_files.write_pngs", False),
+FORMATS = {
+    "hdf5": "hdf5.write_hdf5",
+    "mat": "matlab.write_matlab",
+    "torch": "tensors.write_tensors",
+    "png": "png_files.write_pngs",
 }
-"""Formats by the name that `--format` takes."""
+"""Modules of this room and functions that write a format, by the name that `--format` takes: from the place, the run
+(of one line, coloured or behind filters), and its ``calibration`` or a ``projector``'s name, to sentences on what of
+the run the format does not hold, or how it is used."""
+PNG = "png"
+"""The format that is a folder in place of a file. It alone holds no calibration and no run behind colour filters."""
 READERS = {".h5": "hdf5.load_hdf5", ".hdf5": "hdf5.load_hdf5", ".mat": "matlab.load_mat"}
 """What opens a file that `mitsim import` takes, by the end of its name: from the place and a channel to a context of
 :class:`mitsim.exchange.packed.Loaded`."""
-_ENDINGS = {".h5": ("hdf5",), ".hdf5": ("hdf5",), ".mat": ("mat", "flatcam")}
-"""Formats by how names end that `mitsim import` takes them by."""
 _CALLED = {"output": "run", "calibration_output": "calibration"}
 """What the folder of an argument is, in messages."""
 
@@ -124,14 +97,14 @@ def export(
         called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
         format cannot hold.
     """
-    chosen = check_export(run, format, output, calibration, projector)
+    check_export(run, format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    with output_file(place, overwrite) if chosen.kind == "file" else nullcontext():
+    with nullcontext() if format == PNG else output_file(place, overwrite):
         from mitsim.exchange.packed import calibration_content, run_content
 
         shots, calibrated = run_content(folder), None if factors is None else calibration_content(factors)
-        options = {"projector": projector} if chosen.calibration == "none" else {"calibration": calibrated}
-        notes = _function(chosen.writer)(place, shots, **options)
+        options = {"projector": projector} if format == PNG else {"calibration": calibrated}
+        notes = _function(FORMATS[format])(place, shots, **options)
     return {
         "format": format,
         "frames": _frames_of(shots),
@@ -147,36 +120,34 @@ def check_export(
     output: Path | str,
     calibration: Path | str | None = None,
     projector: str | None = None,
-) -> Format:
-    """Return the format of an :func:`export`; what that refuses before it writes is refused here.
+) -> None:
+    """Refuse what :func:`export` refuses before it writes.
 
     Parameters
     ----------
     run, format, output, calibration, projector
         as there.
     """
-    chosen = check_format(format, output, calibration, projector)
+    check_format(format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
     lines = _lines(folder, factors)
-    if is_mosaic(folder) and not chosen.filters:
-        able = ", ".join(name for name, other in FORMATS.items() if other.filters)
+    if is_mosaic(folder) and format == PNG:
+        able = ", ".join(name for name in FORMATS if name != PNG)
         raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
     for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
+        part = folder if is_mosaic(folder) else folder / line
+        manifest = read_manifest(part, RunManifest)
         if factors is not None:
             read_manifest(factors / line, CalibrationManifest)
+        if format == PNG:
+            _function("png_files.check_pictures")(manifest, projector, str(part))
     check_apart(place, [folder, *([factors] if factors else [])])
-    if projector is not None:
-        from mitsim.exchange.png_files import Raster
-
-        Raster.of(projector)
-    return chosen
 
 
 def check_format(
     format: str, output: Path | str, calibration: Path | str | None = None, projector: str | None = None
-) -> Format:
-    """The format of a name; what :func:`export` refuses before it looks into a folder is refused here.
+) -> None:
+    """Refuse what :func:`export` refuses before it looks into a folder.
 
     Parameters
     ----------
@@ -185,18 +156,14 @@ def check_format(
     """
     if format not in FORMATS:
         raise ArgumentError("format", f"{format!r}: use {', '.join(FORMATS)}")
-    chosen, place = FORMATS[format], Path(output)
-    if projector is not None and format != "png":
+    if projector is not None and format != PNG:
         raise ArgumentError("projector", f"{projector}: {format} draws no pictures for one; leave it out")
-    if calibration is None and chosen.calibration == "needed":
-        raise ArgumentError("calibration", f"is not given, and {format} is of its factors; give a folder of it")
-    if calibration is not None and chosen.calibration == "none":
+    if calibration is not None and format == PNG:
         raise ArgumentError("calibration", f"{calibration}: {format} holds none; leave it out")
-    if format not in _ENDINGS.get(ending := place.suffix.lower(), (format,)):
-        raise MitsimError(
-            f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
-        )
-    return chosen
+    ending = Path(output).suffix.lower()
+    if ending in READERS and FORMATS[format].partition(".")[0] != (reader := READERS[ending].partition(".")[0]):
+        right = next(name for name, writer in FORMATS.items() if writer.startswith(reader))
+        raise MitsimError(f"output {output}: {ending} is of {right}, not of {format}; rename it")
 
 
 def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:

@@ -6,9 +6,8 @@ The layout stands in docs/exchange.md. Shots are chunks of their own, so that on
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,6 @@ from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, fits_a_frame, parse_json
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import CalibrationManifest, RunManifest
 from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture
 from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN
 from mitsim.exchange.packed import (
     FACTORS,
@@ -41,7 +39,6 @@ from mitsim.version import __version__
 if TYPE_CHECKING:
     import h5py
 
-    from mitsim.reconstruct.factors import Factors
 
 _LINES = "lines"
 """Group that has a group of each line."""
@@ -86,56 +83,12 @@ def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> 
     return ()
 
 
-@dataclass(frozen=True, eq=False)
-class ExchangeFile:
-    """An HDF5 file of :func:`write_hdf5`, open for reading; frames are read when they are asked for.
-
-    Attributes
-    ----------
-    run
-        the capture's folder, as it was.
-    calibration
-        the calibration's, where the file holds one.
-    """
-
-    run: Packed[RunManifest]
-    calibration: Packed[CalibrationManifest] | None
-
-    @property
-    def shots(self) -> Capture:
-        """The capture, its frames left in the file."""
-        return Capture(self.run.manifest, None, _Lazily(self.run))
-
-    @property
-    def factors(self) -> Factors | None:
-        """The calibration's factors, where the file holds them."""
-        if self.calibration is None:
-            return None
-        from mitsim.reconstruct.factors import factors_of
-
-        return factors_of(self.calibration.manifest, self.calibration.read, str(self.calibration.place))
-
-
-@contextmanager
-def open_hdf5(path: Path | str, line: str | None = None) -> Iterator[ExchangeFile]:
-    """The file ``path`` of :func:`write_hdf5`, or one ``line`` of it where it holds several, while the context lasts.
-    Behind colour filters the run is that of all lines, and a ``line`` is needed for its calibration alone.
-
-    MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a line that it
-    does not have.
-    """
-    with open_folders(path) as (run, calibration):
-        name = line or ""
-        if name not in {*run.parts, *run.names}:
-            lines = ", ".join(filter(None, run.names))
-            known = f"{lines}; give one" if lines else "no lines; leave it out"
-            raise ArgumentError("line", f"{line!r}: {path} has {known}")
-        yield ExchangeFile(run.of_line(name), calibration.parts.get(name) if calibration else None)
-
-
 @contextmanager
 def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
-    """The folders in the file ``path``, coloured or not, while the context lasts. MitsimError as :func:`open_hdf5`."""
+    """The folders in the file ``path``, coloured or not, while the context lasts.
+
+    MitsimError for a file that is missing or damaged, is none of these, or leads to other files.
+    """
     path = Path(path)
     with checked_hdf5(path, lambda _: 0.0) as file:  # _whole checks what is read at once
         with hdf5_errors(path):
@@ -151,8 +104,10 @@ def open_folders(path: Path | str) -> Iterator[tuple[Run, Calibration | None]]:
 
 @contextmanager
 def load_hdf5(path: Path, channel: str | None) -> Iterator[Loaded]:
-    """All of the file ``path``, while the context lasts. MitsimError as :func:`open_hdf5`, and for a ``channel``: its
-    frames have one."""
+    """Open all of the file ``path`` while the context lasts.
+
+    MitsimError as :func:`open_folders`, and for a ``channel``, because its frames have one.
+    """
     if channel is not None:
         raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
     with open_folders(path) as (run, calibration):
@@ -191,24 +146,6 @@ def read_matlab(path: Path) -> dict[str, Any]:
                 text = known == _LETTERS
                 found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
     return found
-
-
-class _Lazily(Mapping[str, tuple[Channels, Metadata]]):
-    """Files of a folder by name, read at every look."""
-
-    def __init__(self, packed: Packed[RunManifest]) -> None:
-        self._packed = packed
-
-    def __getitem__(self, name: str) -> tuple[Channels, Metadata]:
-        if name not in self._packed.names:
-            raise KeyError(name)
-        return self._packed.read(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys(self._packed.names))
-
-    def __len__(self) -> int:
-        return len(dict.fromkeys(self._packed.names))
 
 
 def _write_run(place: h5py.Group, run: Packed[RunManifest]) -> None:

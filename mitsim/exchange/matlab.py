@@ -3,14 +3,9 @@
 With the variables of the paper's public script `phi_left` (P o X) `phi_right`' = `data_coded` - `measBg` in digital
 numbers, for each pattern P = PL(:, i) PR(:, j)' (Zheng & Asif, arXiv 2111.12862, section III-B).
 
-With FlatCam's: it (Asif et al. 2017, arXiv 1509.00116) has a colour sensor and calibrates each of its four planes: a
-plane of a frame, less the means of its rows and columns, is P1 X Q1^T. The loader of
-https://github.com/tanjasper/flatcam takes plane b from row 0 and column 0 on, every second one, gb from (0, 1), gr from
-(1, 0), r from (1, 1). A monochrome frame has the same four planes, whose factors are every second row of both. A
-coloured run has a whole frame of each line: it is a plane of a frame of twice the rows and columns, so that nothing is
-left out.
-
-Files that are written are of version 5, which SciPy, GNU Octave and every MATLAB read; version 7.3 is read, too.
+Files that are written are of version 5, which SciPy, GNU Octave and every MATLAB read; version 7.3 is read, too. The
+calibration of a real FlatCam (Asif et al. 2017, arXiv 1509.00116) is read: a plane of its colour sensor, less the
+means of its rows and columns, is P1 X Q1^T.
 """
 
 from __future__ import annotations
@@ -31,10 +26,10 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray, is_hdf5, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
-from mitsim.core.imagelist import ALL, BGGR, WAVELENGTHS_NM, check_channel, planes_of
+from mitsim.core.imagelist import ALL, WAVELENGTHS_NM, check_channel
 from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
 from mitsim.core.recorders import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, ColourManifest, lines_of_planes
+from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, lines_of_planes
 from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.hdf5 import read_matlab
 from mitsim.exchange.packed import (
@@ -51,8 +46,6 @@ from mitsim.exchange.packed import (
     unpack_run,
 )
 
-PLANES = planes_of(BGGR)
-"""First row and first column of each plane of a frame, as FlatCam has them."""
 ELECTRONS = "expected electrons of the frames"
 """What such a file does not hold of a simulated run."""
 Variables = dict[str, Any]
@@ -283,107 +276,12 @@ def _factors_in_dn(calibration: Packed[CalibrationManifest], digital: Digital) -
     return tuple(calibration.read(name)[0]["factor"].astype(np.float64) * root for name in FACTORS)
 
 
-# -------- Folders in, FlatCam's variables out
-
-_COLOURS = (("r",), ("gr", "gb"), ("b",))
-"""Planes of each colour, the longest wavelength first. Either green plane has the whole frame."""
-
-
-def write_flatcam(path: Path, run: Run, calibration: Calibration) -> tuple[str, ...]:
-    """Write a run with FlatCam's variables, whole or not at all; returns a sentence on what is left out.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    run
-        with frames of an even number of rows and columns; or of three lines, of which the longest is taken for red and
-        the shortest for blue, and each plane is the whole frame of a line.
-    calibration
-        that goes with it, of the same lines.
-
-    Raises
-    ------
-    MitsimError
-        for other frames or lines, lines that differ in the number or size of their frames, and more frames than such a
-        file holds.
-    """
-    if run.colours:
-        variables = _of_lines(path, run, run.colours, calibration)
-    else:
-        variables = _of_one(run.parts[""], calibration.parts[""])
-    write_variables(path, variables)
-    return (f"Left out: {ELECTRONS}",)
-
-
-def _of_one(run: Packed[RunManifest], calibration: Packed[CalibrationManifest]) -> Variables:
-    left, right = _factors_in_dn(calibration, run.manifest.digital)
-    if len(left) % 2 or len(right) % 2:
-        size = f"{len(left)}x{len(right)}"
-        raise MitsimError(f"{run.place}: frames are {size}; FlatCam's four planes need even sides, use mat")
-    meas = np.empty((len(left), len(right), len(run.manifest.patterns.captures)), order="F")
-    kind = _fill(meas, run)
-    factors = {name: (left[row::2], right[column::2]) for name, (row, column) in PLANES.items()}
-    return {"meas": meas, "dn_class": kind, **_plane_variables(factors), **_folder_variables(run, calibration)}
-
-
-def _of_lines(path: Path, run: Run, colours: ColourManifest, calibration: Calibration) -> Variables:
-    ends, planes = endings(colours.names, path), _lines_of_planes(colours, path)
-    counts = {name: len(run.parts[name].manifest.patterns.captures) for name in colours.names}
-    if len({*counts.values()}) > 1:
-        reported = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise MitsimError(f"{path}: frames are {reported}, but FlatCam's planes are of one frame; use mat")
-    sides = {name: _factors_in_dn(calibration.parts[name], shots.manifest.digital) for name, shots in run.parts.items()}
-    rows, columns = (len(side) for side in sides[planes["r"]])
-    meas, variables = (
-        np.empty((2 * rows, 2 * columns, counts[planes["r"]]), order="F"),
-        _colour_variables(run, calibration),
-    )
-    for plane, name in planes.items():
-        row, column = PLANES[plane]
-        kind = _fill(meas[row::2, column::2], run.parts[name])
-        own = {"dn_class": kind, **_folder_variables(run.parts[name], calibration.parts[name])}
-        variables.update({f"{key}{ends[name]}": values for key, values in own.items()})
-    return {**variables, "meas": meas, **_plane_variables({plane: sides[planes[plane]] for plane in PLANES})}
-
-
-def _lines_of_planes(colours: ColourManifest, path: Path) -> dict[str, str]:
-    """Name of the line that each plane is of."""
-    if len(colours.names) != len(_COLOURS):
-        raise MitsimError(
-            f"{path}: lines are {', '.join(colours.names)}; FlatCam has red, green and blue, so use mat, or export the "
-            "folder of a line"
-        )
-    by_length = sorted(colours.channels, key=lambda line: -line.wavelength_nm)
-    return {plane: line.name for line, planes in zip(by_length, _COLOURS, strict=True) for plane in planes}
-
-
-def _fill(meas: npt.NDArray[Any], run: Packed[RunManifest]) -> str:
-    """Put a run's frames into ``meas`` (rows, columns, shots); returns the type of their numbers."""
-    for index, (shot, channels, _) in enumerate(shots_of(run)):
-        if channels["DN"].shape != meas.shape[:2]:
-            rows, columns = meas.shape[:2]
-            raise MitsimError(f"{run.place / shot.file}: is not {rows}x{columns}, as the calibration; calibrate again")
-        meas[:, :, index] = channels["DN"]
-    return channels["DN"].dtype.name
-
-
-def _plane_variables(factors: Mapping[str, tuple[FloatArray, ...]]) -> Variables:
-    """FlatCam's variables of the left and right ``factors`` of each plane, which lose the means of their columns as
-    frames do."""
-    variables: Variables = {"angle": 0.0}
-    for plane, (left, right) in factors.items():
-        variables["cSize"] = np.array([[len(left), len(right)]], float)
-        variables.update({f"P1{plane}": left - left.mean(axis=0), f"Q1{plane}": right - right.mean(axis=0)})
-    return variables
-
-
 # -------- A file in, folders out
 
 
 @contextmanager
 def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
-    """Run and calibration in a MATLAB file of `mitsim export`, with the paper's variables or FlatCam's.
+    """Run and calibration in a MATLAB file of `mitsim export`.
 
     Parameters
     ----------
@@ -408,9 +306,8 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
 
 def _run_in(file: MatFile) -> tuple[Run, dict[str, MatFile]]:
     """The run in a ``file``, and what the file holds of each line."""
-    meas = _frames_in(file, "meas") if "meas" in file else None
     if COLOURED not in file:
-        shots = _run_part(file, meas)
+        shots = _run_part(file)
         if FILTERED not in file:
             return Content({"": shots}), {"": file}
         text = file.text(FILTERED)
@@ -420,32 +317,16 @@ def _run_in(file: MatFile) -> tuple[Run, dict[str, MatFile]]:
         return Content({"": shots}, colours, text, truths), lines
     text = file.text(COLOURED)
     colours = unpack_colours(text, RUN, file.path)
-    frames = (
-        {}
-        if meas is None
-        else {
-            name: meas[PLANES[plane][0] :: 2, PLANES[plane][1] :: 2]
-            for plane, name in _lines_of_planes(colours, file.path).items()
-        }
-    )
     lines = file.by_line(colours.names)
-    return Content({name: _run_part(own, frames.get(name)) for name, own in lines.items()}, colours, text), lines
+    return Content({name: _run_part(own) for name, own in lines.items()}, colours, text), lines
 
 
-def _frames_in(file: MatFile, name: str) -> npt.NDArray[Any]:
-    """The frames called ``name``, (rows, columns) and further axes."""
-    frames = np.asarray(file.values.get(name))
-    if frames.ndim < 2:
-        raise MitsimError(f"{file.path}: {name} is missing, or no frames; export it again")
-    return frames
-
-
-def _run_part(own: MatFile, meas: npt.NDArray[Any] | None) -> Packed[RunManifest]:
-    """The run of the variables ``own``, its frames in ``meas`` (rows, columns, shots), or, without it, `data_coded`."""
+def _run_part(own: MatFile) -> Packed[RunManifest]:
+    """Return the run of the variables ``own``."""
     text = own.text("run_manifest")
     manifest = unpack_run(text, own.path)
     captures, ambient, closing = manifest.patterns.captures, manifest.ambient_frame, manifest.closing_frame
-    frame = _frames_of_patterns(own, manifest) if meas is None else _frames_of_shots(own, meas, manifest)
+    frame = _frames_of_patterns(own, manifest)
     shots = {shot.file: shot for shot in captures}
     kind = np.float32 if own.text("dn_class") == "float32" else np.uint32
 
@@ -468,22 +349,16 @@ def _run_part(own: MatFile, meas: npt.NDArray[Any] | None) -> Packed[RunManifest
 def _frames_of_patterns(own: MatFile, manifest: RunManifest) -> Callable[[ShotFile], npt.NDArray[Any]]:
     """The frame of a shot in `data_coded`, (rows, columns, K, K')."""
     left, right = manifest.patterns.matrices
-    shape = *_frames_in(own, "data_coded").shape[:2], left.shape[1], right.shape[1]
+    coded = np.asarray(own.values.get("data_coded"))
+    if coded.ndim < 2:
+        raise MitsimError(f"{own.path}: data_coded is missing, or no frames; export it again")
+    shape = *coded.shape[:2], left.shape[1], right.shape[1]
     data = own.array("data_coded", shape)
     stacks = {0: data}
     if any(shot.sign for shot in manifest.patterns.captures):
         negative = own.array("data_negative", shape)
         stacks = {1: data + negative, -1: negative}
     return lambda shot: stacks[shot.sign][:, :, shot.row, shot.column]
-
-
-def _frames_of_shots(
-    own: MatFile, meas: npt.NDArray[Any], manifest: RunManifest
-) -> Callable[[ShotFile], npt.NDArray[Any]]:
-    """The frame of a shot in ``meas``, (rows, columns, shots)."""
-    index = {shot.file: number for number, shot in enumerate(manifest.patterns.captures)}
-    frames = MatFile(own.path, {"meas": meas}).array("meas", (*meas.shape[:2], len(manifest.patterns.captures)))
-    return lambda shot: frames[:, :, index[shot.file]]
 
 
 def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Channel:

@@ -425,7 +425,7 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
         for numbers that PNG cannot hold, patterns that are not of 0, 1 and -1, or a projector of unknown or too few
         pixels.
     """
-    rasters = {name: _raster(shots, projector) for name, shots in run.parts.items()}
+    rasters = {name: check_pictures(shots.manifest, projector, str(shots.place)) for name, shots in run.parts.items()}
     with whole_folder(folder) as place:
         for name, shots in run.parts.items():
             (place / name).mkdir(exist_ok=True)
@@ -474,9 +474,26 @@ def _read_again(folder: Path, line: str, manifest: RunManifest) -> str:
     return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
 
 
-def _raster(run: Packed[RunManifest], projector: str | None) -> Raster:
-    """That of the ``projector``, or of the one that took part in the ``run``."""
-    if projector is not None:
-        return Raster.of(projector)
-    known = run.manifest.configuration.get("projector_model")
-    return Raster.of_projector(known if isinstance(known, dict) else {})
+def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> Raster:
+    """Return the raster that a run's pictures are drawn for.
+
+    Parameters
+    ----------
+    manifest
+        of the run.
+    projector
+        name or TOML file; None: the run's own.
+    place
+        of the run, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for a projector or patterns of which no pictures can be drawn.
+    """
+    known = manifest.configuration.get("projector_model")
+    own = known if isinstance(known, dict) else {}
+    raster, sides = Raster.of(projector) if projector else Raster.of_projector(own), manifest.patterns.matrices
+    grid_in(raster, (len(sides[0]), len(sides[1])), place)
+    next(pictures_of(manifest.patterns, place), None)
+    return raster

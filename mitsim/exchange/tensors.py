@@ -1,14 +1,13 @@
-"""Runs and factors in, tensors out: a file for PyTorch, a data set of folders, and a physics for deepinv.
+"""Runs and factors in, tensors out: a file for PyTorch.
 
-PyTorch and deepinv are extras (`pip install mitsim[torch]`, `mitsim[deepinv]`), imported when they are used.
+PyTorch is an extra (`pip install mitsim[torch]`), imported when it is used.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +16,8 @@ from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, RunManifest
 from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture, load_run
+from mitsim.core.runs import Capture
 from mitsim.exchange.packed import FACTORS, Calibration, Packed, Run
-from mitsim.reconstruct.colour import behind
-
-if TYPE_CHECKING:
-    from mitsim.reconstruct.factors import Factors
 
 _PATTERNS = ("P_L", "P_R")
 """Tensors of the patterns' factors."""
@@ -74,19 +69,6 @@ def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tupl
     return ()
 
 
-def write_deepinv(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
-    """The same as :func:`write_tensors` where deepinv is installed; returns how the file is read.
-
-    Parameters
-    ----------
-    path, run, calibration
-        as there.
-    """
-    extra("deepinv")
-    write_tensors(path, run, calibration)
-    return (f"Read it by mitsim.exchange.tensors.load_physics({str(path)!r})",)
-
-
 def _join_lines(path: Path, run: Run, calibration: Calibration | None) -> dict[str, FloatArray]:
     """Tensors of all lines: those of frames behind filters, which are of all at once, have no axis of them."""
     frames = {name: _frames(part) for name, part in run.parts.items()}
@@ -129,96 +111,3 @@ def measurements(shots: Capture) -> FloatArray:
     columns = shots.patterns[1].shape[1]
     frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
     return np.stack([frames[index] for index in sorted(frames)])
-
-
-class RunDataset:
-    """RUN folders as a map-style data set of PyTorch: item -> (x, y), read when it is asked for.
-
-    x is the truth, (1, n, n') relative to the board, y what was measured, (K K', rows, columns) electrons a second;
-    both of single precision.
-    """
-
-    def __init__(self, folders: Sequence[Path | str]) -> None:
-        """The data set of ``folders``. MitsimError where PyTorch is missing, or one is no complete run with a truth."""
-        self._torch = extra("torch")
-        self.runs = [load_run(folder) for folder in folders]
-        for shots in self.runs:
-            if TRUTH not in shots.files:
-                raise MitsimError(f"{shots.name}: has no {TRUTH}, so it cannot teach; leave it out")
-
-    def __len__(self) -> int:
-        return len(self.runs)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        shots = load_run(self.runs[index].folder or Path())  # anew, so that no item stays in memory
-        if shots.truth is None:
-            raise MitsimError(f"{shots.name}: has no {TRUTH}")
-        pair = shots.truth[None].astype(np.float32), measurements(shots).astype(np.float32)
-        return self._torch.from_numpy(pair[0]), self._torch.from_numpy(pair[1])
-
-
-def physics(factors: Factors, patterns: tuple[FloatArray, FloatArray]) -> Any:
-    """The model of a camera under patterns as a `deepinv.physics.LinearPhysics`, with its exact adjoint.
-
-    ``factors`` are of the camera; ``patterns`` are P_L (n, K) and P_R (n', K'), as `Capture.patterns`. It takes x
-    (batch, 1, n, n') to y (batch, K K', rows, columns) [electrons / s], on x's device and of its precision. MitsimError
-    where deepinv is not installed, or patterns do not fit.
-    """
-    return _physics(*factors.sides, *patterns)
-
-
-def load_physics(path: Path | str) -> tuple[Any, Mapping[str, Tensor]]:
-    """The physics in the file ``path`` of `mitsim export --format deepinv`, and its tensors: `y`, and `x` where the
-    truth is known. Of a coloured run it takes x (batch, lines, n, n') to y (batch, lines, K K', rows, columns), every
-    line by its own factors; of one behind colour filters to y (batch, K K', rows, columns) of all lines. MitsimError
-    where deepinv is not installed, or the file is none."""
-    torch = extra("torch")
-    try:
-        tensors = torch.load(path, weights_only=True)
-        left, right, *patterns = (tensors[name].numpy() for name in (*SIDES, *_PATTERNS))
-    except Exception as error:  # torch.load raises of all kinds
-        raise MitsimError(f"{path}: no file of `mitsim export --format deepinv` ({error}); export it again") from error
-    if left.ndim == 2:
-        return _physics(left, right, *patterns), tensors
-    lines = [_physics(*sides, *patterns) for sides in zip(left, right, strict=True)]
-    passed = None
-    if "weights" in tensors:
-        passed = torch.from_numpy(behind(tensors["weights"].numpy(), (left.shape[1], right.shape[1])))
-
-    def forward(x: Tensor, **_: Any) -> Tensor:
-        """A x."""
-        seen = torch.stack([line.A(x[:, i : i + 1]) for i, line in enumerate(lines)], 1)
-        return seen if passed is None else (passed.to(x)[:, None] * seen).sum(1)
-
-    def adjoint(y: Tensor, **_: Any) -> Tensor:
-        """A^T y."""
-        each = y if passed is None else passed.to(y)[:, None] * y[:, None]
-        return torch.cat([line.A_adjoint(each[:, i]) for i, line in enumerate(lines)], 1)
-
-    size = len(lines), left.shape[2], right.shape[2]
-    return extra("deepinv").physics.LinearPhysics(A=forward, A_adjoint=adjoint, img_size=size), tensors
-
-
-def _physics(left: FloatArray, right: FloatArray, p_left: FloatArray, p_right: FloatArray) -> Any:
-    torch, linear = extra("torch"), extra("deepinv").physics.LinearPhysics
-    for name, side, pattern in (("P_L", left, p_left), ("P_R", right, p_right)):
-        if len(pattern) != side.shape[1]:
-            raise MitsimError(f"{name} has {len(pattern)} projector pixels, but the factor {side.shape[1]}")
-    # (K, m, n) stacks Phi diag(p_i): frame (i, j) is lefts[i] X rights[j]^T.
-    lefts, rights = (
-        torch.from_numpy(np.ascontiguousarray(side[None] * pattern.T[:, None, :]))
-        for side, pattern in ((left, p_left), (right, p_right))
-    )
-    count, shape = (len(lefts), len(rights)), (len(left), len(right))
-
-    def forward(x: Tensor, **_: Any) -> Tensor:
-        """A x."""
-        half = lefts.to(x) @ x
-        return (half[:, :, None] @ rights.to(x).transpose(1, 2)).reshape(len(x), -1, *shape)
-
-    def adjoint(y: Tensor, **_: Any) -> Tensor:
-        """A^T y."""
-        gathered = (y.reshape(len(y), *count, *shape) @ rights.to(y)).sum(2)
-        return (lefts.to(y).transpose(1, 2) @ gathered).sum(1, keepdim=True)
-
-    return linear(A=forward, A_adjoint=adjoint, img_size=(1, left.shape[1], right.shape[1]))

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import versions
@@ -64,26 +63,6 @@ _UNFINISHED = ".unfinished"
 
 
 # -------- Pairs
-
-
-class PairDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Pairs of a store as a map-style data set of PyTorch: item -> (frames (K, m, m') [electrons / s], truth (1, n,
-    n')), single precision, read when it is asked for.
-
-    Parameters
-    ----------
-    store
-        the pairs.
-    """
-
-    def __init__(self, store: PairStore) -> None:
-        self.store = store
-
-    def __len__(self) -> int:
-        return len(self.store)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        return torch.from_numpy(self.store.frames(index)), torch.from_numpy(self.store.truth(index))[None]
 
 
 @dataclass(frozen=True, eq=False)

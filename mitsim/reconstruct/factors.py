@@ -166,9 +166,9 @@ class Factors:
             which = "the run's camera, with its scene, --camera, --projector and -D"
             if name in _LIGHT:
                 which = "in this light: its diffraction at the mask differs"
+            said = [cut("that of a camera file" if each == "plate" else str(each)) for each in (other, own)]
             raise MitsimError(
-                f"calibration {self.name}: {cut(name)} is {cut(str(other))}, but {shots.name} has {cut(str(own))}; "
-                f"calibrate {which}"
+                f"calibration {self.name}: {cut(name)} is {said[0]}, but {shots.name} has {said[1]}; calibrate {which}"
             )
         for side, pattern, factor in zip(("P_L", "P_R"), shots.patterns, (self.left, self.right), strict=True):
             if len(pattern) != factor.shape[1]:

@@ -24,7 +24,6 @@ measure: at mu = 0 these would divide by sigma^2.)
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -33,8 +32,7 @@ from scipy.fft import dctn, idctn
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.convolution import ConvolutionalCamera, check_lambda, solve_iteratively
+from mitsim.reconstruct.convolution import check_lambda
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, end_of_range, noise_variance
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV, Bounds
@@ -501,41 +499,6 @@ class TotalVariation(Tikhonov):
             as :func:`solve_tv` takes them.
         """
         return solve_tv(prepared, frames, lam, **iterative)
-
-
-@dataclass(frozen=True)
-class Convolutional:
-    """Tikhonov images of a camera whose scene points all cast one pattern, by conjugate gradients.
-
-    Attributes
-    ----------
-    tolerance, iterations
-        residual of the normal equations, relative, at which it ends, and the most steps.
-    """
-
-    tolerance: float = 1e-6
-    iterations: int = 500
-
-    def init(self, camera: ConvolutionalCamera, patterns: PatternFamily) -> tuple[ConvolutionalCamera, PatternFamily]:
-        """The ``camera`` and its ``patterns``: there is nothing to factorise."""
-        return camera, patterns
-
-    def compute(
-        self,
-        prepared: tuple[ConvolutionalCamera, PatternFamily],
-        frames: Iterable[FloatArray],
-        lam: float | Literal["auto"],
-    ) -> Solution:
-        """The image of ``frames``.
-
-        Parameters
-        ----------
-        prepared, frames
-            what :meth:`init` gives, and a frame of each pattern, row-major over (i, j).
-        lam
-            lambda; MitsimError for ``auto``.
-        """
-        return solve_iteratively(*prepared, frames, lam, self.tolerance, self.iterations)
 
 
 _ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()

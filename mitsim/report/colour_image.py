@@ -341,7 +341,6 @@ class JudgedColours:
         **inputs
             further entries of colour.json.
         """
-        remove_page(folder)
         checksums = self.colours.write(folder)
         of_lines = (f"{name}/{IMAGE_FILE}" for name in self.colours.lines.names)
         checksums |= {name: checksum(folder / name) for name in of_lines if (folder / name).is_file()}
@@ -362,6 +361,13 @@ class JudgedColours:
 # -------- A folder of an image in colour in, its pictures and page out
 
 
+def begin_image(folder: Path, lines: ColourManifest, **inputs: Any) -> None:
+    """Note in colour.json that an image of ``lines`` is being made, so that the same work takes over a killed one's
+    folder."""
+    remove_page(folder)
+    write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), status="incomplete", **inputs)
+
+
 def report_colours(folder: Path) -> Path:
     """Write the pictures and the page of an image in colour, and of those of its lines, from their files alone.
 
@@ -377,6 +383,8 @@ def report_colours(folder: Path) -> Path:
     """
     data = read_json(folder / COLOUR)
     lines = checked_colours(data, IMAGE, folder)
+    if data.get("status") == "incomplete":
+        raise MitsimError(f"{folder / COLOUR}: holds no result of a finished image; reconstruct it again")
     verify_files(folder, data.get("checksums"), "reconstruct it again")
     for name in lines.names:
         if (folder / name / RESULT_FILE).is_file():

@@ -40,7 +40,7 @@ from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, check_joint
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
-from mitsim.report.colour_image import ColourImage, JudgedColours, board_of
+from mitsim.report.colour_image import ColourImage, JudgedColours, begin_image, board_of
 
 # ---- From a run to its images ----
 
@@ -133,6 +133,7 @@ def reconstruct_mosaic(
                 "unexplained": unexplained,
             },
         )
+        begin_image(folder, shots.manifest, inputs=inputs)
         for name, image in zip(shots.manifest.names, solved.images, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})

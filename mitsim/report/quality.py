@@ -17,7 +17,7 @@ from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.runs import load_run
-from mitsim.core.spectral_manifests import IMAGE, is_coloured, is_mosaic, read_colours, same_lines
+from mitsim.core.spectral_manifests import COLOUR, IMAGE, is_coloured, is_mosaic, read_colours, same_lines
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
@@ -174,7 +174,7 @@ def reconstruct_colours(
     MitsimError
         for folders of different lines, and as :func:`reconstruct`.
     """
-    from mitsim.report.colour_image import ColourImage, JudgedColours, board_of, one_paragraph
+    from mitsim.report.colour_image import ColourImage, JudgedColours, begin_image, board_of, one_paragraph
     from mitsim.report.folders import report_folder
     from mitsim.report.mosaic_images import reconstruct_mosaic
 
@@ -190,12 +190,24 @@ def reconstruct_colours(
     held = is_coloured(output)
     earlier = held and read_colours(output, IMAGE).names == lines.names
     with output_folder(output, overwrite=earlier or (overwrite and held)) as folder:
-        images = {
-            name: reconstruct(
-                run / name, calibration / name, folder / name, overwrite=overwrite, job=job.apart(f"{name} "), **options
-            )
-            for name in lines.names
-        }
+        if not held:
+            begin_image(folder, lines)
+        try:
+            images = {
+                name: reconstruct(
+                    run / name,
+                    calibration / name,
+                    folder / name,
+                    overwrite=overwrite,
+                    job=job.apart(f"{name} "),
+                    **options,
+                )
+                for name in lines.names
+            }
+        except BaseException:
+            if not held and not any((folder / name).is_dir() for name in lines.names):  # refused before its first image
+                (folder / COLOUR).unlink()
+            raise
         solved = {name: judged.reconstruction for name, judged in images.items()}
         shapes = {each.image.shape for each in solved.values()}
         if len(shapes) > 1:

@@ -59,6 +59,10 @@ def check_image(path: Path) -> tuple[int, bool]:
     if start.startswith(exr.MAGIC):
         header = exr.read_header(path)
         width, height, grey = header.width, header.height, header.channels < 3
+        if header.types not in ({"half"}, {"float"}):  # Mitsuba converts all to the first one, in silence
+            raise ValueError(
+                f"its channels are {' and '.join(sorted(header.types))}; save all as float, or all as half"
+            )
     elif start.startswith(b"#?"):
         # The first line that Mitsuba could take for the size.
         size = next((line for line in start.split(b"\n") if b"-Y" in line), b"")

@@ -41,7 +41,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.spectral_manifests import bands_of, is_coloured, is_mosaic, spectral_of
 from mitsim.devices.sensor import load_sensor
-from mitsim.exchange.formats import check_export, check_format, export
+from mitsim.exchange.formats import PNG, check_export, check_format, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
     FOLDERS,
@@ -665,12 +665,12 @@ class _Steps:
         run, calibration = self._source(step, "run"), None
         if "calibration" in step.values or calibration_for(self.session, step):
             calibration = self._source(step, "calibration")
-        chosen = check_format(values["format"], step.output, calibration, values.get("projector"))
+        check_format(values["format"], step.output, calibration, values.get("projector"))
         if "run" in step.values and ("calibration" in step.values or calibration is None):
             check_export(run, output=self.folder / step.output, calibration=calibration, **values)
         self._check_folders(step, is_coloured(run))
         if step.output not in self.made:
-            check_output(self.folder / step.output, kind=chosen.kind)
+            check_output(self.folder / step.output, kind="folder" if values["format"] == PNG else "file")
 
         def work() -> Said:
             found = export(run, output=self.folder / step.output, calibration=calibration, **values)

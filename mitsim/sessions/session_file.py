@@ -26,7 +26,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_na
 from mitsim.core.files import PAGE, PICTURES, resolve
 from mitsim.core.mistakes import Mistake, Place, Table, mistakes, told_together
 from mitsim.devices.session import SessionRecipe, load_recipe
-from mitsim.exchange.formats import check_format, export
+from mitsim.exchange.formats import PNG, check_format, export
 from mitsim.reconstruct.request import ImageRequest
 from mitsim.verbs import StudyOptions, demo
 
@@ -568,11 +568,8 @@ def _check_export(session: Session, step: Step, place: Place, found: _Mistakes) 
 
 def calibration_for(session: Session, step: Step) -> str | None:
     """The calibration that an export ``step`` takes of its own ``session``: that which its format can hold."""
-    from mitsim.exchange.formats import FORMATS
-
-    chosen = FORMATS.get(step.values["format"])
     own = session.step("calibrate")
-    return own.output if own and chosen and chosen.calibration != "none" else None
+    return own.output if own and step.values["format"] != PNG else None
 
 
 def _check_sweep(session: Session, step: Step, place: Place, found: _Mistakes) -> None:

@@ -31,6 +31,7 @@ from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
+from mitsim.reconstruct.solution import Solution
 from mitsim.report import label
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import (
@@ -48,7 +49,7 @@ from mitsim.report.plots import (
 from mitsim.studies import lit_lines
 from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
-from mitsim.studies.framework.studio import Studio
+from mitsim.studies.framework.studio import Studio, flags_of
 
 # -------- Beside daylight of any brightness
 
@@ -124,9 +125,15 @@ def measure_ladder(
 
     kept = lit_lines.most(lambda lux: least(lux) <= goal, *_BETWEEN_LX)
     rows = [
-        point.row(lux=lux, draw=draw, method=method, mean_delta_e=float(judge(place.means(image)).mean()))
+        point.row(
+            lux=lux,
+            draw=draw,
+            method=method,
+            mean_delta_e=float(judge(place.means(_stacked(found))).mean()),
+            **flags_of(*(line.status for line in found)),
+        )
         for (lux, draw), by_line in zip(draws, zip(*images, strict=True), strict=True)
-        for method, image in zip((TIKHONOV, MARKOV), np.moveaxis(np.array(by_line), 0, -1), strict=True)
+        for method, found in zip((TIKHONOV, MARKOV), zip(*by_line, strict=True), strict=True)
     ]
     for lux in ladder:
         power = lux / kept if kept else None
@@ -268,38 +275,48 @@ def _measure(studio: Studio, point: Point) -> Found:
     lines = studio.once("lines", 1, (setup, seed), lambda: lit_lines.light_lines(setup, seed))
     if way.startswith("mosaic"):
         shots = studio.once("mosaic", 1, (setup, patterns, seed), lambda: lit_lines.mosaic_shots(lines, patterns, seed))
-        images = np.moveaxis(shots.images(way.removeprefix("mosaic, ")), 0, -1)
+        found = shots.images(way.removeprefix("mosaic, "))
+        images, flags = np.moveaxis(found.images, 0, -1), flags_of(found.joint.status) if found.joint else {}
     elif way in (*DAYLIGHT, BY_LUX):
         light = studio.once("daylight", 1, setup, lambda: lit_lines.daylight_frame(setup, studio.folder("daylight")))
         if way == BY_LUX:
             return measure_ladder(lines, light, point, _place(setup.scene))
-        images = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
+        solved = _under_daylight(lines, light, DAYLIGHT[way], patterns, seed)
+        images, flags = _stacked(solved), flags_of(*(each.status for each in solved))
     else:
         middle = lines[len(lines) // 2]
         factors = [line.factors if way == OWN else lit_lines.serving(line, middle) for line in lines]
-        images = np.stack([_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)], axis=-1)
+        solved = [_solve(*pair, patterns, seed) for pair in zip(lines, factors, strict=True)]
+        images, flags = _stacked(solved), flags_of(*(each.status for each in solved))
     truth = np.stack([line.lit.truth for line in lines], axis=-1)
     board = lines[0].factors.manifest.board_reflectance or 1.0
-    return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board)
+    return _judge(point, [line.wavelength_nm for line in lines], images * board, truth * board, flags)
 
 
-def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> FloatArray:
-    return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors).image
+def _solve(line: lit_lines.LitLine, factors: Factors, patterns: str, seed: int) -> Solution:
+    return reconstruct(expose(line.lit.light, patterns, seed=line.seed(seed)), factors)
+
+
+def _stacked(solved: Sequence[Solution]) -> FloatArray:
+    """Return the images of all lines, (n, n, lines)."""
+    return np.stack([each.image for each in solved], axis=-1)
 
 
 def _under_daylight(
     lines: Sequence[lit_lines.LitLine], light: tuple[FloatArray, float], part: float, patterns: str, seed: int
-) -> FloatArray:
-    """(n, n, lines) images of frames beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
+) -> list[Solution]:
+    """Solve frames of each line beside a ``part`` of a lamp's ``light`` (irradiance and wavelength), less it."""
     images = []
     for line in lines:
         lit = lit_lines.DaylitLine.of(line, light, patterns, seed)
         shots = 0 if lit.family.signed else ambient_shots(lit.family)
         images += lit.images([(part, seed)], [lit.model], shots)[0]
-    return np.stack(images, axis=-1)
+    return images
 
 
-def _judge(point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray) -> Found:
+def _judge(
+    point: Point, wavelengths: Sequence[float], images: FloatArray, truth: FloatArray, flags: Mapping[str, Any]
+) -> Found:
     """Rows of all patches of the chart in ``images`` (n, n, lines), and its colours."""
     place, known, fixed = _place(point.setup.scene), chart(), ColourModel.of_lines(wavelengths)
     means = place.means(images)
@@ -322,7 +339,7 @@ def _judge(point: Point, wavelengths: Sequence[float], images: FloatArray, truth
     }
     rows = [
         point.row(
-            number=number, patch=name, lines=lines, psnr_db=quality, **by_line,
+            number=number, patch=name, lines=lines, psnr_db=quality, **by_line, **flags,
             **{column: float(values[number]) for column, values in columns.items()},
             **{f"truth_{axis}": float(value) for axis, value in zip("XYZ", known.xyz[number], strict=True)},
             **{axis: float(value) for axis, value in zip("XYZ", seen[number], strict=True)},

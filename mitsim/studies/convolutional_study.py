@@ -53,7 +53,7 @@ from mitsim.studies.framework.experiment import (
     Scope,
     picture,
 )
-from mitsim.studies.framework.studio import Studio, reason_of
+from mitsim.studies.framework.studio import Studio, flags_of
 
 MEASURED, TRACED = "measured", "rendered"
 PERIODS = (1, 2, 3, 4, 5, 7)
@@ -127,7 +127,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         for exposure in EXPOSURES:
             shots = take(whole, bench.family(f"dots:{k}"), truth, bench.sensor, exposure, seed)
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
-            stated: dict[str, Value] = {"flagged": bool(reason := reason_of(solution.status)), "reason": reason}
+            stated = flags_of(solution.status)
             rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **stated))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
                 arrays = claims.image_arrays(solution.image, truth)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,12 +18,14 @@ from mitsim.metrics import psnr, ssim
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.pages import Value
 from mitsim.studies.camera_studies import modulation
 from mitsim.studies.framework.experiment import PRINT_MM
+from mitsim.studies.framework.studio import flags_of
 from mitsim.studies.learned_bench import SHEET_MM, SIDE, Case
 
 if TYPE_CHECKING:
@@ -97,34 +100,30 @@ def classical_rows(case: Case, picture: str) -> Iterator[tuple[dict[str, Value],
     for method in CLASSICAL:
         started = time.process_time()
         solve = _solver(method, prepared, sums)
-        lam, image = solve(None)
+        own = solve("auto")
         seconds = time.process_time() - started
-        others = _AROUND if method in (TV, NONNEGATIVE) else [each * problem.scale / lam for each in LAMBDAS]
-        images = [image, *(solve(lam * factor)[1] for factor in others)]
-        best = max(images, key=lambda each: psnr(each, case.truth))
-        for weight, each in zip(WEIGHTS, (image, best), strict=True):
-            _, beyond = beyond_noise(prepared, problem, each)
+        others = _AROUND if method in (TV, NONNEGATIVE) else [each * problem.scale / own.lam for each in LAMBDAS]
+        best = max(own, *(solve(own.lam * factor) for factor in others), key=lambda each: psnr(each.image, case.truth))
+        for weight, each in zip(WEIGHTS, (own, best), strict=True):
+            _, beyond = beyond_noise(prepared, problem, each.image)
             row: dict[str, Value] = {"training": "none", "method": method, "weight": weight}
             row |= {"beyond": beyond, "seconds": seconds, "unexplained": case.unexplained}
-            yield {**row, **scores(each, case, picture)}, each
+            yield {**row, **_flags(each, case), **scores(each.image, case, picture)}, each.image
 
 
-def _solver(method: str, prepared: Prepared, sums: Accumulator) -> Callable[[float | None], tuple[float, FloatArray]]:
-    """From a weight (None: the automatic one) to it and the image that it gives."""
+def _flags(found: Solution, case: Case) -> dict[str, Value]:
+    """Return the columns that flag an image ``found`` of a ``case`` by its solution and its frames."""
+    return flags_of(found.status, others=("frames fit no image",) * (case.unexplained > UNEXPLAINED))
+
+
+def _solver(method: str, prepared: Prepared, sums: Accumulator) -> Callable[[Any], Solution]:
+    """Return the function that solves with a weight, or with the automatic one of the ``method``."""
     if method == MARKOV:
         prepared, sums = _with_correlation(prepared, sums)
 
-    def solve(weight: float | None) -> tuple[float, FloatArray]:
-        lam: Any = "auto" if weight is None else weight
-        if method == TV:
-            found = solve_tv(prepared, sums, lam)
-        elif method == NONNEGATIVE:
-            found = solve_nonnegative(prepared, sums, lam)
-        else:
-            found = prepared.solve(sums, lam)
-        return found.lam, found.image
-
-    return solve
+    if method in (TV, NONNEGATIVE):
+        return partial(solve_tv if method == TV else solve_nonnegative, prepared, sums)
+    return partial(prepared.solve, sums)
 
 
 def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, Accumulator]:
@@ -162,6 +161,6 @@ def network_row(
     _, beyond = beyond_noise(prepared, prepared.problem(sums), solution.image)
     frames, camera = beyond > UNEXPLAINED, bool(prepared.doubts)
     noise = len(solution.status.flags) > frames + camera
-    flags = {"flag_image": frames, "flag_frames": case.unexplained > UNEXPLAINED}
-    flags |= {"flag_camera": camera, "flag_noise": noise}
+    flags: dict[str, Value] = {"flag_image": frames, "flag_frames": case.unexplained > UNEXPLAINED}
+    flags |= {"flag_camera": camera, "flag_noise": noise, **_flags(solution, case)}
     return {"beyond": beyond, "seconds": seconds, **flags, **scores(solution.image, case, picture)}, solution.image

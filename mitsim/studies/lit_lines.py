@@ -52,10 +52,11 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import behind, daylight
 from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LAMBDAS, LitScene
-from mitsim.report.mosaic_images import MosaicCamera, Solver, solver_of
+from mitsim.report.mosaic_images import LineImages, MosaicCamera, Solver, solver_of
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Setup
 
@@ -255,8 +256,8 @@ class MosaicShots:
         """(lines, n, n') reflectance at each line."""
         return np.stack([line.lit.truth for line in self.lines])
 
-    def images(self, way: str) -> FloatArray:
-        """(lines, n, n') images of the lines by a ``way``, one of :data:`WAYS`, with the best lambda for the truth.
+    def images(self, way: str) -> LineImages:
+        """Solve the images of all lines by a ``way``, one of :data:`WAYS`, with the best lambda for the truth.
 
         MitsimError for demosaicing without colour-demosaicing.
         """
@@ -265,15 +266,15 @@ class MosaicShots:
         with single_threaded_blas():
             return self._best(solver, way)
 
-    def _best(self, solver: Solver, way: str) -> FloatArray:
+    def _best(self, solver: Solver, way: str) -> LineImages:
         for each in self.frames:
             solver.add(*each)
-        flat, solved = self.truth.reshape(len(self.lines), -1), dict[float, FloatArray]()
+        flat, solved = self.truth.reshape(len(self.lines), -1), dict[float, LineImages]()
 
         def quality(lam: float) -> float:
             if lam not in solved:
-                solved[lam] = solver.images(lam, relative=True).images
-            return psnr(solved[lam].reshape(flat.shape), flat)
+                solved[lam] = solver.images(lam, relative=True)
+            return psnr(solved[lam].images.reshape(flat.shape), flat)
 
         best = max(_COARSE if way == JOINT else LAMBDAS, key=quality)
         if way == JOINT:
@@ -438,8 +439,8 @@ class DaylitLine:
 
     def images(
         self, exposures: Sequence[tuple[float, int]], models: Sequence[Prepared], shots: int
-    ) -> list[list[FloatArray]]:
-        """Of each noisy exposure of all patterns, an image (n, n') by each of some models, with automatic lambda.
+    ) -> list[list[Solution]]:
+        """Solve each noisy exposure of all patterns by each of some models, with automatic lambda.
 
         Parameters
         ----------
@@ -456,7 +457,7 @@ class DaylitLine:
 
     def _images(
         self, rates: Sequence[FloatArray], exposure: tuple[float, int], models: Sequence[Prepared], shots: int
-    ) -> list[FloatArray]:
+    ) -> list[Solution]:
         lamp, sums = exposure[0] * self.lamp, [model.accumulator() for model in models]
         exposer = Exposer(self.line.lit.bench.devices, self.seconds(exposure[0]), self.line.seed(exposure[1]))
         off: FloatArray | float = 0.0
@@ -465,7 +466,7 @@ class DaylitLine:
         for measured in expose_rates(exposer, self.family, [rate + lamp for rate in rates], off):
             for each in sums:
                 each.add(*measured)
-        return [model.solve(each, "auto").image for model, each in zip(models, sums, strict=True)]
+        return [model.solve(each, "auto") for model, each in zip(models, sums, strict=True)]
 
     def least_variance(self, part: float, place: ChartPlace) -> FloatArray:
         """(patches,) least variance of the means over a chart's patches that an image without bias has.

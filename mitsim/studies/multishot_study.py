@@ -49,7 +49,7 @@ from mitsim.report.pages import Table
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Lines, image_arrays, images
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Image, Studio, reason_of
+from mitsim.studies.framework.studio import Image, Studio, flags_of
 
 REACH = 15.0
 """Features that the mask moves either way."""
@@ -110,8 +110,8 @@ def _moving(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
     for exposure in EXPOSURES:
         seconds = mask.seconds(rows, columns, exposure)
         found = mask.solve(rows, columns, seconds)
-        quality, reason = lit.quality(found.image), reason_of(found.status)
-        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, bool(reason), reason=reason)
+        quality, flags = lit.quality(found.image), flags_of(found.status)
+        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, flags)
     return images
 
 

@@ -21,7 +21,7 @@ from mitsim.report.plots import quality_bars
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio, reason_of
+from mitsim.studies.framework.studio import Studio, flags_of
 
 FAMILIES = ("uniform", "dots:4", "dots:7")
 _SHOWN = ("uniform", "dots:7")
@@ -59,14 +59,14 @@ def _measure(studio: Studio, point: Point) -> Found:
         solution = solve_tv(model, sums, "auto")
         seconds = time.perf_counter() - started
         others = (solve_tv(model, sums, solution.lam * weight).image for weight in _WEIGHTS)
-    image, reason = solution.image, reason_of(solution.status)
+    image = solution.image
     tracemalloc.start()
     one = next(others)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     best = max(psnr(each, truth) for each in (image, one, *others))
     measured: dict[str, Value] = {"psnr_db": psnr(image, truth), "psnr_best_db": best, "seconds": seconds}
-    measured |= {"peak_mib": peak / 2**20, "flagged": bool(reason), "reason": reason}
+    measured |= {"peak_mib": peak / 2**20, **flags_of(solution.status)}
     return claims.finding(studio, point, image if point["patterns"] in _SHOWN else None, **measured)
 
 

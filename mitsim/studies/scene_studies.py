@@ -52,7 +52,7 @@ from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework import claims
 from mitsim.studies.framework.claims import Holds
 from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio, reason_of
+from mitsim.studies.framework.studio import Studio, flags_of
 
 # -------- Light of a glossy scene and of its matt twin in
 
@@ -217,9 +217,9 @@ def _reflectivity_measure(studio: Studio, point: Point) -> Found:
         times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected_frames(RENDERED, family))
         for exposure, seconds in zip(EXPOSURES, times, strict=True):
             found = split(frames, twin, seconds)
-            image, reason = found.solution.image, reason_of(found.solution.status)
+            image = found.solution.image
             measured: dict[str, Value] = {"psnr_db": psnr(image, lit.truth), "psnr_matt_db": psnr(image, twin.truth)}
-            measured |= {"flagged": bool(reason), "reason": reason}
+            measured |= flags_of(found.solution.status)
             measured |= {f"{cause}_db": _decibels(part) for cause, part in found.parts.items()}
             added = np.sum([found.parts[cause] for cause in (SENSOR, INTERREFLECTION, SATURATION)], axis=0)
             rows.append(

@@ -45,7 +45,7 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, stripe_sums
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, image_grid, label_axes, panels_of
@@ -53,7 +53,7 @@ from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
 from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio
+from mitsim.studies.framework.studio import Studio, flags_of
 
 # -------- A scene, its camera and names of effects in
 
@@ -188,8 +188,8 @@ class Levels:
         own = {SATURATION: fills, QUANTISATION: lit.bench.sensor.bits is not None, CALIBRATION_NOISE: True}
         self.effects = tuple(name for name in EFFECTS if name in scene_ablation.effects or own.get(name, False))
 
-    def images(self, on: frozenset[str]) -> Mapping[str, FloatArray]:
-        """The image by model, with the effects ``on`` that the scene has."""
+    def images(self, on: frozenset[str]) -> Mapping[str, Solution]:
+        """Reconstruct the scene by each model, with the effects ``on`` that the scene has."""
         off, light = frozenset(self.effects) - on, self.lit.light
         sensor, fraction = sensor_without(light.bench.sensor, off), Exposure().fraction
         fraction = fraction / _ROOM if SATURATION in off else fraction
@@ -202,7 +202,7 @@ class Levels:
         found = {}
         for model, factors in zip(MODELS, (self._assumed, calibrated), strict=True):
             fitting = replace(factors, manifest=factors.manifest.model_copy(update={"camera": shots.manifest.camera}))
-            found[model] = reconstruct(shots, fitting).image
+            found[model] = reconstruct(shots, fitting)
         return found
 
 
@@ -262,7 +262,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         "levels", 1, (setup, seed), lambda: Levels(lit, scene_ablation, sessions, str(point["patterns"]), seed)
     )
 
-    def images(on: frozenset[str]) -> Mapping[str, FloatArray]:
+    def images(on: frozenset[str]) -> Mapping[str, Solution]:
         own = on & frozenset(levels.effects)
         return studio.once("images", _KEPT, (setup, seed, own), lambda: levels.images(own))
 
@@ -271,14 +271,16 @@ def _measure(studio: Studio, point: Point) -> Found:
         point.row(
             model=model,
             called_for=effect in levels.effects,
-            without_db=(before := psnr(without[model], lit.truth)),
-            with_db=(after := psnr(having[model], lit.truth)),
+            without_db=(before := psnr(without[model].image, lit.truth)),
+            with_db=(after := psnr(having[model].image, lit.truth)),
             change_db=after - before,
+            **flags_of(having[model].status),
         )
         for model in MODELS
     ]
     ends_of = {EFFECTS[0]: without, EFFECTS[-1]: having} if way == IN_ORDER else {}
-    kept = {**ends_of[effect], TRUTH: lit.truth} if effect in ends_of else {}
+    images_of = {model: found.image for model, found in ends_of.get(effect, {}).items()}
+    kept = {**images_of, TRUTH: lit.truth} if images_of else {}
     return Found(tuple(rows), single_precision(kept))
 
 

@@ -15,7 +15,7 @@ from scipy import stats
 
 from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
-from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
 
 Record = Callable[[str, object], None]
@@ -139,7 +139,10 @@ def test_a_frame_is_quantised_once(camera: SensorModel) -> None:
 def test_the_paper_s_noise_comes_out_of_the_same_chain() -> None:
     # Y_n = G/F (Poisson(F/G Y) + N(0, s^2)): mean Y, variance G/F Y + (G/F)^2 s^2, here at Y = 0.7 G.
     full_well, gain, decibel, side = 1e4, 2.0, 50.0, 300
-    model = paper_sensor(full_well, gain, decibel)
+    model = SensorModel(
+        name="paper noise model", source="arXiv 2111.12862", pixel_pitch_um=11.72, quantum_efficiency=1.0,
+        full_well_e=math.inf, gain_dn_per_e=gain / full_well, read_noise_e=full_well * 10 ** (-decibel / 20),
+    )  # fmt: skip
     signal = 0.7 * gain
     mean, variance = pair(model, signal / model.gain_dn_per_e, side, 0.0, "paper")
     noise = full_well * 10 ** (-decibel / 20)

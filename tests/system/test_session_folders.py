@@ -17,6 +17,8 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.exr import read_frame, write_frame
+from mitsim.report.quality import reconstruct_colours
+from tests.coloured import folders
 
 IMAGE: dict[str, Any] = {"run": "run", "calibration": "calibration"}
 
@@ -52,7 +54,7 @@ def test_arguments_are_not_changed(place: Path) -> None:
 
 
 def test_mappings_of_public_functions_are_not_changed(place: Path) -> None:
-    """Every public call that takes mappings leaves them as they were."""
+    """Every public call that takes mappings leaves them as they were. (Planted: `more` that takes checksums in.)"""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     stages, more, effects = {"read": 1.0, "total": 2.0}, {"note": {"a": [1]}}, {"diffraction": False}
@@ -152,18 +154,46 @@ def replace(source, target):
     if str(target).endswith(name):
         os.kill(os.getpid(), 9)
 os.replace = replace
-sys.argv = ["mitsim", "run", "session.toml", "-o", "out", "--quiet", "--no-pictures"]
+sys.argv = ["mitsim", *sys.argv[2:], "-o", "out", "--quiet", "--no-pictures"]
 cli.run()
 """
+
+
+def kill(file: str, *arguments: str) -> None:
+    """Run a command into the folder `out`, and kill it when a ``file`` has its name."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(ms.__file__).parents[1])}
+    command = [sys.executable, "-c", KILLED, file, *arguments]
+    killed = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert killed.returncode == -9, killed.stderr
+
+
+@pytest.mark.parametrize("file", ["out/colour.json", "638nm/image.exr", "445nm/result.json", "out/image.exr"])
+def test_an_image_in_colour_that_was_killed_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    """By the same call, bit for bit; until then it has no page. A refusal leaves nothing. (Planted: colour.json
+    written last.)"""
+    run, calibration = folders(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    kill(file, "reconstruct", str(run), "--calibration", str(calibration))
+    with pytest.raises(ms.MitsimError, match="no result of a finished image"):
+        ms.report_folder("out")
+    for place in ("out", "whole"):
+        reconstruct_colours(run, calibration, place, page=False)
+    frames = [{path.relative_to(place): path.read_bytes() for path in Path(place).rglob("*.exr")}
+              for place in ("out", "whole")]  # fmt: skip
+    assert frames[0] == frames[1] and len(frames[0]) >= 4 and not [*Path("out").rglob(".*")]
+    (run / "638nm" / "frame_00000.exr").write_bytes(b"")
+    with pytest.raises(ms.MitsimError):
+        reconstruct_colours(run, calibration, "new", page=False)
+    assert not Path("new").exists()
 
 
 @pytest.mark.parametrize("file", ["image/image.exr", "image/image.png", "out/session.json"])
 def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: str) -> None:
     """An image without its result, and a session without its steps, are taken up again; 0.10.0 refused the first."""
     (place / "session.toml").write_text('[[reconstruct]]\nrun = "run"\ncalibration = "calibration"\n')
-    environment = {**os.environ, "PYTHONPATH": str(Path(ms.__file__).parents[1])}
-    killed = subprocess.run([sys.executable, "-c", KILLED, file], env=environment, capture_output=True, text=True)
-    assert killed.returncode == -9, killed.stderr
+    kill(file, "run", "session.toml")
     assert taken({"reconstruct": [{**IMAGE}]}, resume=True) == [False]
     ms.run({"reconstruct": [{**IMAGE}]}, "whole", pictures=False)
     assert (place / "out/image/image.exr").read_bytes() == (place / "whole/image/image.exr").read_bytes()
@@ -171,18 +201,19 @@ def test_a_session_killed_while_an_image_is_written_goes_on(place: Path, file: s
 
 
 def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
-    """Of the same inputs; others are refused, and the page of an unfinished image is."""
+    """An image that was killed is made by the same call, but no image of other inputs, and it has no page.
+    (Planted: no head before its files.)"""
     shots, factors = ms.load_run("run"), ms.load_calibration("calibration")
     image = ms.reconstruct(shots, factors)
     image.save("image")
-    result = json.loads((place / "image" / "result.json").read_text())
-    (place / "image" / "result.json").write_text(json.dumps({"status": "incomplete", "inputs": result["inputs"]}))
+    kill("image.exr", "reconstruct", "run", "--calibration", "calibration")
     with pytest.raises(ms.MitsimError, match="no result of a finished image"):
-        ms.report_folder("image")
+        ms.report_folder("out")
     with pytest.raises(ms.MitsimError, match="holds an image of other inputs"):
-        ms.reconstruct(shots, factors, 10.0).save("image")
-    image.save("image")
-    assert json.loads((place / "image" / "result.json").read_text())["checksums"].keys() >= {"image.exr", "image.png"}
+        ms.reconstruct(shots, factors, 10.0).save("out")
+    image.save("out")
+    assert json.loads((place / "out" / "result.json").read_text())["checksums"].keys() >= {"image.exr", "image.png"}
+    assert (place / "out" / "image.exr").read_bytes() == (place / "image" / "image.exr").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -195,7 +226,7 @@ def test_an_image_that_was_begun_is_made_again(place: Path) -> None:
     ],
 )
 def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change: dict[str, Any]) -> None:
-    """Each wrong kind is refused in one line."""
+    """Each wrong kind is refused in one line. (Planted: entries that are taken as they are.)"""
     tables = {"reconstruct": [{**IMAGE}]}
     ms.run(tables, "out", pictures=False)
     held = json.loads((place / "out" / "session.json").read_text())
@@ -207,10 +238,14 @@ def test_a_session_json_of_other_kinds_is_refused_in_a_line(place: Path, change:
 
 
 def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
-    """Folders and files that steps read are looked into before the first of them works."""
+    """Folders and files that steps read are looked into before the first of them works. (Planted: manifests
+    alone; pictures without their projector.)"""
     frame = place / "run" / "frame_00003.exr"
     shutil.copytree(place / "run", place / "good")
     frame.write_bytes(frame.read_bytes()[:-5])
+    manifest = json.loads((shutil.copytree(place / "good", place / "imported") / "manifest.json").read_text())
+    del manifest["configuration"]["projector_model"]
+    (place / "imported" / "manifest.json").write_text(json.dumps(manifest))
     good = {**IMAGE, "run": "good"}
     for step, words in (
         ({"reconstruct": [good, {**IMAGE, "output": "b"}]}, "checksum differs"),
@@ -218,6 +253,7 @@ def test_nothing_is_left_where_a_later_step_is_refused(place: Path) -> None:
         ({"reconstruct": [good, {**good, "output": "b", "margin": 900}]}, "margin"),
         ({"reconstruct": [good], "export": [{"format": "hdf5", "run": "run", "output": "a.h5"}]}, "checksum differs"),
         ({"reconstruct": [good], "export": [{"format": "png", "run": "good", "output": "p", "projector": "no"}]}, "no"),
+        ({"reconstruct": [good], "export": [{"format": "png", "run": "imported", "output": "p"}]}, "imported frames"),
         ({"reconstruct": [good], "study": [{"name": "no such"}]}, "no such"),
     ):
         with pytest.raises(ms.MitsimError) as refused:

@@ -11,7 +11,7 @@ import pytest
 from mitsim.core import files
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import verify
-from mitsim.core.files import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file
+from mitsim.core.files import LOCK, check_apart, output_file, output_folder, prepare_output, whole_file, whole_folder
 
 
 def test_prepare_output_makes_the_folder(tmp_path: Path) -> None:
@@ -215,3 +215,24 @@ def test_what_is_read_is_not_replaced(tmp_path: Path) -> None:
             check_apart(tmp_path / name, inputs)
     for name in ("new.exr", "run/new.h5"):
         check_apart(tmp_path / name, inputs)
+
+
+def test_what_a_killed_process_left_is_removed_by_the_same_work(tmp_path: Path) -> None:
+    """A folder whose files appear together is begun anew, and parts of a file go; those of other files stay."""
+    killed = "import os, sys; from mitsim.core.files import output_file, whole_file, whole_folder\n"
+    folder = f"{killed}with whole_folder(sys.argv[1]) as place:\n (place / 'a').write_text('b'); os._exit(9)"
+    file = f"{killed}with output_file(sys.argv[1]) as place, whole_file(place) as part:\n part.touch(); os._exit(9)"
+    others = tmp_path / ".run.h5.1-2.part", tmp_path / ".run.5.1-2.part"
+    for code, name in ((folder, "pngs"), (file, "run")):
+        assert subprocess.run([sys.executable, "-c", code, str(tmp_path / name)]).returncode == 9
+    assert (tmp_path / "pngs" / "a").is_file() and len([*tmp_path.glob(".run.*.part")]) == 1
+    for each in others:
+        each.touch()
+    with whole_folder(tmp_path / "pngs") as place:
+        (place / "c").touch()
+    with output_file(tmp_path / "run"):
+        pass
+    assert [path.name for path in (tmp_path / "pngs").iterdir()] == ["c"]
+    assert {*tmp_path.glob(".run.*.part")} == {*others}
+    with pytest.raises(MitsimError, match="holds files already"), whole_folder(tmp_path / "pngs"):
+        pass

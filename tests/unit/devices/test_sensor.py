@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
-from mitsim.devices.sensor import SensorModel, load_sensor, paper_sensor
+from mitsim.devices.sensor import SensorModel, load_sensor
 from tests.invented import sensor
 
 BASE = {
@@ -110,13 +110,6 @@ def test_the_shipped_sensor_fills_its_adc_but_does_not_overflow_it() -> None:
     # The two figures its full well and read noise are derived from (mvBlueFOX3 manual).
     assert 10 * math.log10(model.full_well_e) == pytest.approx(45.1, abs=0.05)
     assert 20 * math.log10(model.full_well_e / (model.read_noise_e + 0.5)) == pytest.approx(73, abs=0.5)
-
-
-def test_the_paper_s_model_has_the_paper_s_numbers() -> None:
-    model = paper_sensor(full_well_e=1e4, gain=2.0, dynamic_range_db=60.0)
-    assert model.gain_dn_per_e == pytest.approx(2e-4)  # G / F
-    assert model.read_noise_e == pytest.approx(10.0)  # F 10^(-R/20)
-    assert model.bits is None and model.black_level_dn == 0.0 and math.isinf(model.full_well_e)
 
 
 def test_a_camera_s_identity_has_the_effects_that_it_names_and_no_others() -> None:

@@ -15,7 +15,6 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.exchange import tensors
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.hdf5 import open_hdf5
 from mitsim.reconstruct.colour import behind
 from tests.coloured import WEIGHTS, mosaic_folders
 from tests.unit.exchange.test_coloured import octave, whole
@@ -100,38 +99,22 @@ save('-v7', 'again.mat', '-struct', 'a');
     assert whole(tmp_path / "cal") == whole(folders[1])
 
 
-def test_frames_and_factors_are_read_where_they_lie(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    export(folders[0], "hdf5", tmp_path / "all.h5", folders[1])
-    with open_hdf5(tmp_path / "all.h5") as file:
-        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is None
-    with open_hdf5(tmp_path / "all.h5", "520nm") as file:
-        assert np.array_equal(file.shots.dn, ms.load_run(folders[0]).dn) and file.factors is not None
-        assert np.array_equal(file.factors.left, ms.load_calibration(folders[1] / "520nm").left)
-    with pytest.raises(MitsimError, match="has 638nm, 520nm, 445nm; give one"), open_hdf5(tmp_path / "all.h5", "521nm"):
-        pass
-
-
 def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """<A x, y> = <x, A^T y> in double precision, and A of the truths is what was measured, but for noise."""
+    """Sums of the lines, each by its own factors and weights, are what was measured, but for noise."""
     torch = pytest.importorskip("torch")
-    pytest.importorskip("deepinv")
-    export(folders[0], "deepinv", tmp_path / "run.pt", folders[1])
-    physics, held = tensors.load_physics(tmp_path / "run.pt")
-    assert np.array_equal(held["y"].numpy(), tensors.measurements(ms.load_run(folders[0])))
-    seen = physics.A(held["x"][None])[0]
-    assert (seen - held["y"]).abs().mean() < 0.01 * held["y"].mean()
-    generator = torch.Generator().manual_seed(1)
-    x = torch.randn(2, *held["x"].shape, dtype=torch.float64, generator=generator)
-    y = torch.randn(2, *held["y"].shape, dtype=torch.float64, generator=generator)
-    forward = physics.A(x)
-    assert abs((forward * y).sum() - (x * physics.A_adjoint(y)).sum()) <= 1e-12 * forward.norm() * y.norm()
+    export(folders[0], "torch", tmp_path / "run.pt", folders[1])
+    held = {name: each.numpy() for name, each in torch.load(tmp_path / "run.pt", weights_only=True).items()}
+    assert np.array_equal(held["y"], tensors.measurements(ms.load_run(folders[0])))
+    columns, rows = held["P_R"].shape[1], held["y"].shape[1:]
+    for index, frame in enumerate(held["y"]):
+        lit = np.outer(held["P_L"][:, index // columns], held["P_R"][:, index % columns]) * held["x"]
+        lines = held["left"] @ lit @ held["right"].transpose(0, 2, 1) * behind(held["weights"], rows)
+        assert np.abs(lines.sum(0) - frame).mean() < 0.01 * held["y"].mean()
 
 
-@pytest.mark.parametrize("format", ["flatcam", "png"])
-def test_formats_that_know_no_filters_say_so(format: str, folders: tuple[Path, Path], tmp_path: Path) -> None:
-    calibration = folders[1] if format == "flatcam" else None
-    with pytest.raises(MitsimError, match=rf"is behind colour filters, of which {format} .*; use hdf5, mat, deepinv"):
-        export(folders[0], format, tmp_path / "out", calibration)
+def test_pictures_know_no_filters(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(MitsimError, match=r"is behind colour filters, of which png .*; use hdf5, mat, torch"):
+        export(folders[0], "png", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.hdf5 import open_hdf5
+from mitsim.exchange.hdf5 import open_folders
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 
@@ -64,17 +64,6 @@ def test_the_layout_is_that_of_the_documentation(bench: Made, tmp_path: Path) ->
         assert file["run/manifest"][()].tobytes().decode() == (bench.run / "manifest.json").read_text()
 
 
-def test_an_open_file_is_a_capture_and_factors_without_a_folder(bench: Made, tmp_path: Path) -> None:
-    """The image is that of the folders, bit for bit; a copy saved from it is the folder."""
-    image = ms.reconstruct(ms.load_run(bench.run), ms.load_calibration(bench.calibration))
-    with open_hdf5(exported(bench, tmp_path)) as file:
-        again = ms.reconstruct(file.shots, file.factors)
-        assert file.shots.fingerprint == ms.load_run(bench.run).fingerprint
-        file.shots.save(tmp_path / "saved")
-    assert np.array_equal(again.image, image.image) and again.lam == image.lam
-    assert bytes_of(tmp_path / "saved") == bytes_of(bench.run)
-
-
 def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
     """(Planted: the stack fetched as a whole.)"""
     path = exported(bench, tmp_path)
@@ -83,12 +72,13 @@ def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
     damaged = bytearray(path.read_bytes())
     damaged[place + size // 2] ^= 0xFF
     path.write_bytes(damaged)
-    with open_hdf5(path) as file:
-        names = [shot.file for shot in file.run.manifest.patterns.captures]
+    with open_folders(path) as (folders, _):
+        run = folders.parts[""]
+        names = [shot.file for shot in run.manifest.patterns.captures]
         for index in (0, 1, 2, 4, 5):
-            assert np.array_equal(file.run.read(names[index])[0]["DN"], read_frame(bench.run / names[index])[0]["DN"])
+            assert np.array_equal(run.read(names[index])[0]["DN"], read_frame(bench.run / names[index])[0]["DN"])
         with pytest.raises(MitsimError, match="damaged"):
-            file.run.read(names[3])
+            run.read(names[3])
 
 
 def test_a_damaged_file_leaves_no_folder(bench: Made, tmp_path: Path) -> None:
@@ -219,9 +209,10 @@ def test_a_file_that_is_cut_while_it_is_read_is_refused(bench: Made, tmp_path: P
         frames = file["run/shots/DN"][()]
         del file["run/shots/DN"]
         file["run/shots/DN"] = frames
-    with open_hdf5(path) as file:
-        names = file.run.names
-        file.run.read(names[5])
+    with open_folders(path) as (folders, _):
+        run = folders.parts[""]
+        names = run.names
+        run.read(names[5])
         os.truncate(path, path.stat().st_size - 100)
         with pytest.raises(MitsimError, match="cut short while it was read"):
-            file.run.read(names[5])
+            run.read(names[5])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import struct
 import subprocess
@@ -19,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.exchange import matlab
 from mitsim.exchange.formats import export, import_file
-from tests.exchanged import COLUMNS, DIGITAL, ROWS, SCENE, Made, bytes_of, made
+from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, bytes_of, made
 
 CASES = ["dots", "signed", "real output", "ambient", "closing"]
 
@@ -34,13 +33,12 @@ def bench_of(case: str, tmp_path: Path) -> Made:
     )
 
 
-@pytest.mark.parametrize("format", ["mat", "flatcam"])
 @pytest.mark.parametrize("case", CASES)
-def test_folders_come_back_without_the_expected_electrons(format: str, case: str, tmp_path: Path) -> None:
+def test_folders_come_back_without_the_expected_electrons(case: str, tmp_path: Path) -> None:
     """Digital numbers, ambient frame, truth, factors and manifests to the bit, and so the image. (Planted: rows of the
     pattern's index for columns; the negative half not added again; factors divided by the scale, not by its root.)"""
     bench = bench_of(case, tmp_path)
-    export(bench.run, format, tmp_path / "all.mat", bench.calibration)
+    export(bench.run, "mat", tmp_path / "all.mat", bench.calibration)
     result = import_file(tmp_path / "all.mat", tmp_path / "run 2", tmp_path / "cal 2")
     assert result["left_out"] == [matlab.ELECTRONS]
     first, again = ms.load_run(bench.run), ms.load_run(tmp_path / "run 2")
@@ -78,30 +76,6 @@ def test_the_papers_variables_are_its_model(case: str, tmp_path: Path) -> None:
             expected = held["phi_left"] @ lit @ held["phi_right"].T
             # Shot and read noise of some 1e4 electrons: 40 DN at most; a wrong scale, sign or order is hundreds.
             assert np.abs(found - expected).mean() < 0.05 * np.abs(expected).mean() + 30
-
-
-def test_flatcams_variables_are_its_model(tmp_path: Path) -> None:
-    """A plane of a frame, less its rows' and columns' means, is P1 X Q1' less noise, plane by plane as its loader takes
-    them. (Planted: gb and gr changed places; factors with their means.)"""
-    bench = made(tmp_path)
-    export(bench.run, "flatcam", tmp_path / "all.mat", bench.calibration)
-    held = loadmat(tmp_path / "all.mat")
-    assert held["cSize"].tolist() == [[ROWS / 2, COLUMNS / 2]] and held["angle"].item() == 0
-    lit = np.outer(held["PL"][:, 1], held["PR"][:, 2]) * bench.scene
-    frame = held["meas"][:, :, 5]
-    for name, plane in {
-        "r": frame[1::2, 1::2],
-        "gb": frame[0::2, 1::2],
-        "gr": frame[1::2, 0::2],
-        "b": frame[0::2, 0::2],
-    }.items():
-        left, right = held[f"P1{name}"], held[f"Q1{name}"]
-        assert left.shape == (ROWS / 2, SCENE[0]) and right.shape == (COLUMNS / 2, SCENE[1])
-        centred = plane - plane.mean(0) - plane.mean(1, keepdims=True) + plane.mean()
-        expected = left @ lit @ right.T
-        # What is left is noise, which other planes and factors with their means do not explain.
-        assert np.linalg.norm(centred - expected) < 0.5 * np.linalg.norm(centred)
-        assert np.abs(np.corrcoef(centred.ravel(), expected.ravel())[0, 1]) > 0.9
 
 
 def test_background_is_black_level_and_dark_current_or_the_ambient_frame(tmp_path: Path) -> None:
@@ -188,13 +162,6 @@ def test_a_run_larger_than_such_a_file_is_refused(tmp_path: Path, monkeypatch: p
     with pytest.raises(MitsimError, match=r"data_coded takes .* hdf5"):
         export(made(tmp_path).run, "mat", tmp_path / "all.mat")
     assert not (tmp_path / "all.mat").exists()
-
-
-def test_flatcam_needs_a_calibration(tmp_path: Path) -> None:
-    with pytest.raises(MitsimError, match="calibration is not given"):
-        export(made(tmp_path).run, "flatcam", tmp_path / "all.mat")
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert manifest["status"] == "complete"
 
 
 @pytest.mark.parametrize("angle", [0.0, -0.4])

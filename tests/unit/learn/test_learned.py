@@ -29,7 +29,7 @@ from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import CLASSES
 from mitsim.learn.networks import LEVELS, WAYS, UNet, has_half
-from mitsim.learn.training import PairDataset, train_network
+from mitsim.learn.training import train_network
 from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -202,10 +202,10 @@ def test_a_denoiser_gives_back_what_it_learned_nothing_of() -> None:
 
 @pytest.mark.slow
 def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
-    """Its physics of the camera has an exact adjoint, our step of the frames is its proximal step, and its loop with
-    our denoiser, as docs/learned.md writes it, gives our image: conjugate gradients leave 1e-8 of white. (Planted:
+    """The physics that docs/learned.md makes of tensors has an exact adjoint, our step of the frames is its proximal
+    step, and deepinv's loop with our denoiser gives our image: conjugate gradients leave 1e-8 of white. (Planted:
     grey not taken off before the denoiser.)"""
-    deepinv = pytest.importorskip("deepinv", reason="deepinv is an extra: pip install 'mitsim[deepinv]'")
+    deepinv = pytest.importorskip("deepinv", reason="not installed: pip install deepinv")
     camera = bench(peak=300.0)
     shots, factors = camera.run("dots:2", picture(1), 1), camera.calibrated(1)
     prepared = SOLVERS["tikhonov"].init(factors, shots.patterns)
@@ -215,12 +215,7 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
     problem = prepared.problem(sums)
     variance = datum_variance(problem)
     data, own = Data.of(problem.projected[None], variance, DOUBLE), Diagonal.of(prepared, DOUBLE)
-    physics, y = tensors.physics(factors, shots.patterns), torch.as_tensor(tensors.measurements(shots))[None]
-    x, z = (torch.randn(shape, generator=random, dtype=torch.float64) for shape in (y.shape, (1, 1, 16, 16)))
-    there, back = (physics.A(z) * x).sum(), (z * physics.A_adjoint(x)).sum()
-    assert abs(there - back) < 1e-12 * physics.A(z).norm() * x.norm()
-    step = physics.prox_l2(z, y, 1e-3 / variance, max_iter=2000, tol=1e-12)
-    assert_allclose(step, own.nearest(data, z, torch.tensor(1e3)), atol=1e-8)
+    y = torch.as_tensor(tensors.measurements(shots))[None]
     network = CLASSES["plug-and-play"]((16, 16)).double()
     with torch.no_grad():
         for values in network.network.last.parameters():
@@ -228,11 +223,19 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
         start, expected = network.start(data, own) + 0.5, network(data, own)
     assert float((expected - start).abs().max()) > 1e-3
     model = LearnedSolver(cast(Any, None), network, factors.sides, shots.patterns)
-    names = dict(physics=physics, y=y, model=model, start=start, variance=variance, deepinv=deepinv)
+    names: dict[str, Any] = dict(y=y, model=model, start=start, variance=variance, deepinv=deepinv, torch=torch)
+    names |= {name: torch.as_tensor(each) for name, each in zip(("P_L", "P_R"), shots.patterns, strict=True)}
+    names |= {name: torch.as_tensor(each) for name, each in zip(("left", "right"), factors.sides, strict=True)}
     (lines,) = re.findall(r"^```text\n(# The loop of deepinv.*?)^```", LEARNED.read_text("utf-8"), flags=re.M | re.S)
     with torch.no_grad():
         exec(lines, names)
     assert_allclose(names["image"], expected, atol=1e-8)
+    physics = names["physics"]
+    x, z = (torch.randn(shape, generator=random, dtype=torch.float64) for shape in (y.shape, (1, 1, 16, 16)))
+    there, back = (physics.A(z) * x).sum(), (z * physics.A_adjoint(x)).sum()
+    assert abs(there - back) < 1e-12 * physics.A(z).norm() * x.norm()
+    step = physics.prox_l2(z, y, 1e-3 / variance, max_iter=2000, tol=1e-12)
+    assert_allclose(step, own.nearest(data, z, torch.tensor(1e3)), atol=1e-8)
 
 
 # -------- Training
@@ -358,13 +361,6 @@ def test_the_rate_goes_over_one_cycle() -> None:
     rates = [training.Trainer.rate(trainer, number) for number in range(1000)]
     assert max(rates) == pytest.approx(1e-3, rel=0.01) and 100 < int(np.argmax(rates)) < 200
     assert rates[0] < 1e-5 and rates[-1] < 1e-8 and np.mean(rates) == pytest.approx(0.5e-3, rel=1e-3)
-
-
-def test_pairs_are_a_data_set_of_torch() -> None:
-    store = FakeStore(8, "dots:2")
-    frames, truths = next(iter(torch.utils.data.DataLoader(PairDataset(store), batch_size=3)))
-    assert frames.shape == (3, 4, 96, 96) and truths.shape == (3, 1, 16, 16)
-    assert_array_equal(truths[1, 0], store.truth(1))
 
 
 @pytest.mark.parametrize(("count", "files"), [(24, 24), (64, 40), (100, 3), (2000, 2000), (1200, 12), (9, 8)])

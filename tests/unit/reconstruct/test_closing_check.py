@@ -45,7 +45,7 @@ def test_a_closing_frame_of_another_power(kind: str, patterns: str) -> None:
 
 
 def test_a_saturated_closing_frame_decides_nothing() -> None:
-    """A saturated closing frame decides nothing, and the result says so."""
+    """The result says so. (Planted: saturated readings not asked for.)"""
     shots = bench().run("dots:4", picture(1), 2)
     light = np.asarray(sum(each.frame for each in shots.pattern_measurements()))
     shots.__dict__["closing"] = ClosingFrame("uniform", light, np.zeros_like(light), 7)
@@ -54,7 +54,7 @@ def test_a_saturated_closing_frame_decides_nothing() -> None:
 
 
 def test_what_dots_leave_undecided_is_stated_until_a_closing_frame_decides_it() -> None:
-    """In words and numbers, and only of a real camera."""
+    """In words and numbers, and only of a real camera. (Planted: stated beside a uniform closing frame, too.)"""
     page = np.where(np.random.default_rng(3).random((32, 32)) < 0.35, 0.1, 0.85)
     camera = Bench(shadow(n=32), shadow(n=32))
     shots, factors = camera.run("dots:4", page, 1), camera.calibrated(1)
@@ -75,7 +75,8 @@ def test_what_dots_leave_undecided_is_stated_until_a_closing_frame_decides_it() 
 
 
 def test_a_projector_that_leaks_light() -> None:
-    """Signed patterns cancel a leak of 5 %, which darkens the image by as much: its size is stated."""
+    """Signed patterns cancel a leak of 5 %, which darkens the image by as much: its size is stated. (Planted: the leak
+    of another pattern than the even one; twice the leak.)"""
     shots = bench().run("hadamard:4", picture(1), 1)
     captures, digital = shots.manifest.patterns.captures, shots.manifest.digital
     bright = next(np.asarray(dn, float) for shot, dn in zip(captures, shots.dn, strict=True) if shot.sign == 1)

@@ -20,13 +20,12 @@ from mitsim.core.runs import Capture, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.convolution import ConvolutionalCamera
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import may_replace, reconstruct
 from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.reconstruct.solvers import SOLVERS, Convolutional, Tikhonov
+from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
 from mitsim.report.quality import reconstruct as reconstruct_folders
 from tests import ideal_sessions
 from tests.ideal_sessions import picture
@@ -119,7 +118,7 @@ def test_a_further_solver_is_a_class_and_its_name(
 
 
 def test_solvers_prepare_once_and_solve_any_number_of_scenes(shots: Capture, factors: Factors) -> None:
-    """The separable ones and the convolutional one alike. (Planted: sums of a scene that stay for the next.)"""
+    """(Planted: sums of a scene that stay for the next.)"""
     for solver in SOLVERS.values():
         prepared = solver.init(factors, shots.patterns)
         images = []
@@ -130,16 +129,6 @@ def test_solvers_prepare_once_and_solve_any_number_of_scenes(shots: Capture, fac
             images.append(solver.compute(prepared, sums, 1e-9 if solver.linear else "auto").image)
         assert np.array_equal(images[0], images[2])
         np.testing.assert_allclose(images[1], 2 * images[0], rtol=1e-3)
-    rng, family = np.random.default_rng(3), parse_patterns("dots:2", N)
-    camera, scenes = ConvolutionalCamera(rng.random((5, 6)), N), rng.random((2, N, N))
-    solver, lam = Convolutional(tolerance=1e-12), 1e-9
-    once = solver.init(camera, family)
-    for scene in scenes:
-        solution = solver.compute(once, camera.frames(family, scene), lam)
-        assert solution.ok and solution.iterations > 0
-        np.testing.assert_allclose(solution.image, scene, atol=1e-4)
-    with pytest.raises(MitsimError, match="give a finite number"):
-        solver.compute(once, camera.frames(family, scenes[0]), "auto")
 
 
 def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors) -> None:
@@ -147,6 +136,9 @@ def test_a_capture_of_another_camera_is_refused(shots: Capture, factors: Factors
     manifest = factors.manifest.model_copy(update={"camera": {"name": "other"}})
     with pytest.raises(MitsimError, match=r"name is other, but .* has bench; calibrate the run's camera"):
         reconstruct(shots, Factors(factors.left, factors.right, manifest, factors.status))
+    masked = manifest.model_copy(update={"camera": {**shots.manifest.camera, "mask": "plate"}})
+    with pytest.raises(MitsimError, match=r"mask is that of a camera file, but"):
+        reconstruct(shots, Factors(factors.left, factors.right, masked, factors.status))
 
 
 @pytest.mark.filterwarnings("error")

@@ -175,6 +175,27 @@ def test_windows_that_differ_are_refused(tmp_path: Path, what: str, reader: str)
         READERS[reader](path)
 
 
+@pytest.mark.parametrize("types", ["uff", "hff", "fhh", "ffu", "fuh", "uuu"])
+def test_channels_of_several_types_are_refused_in_scenes_and_read_elsewhere(tmp_path: Path, types: str) -> None:
+    """Mitsuba takes all for the type of the first: whole numbers for `uff`, half precision for `hff`."""
+    kinds = {"u": np.uint32, "h": np.float16, "f": np.float32}
+    ramp = np.linspace(0.1, 0.9, 48).reshape(6, 8)
+    channels = {name: (9 * ramp).astype(kinds[each]) for name, each in zip(("B", "DN", "R"), types, strict=True)}
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {**channels}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(ValueError, match=r"its channels are .*; save all as float, or all as half"):
+        check_image(tmp_path / "a.exr")
+    for name, values in read_frame(tmp_path / "a.exr")[0].items():
+        assert np.array_equal(values, channels[name])
+    assert np.array_equal(read_image(tmp_path / "a.exr", "DN")[0], channels["DN"])
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_channels_of_one_type_are_a_picture(tmp_path: Path, kind: Any) -> None:
+    channels = dict.fromkeys("BGR", np.full((6, 8), 0.5, kind))
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {**channels}).write(str(tmp_path / "a.exr"))
+    assert check_image(tmp_path / "a.exr") == (48, False)
+
+
 def test_numbers_whose_white_nobody_knows_are_no_picture(tmp_path: Path) -> None:
     """Codes of 8 bits in whole numbers of 32. (Seen failing: divided by 4294967295, a black picture.)"""
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.full((6, 8), 200, np.uint32)}).write(str(tmp_path / "a.exr"))

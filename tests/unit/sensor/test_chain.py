@@ -11,7 +11,7 @@ from scipy import special, stats
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.devices.sensor import SensorModel, paper_sensor
+from mitsim.devices.sensor import SensorModel
 from mitsim.sensor import chain, moments
 from mitsim.sensor import chain as compiled
 from tests.invented import sensor
@@ -75,7 +75,7 @@ def test_an_impossible_exposure_is_refused(peak: float, fraction: float, message
 
 def test_an_exposure_needs_a_full_well() -> None:
     with pytest.raises(MitsimError, match="no full well"):
-        chain.exposure_for_peak(1.0, 0.5, paper_sensor(1e4, 1.0, 73.0), 550.0)
+        chain.exposure_for_peak(1.0, 0.5, sensor().model_copy(update={"full_well_e": math.inf, "bits": None}), 550.0)
 
 
 @pytest.mark.parametrize("bad", [-1e-9, math.nan, math.inf])

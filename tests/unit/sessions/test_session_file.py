@@ -88,7 +88,7 @@ def test_what_is_written_is_read_again(write: Callable[[str], Path]) -> None:
     "name", ["\U0001f600", "a\u0001\u007f\u0085b", "\u2028\u2029", "q\"'\\", "[capture]", "#", "\t", "\U0010ffff"]
 )
 def test_any_text_is_written_and_read_again(write: Callable[[str], Path], name: str) -> None:
-    """As a value, a key and a list item."""
+    """As a value, a key and a list item. (Planted: JSON's spelling, in which a smile is two surrogates.)"""
     tables = {
         "scene": {"scene": "x", name: name},
         "study": [{"name": "sweep", "over": {name: [name, 1.5, True]}, "parameters": {name: -1e-300}}],

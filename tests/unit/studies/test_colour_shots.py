@@ -50,7 +50,7 @@ def shots(*shifts: float) -> MosaicShots:
 
 
 def quality(found: MosaicShots, way: str) -> float:
-    return psnr(found.images(way).reshape(3, -1), found.truth.reshape(3, -1))
+    return psnr(found.images(way).images.reshape(3, -1), found.truth.reshape(3, -1))
 
 
 def test_planes_are_exact_where_lines_share_a_camera() -> None:

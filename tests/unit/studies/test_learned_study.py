@@ -261,7 +261,8 @@ def test_frames_are_kept_as_what_they_add_up_to(patterns: str) -> None:
     direct = markov.accumulator()
     for each in shots.pattern_measurements():
         direct.add(each.frame, each.row, each.column)
-    rows_ = classical_rows(case, "page")
+    rows_ = list(classical_rows(replace(case, unexplained=0.5), "page"))
+    assert all(row["flagged"] and "frames fit no image" in str(row["reason"]) for row, _ in rows_)
     found = {(row["method"], row["weight"]): image for row, image in rows_}
     assert_allclose(found["markov", "automatic"], markov.solve(direct).image, atol=1e-6)
     assert_allclose(found["tikhonov", "automatic"], prepared.solve(sums).image, atol=1e-9)
@@ -358,6 +359,7 @@ def test_a_network_taught_by_pictures_serves_all_patterns(tmp_path: Path, monkey
         assert len(list((tmp_path / "networks").glob("*.pt"))) == 1
     assert image.shape == case.truth.shape
     assert (row["flag_noise"], row["flag_camera"]) == (False, False)
+    assert row["flagged"] == bool(row["reason"])
 
 
 # -------- The study

@@ -22,6 +22,7 @@ from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import (
     ALONE,
+    ASSUMED,
     CALIBRATED,
     EFFECTS,
     EXPERIMENT,
@@ -74,7 +75,7 @@ def levels(studio: Studio, setup: Setup) -> Levels:
 def test_with_all_effects_it_is_what_a_user_gets(studio: Studio, setup: Setup, levels: Levels) -> None:
     """Bit-equal to the rendered image of other studies: light, frames, session and solver. (Planted: another seed.)"""
     wanted = studio.image(setup, RENDERED, FAMILY, 3)
-    found = levels.images(frozenset(EFFECTS))[CALIBRATED]
+    found = levels.images(frozenset(EFFECTS))[CALIBRATED].image
     assert np.array_equal(found, wanted.image)
     assert psnr(found, levels.lit.truth) == wanted.quality.psnr_db
     assert DEPTH in levels.effects and SATURATION not in levels.effects
@@ -83,7 +84,7 @@ def test_with_all_effects_it_is_what_a_user_gets(studio: Studio, setup: Setup, l
 def test_without_effects_both_models_are_one(levels: Levels) -> None:
     """The session of an idealised camera finds its factors: images differ by what sampling leaves of the board."""
     found = levels.images(frozenset())
-    assumed, calibrated = (psnr(found[model], levels.lit.truth) for model in MODELS)
+    assumed, calibrated = (psnr(found[model].image, levels.lit.truth) for model in MODELS)
     assert assumed == pytest.approx(calibrated, abs=0.3) and assumed > 30
 
 
@@ -135,7 +136,7 @@ def test_falloff_costs_what_it_takes_from_the_truth(levels: Levels) -> None:
     """With the model assumed the image is the truth times the brightness of the white board: error X (b - 1), b of mean
     1, beside that of noise. (Planted: the brightness of the whole frame.)"""
     truth = levels.lit.truth
-    without, having = (levels.images(on)[MODELS[0]] for on in (frozenset[str](), frozenset({FALLOFF})))
+    without, having = (levels.images(on)[MODELS[0]].image for on in (frozenset[str](), frozenset({FALLOFF})))
     flux = levels.lit.light.apparent.board_flux.reshape(truth.shape)
     wanted = np.square(truth * (flux / flux.mean() - 1)).mean()
     noise, found = (np.square(image - truth).mean() for image in (without, having))
@@ -155,7 +156,7 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
     squares = []
     for seed in range(SEEDS):
         own = Levels(other, scene_ablation, levels._sessions, FAMILY, seed)
-        rounded, exact = (own.images(on)[MODELS[0]] for on in (frozenset({QUANTISATION}), frozenset[str]()))
+        rounded, exact = (own.images(on)[MODELS[0]].image for on in (frozenset({QUANTISATION}), frozenset[str]()))
         squares.append(float(np.square(rounded - exact).mean()))
     frames = other.idealised_frames(bench.family(FAMILY), 0)
     model, step_s = frames.prepare(), camera.sensor.gain_dn_per_e * frames.seconds(EQUAL_PEAK)
@@ -175,6 +176,8 @@ def test_steps_add_up_to_the_whole(studio: Studio, setup: Setup) -> None:
         assert found.levels[-1] == pytest.approx(found.last.value, abs=1e-9)
         quiet = [row["change_db"] for row in rows if row["model"] == model and not row["called_for"]]
         assert len(quiet) > 5 and not any(quiet)
+    assert all(row["flagged"] == bool(row["reason"]) for row in rows)
+    assert any(row["flagged"] for row in rows if row["model"] == ASSUMED)  # factors that no session gave
 
 
 @pytest.mark.parametrize("effect", EFFECTS)

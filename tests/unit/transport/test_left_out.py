@@ -68,7 +68,7 @@ def test_light_that_no_tracer_finds_is_known_at_every_seed(tmp_path: Path, name:
     """By a judge of its own in float64; a wall turned by 30 degrees fills its cubes to 0.94.
 
     Paths into a lens in the pinhole's place met the first one once or twice in 2^20, or never. (Planted: half the rays
-    of each cube are not counted.)
+    of each cube are not counted; what landed is not divided by the rays' cosine.)
     """
     scene = SCENES[name]
     bench, expected = open_bench(scene.write(tmp_path, "hidden"), for_render=True), scene.light()
