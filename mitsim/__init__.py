@@ -121,7 +121,7 @@ def __dir__() -> list[str]:
 
 
 class _Face(ModuleType):
-    """This package; ``mitsim.reconstruct`` stays the function when Python imports the room of that name."""
+    """Module type whose ``mitsim.reconstruct`` stays the function when Python imports the room of that name."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOMES and isinstance(value, ModuleType)):

@@ -1,7 +1,7 @@
-"""A recovered image and the truth in; PSNR and SSIM out. The only reader of the truth.
+"""Image quality against the truth: PSNR, SSIM and relative error.
 
-Images are reflectances, 1.0 = the calibration board. Nothing here fits a gain or an offset, and nothing
-clips: a reconstruction of the wrong brightness is a wrong reconstruction.
+Images are reflectances relative to the calibration board. Values are neither rescaled nor clipped, because an image of
+the wrong brightness is a wrong image. No other module reads the truth.
 """
 
 from __future__ import annotations
@@ -19,23 +19,16 @@ _LIMITED = ", which limits the PSNR"
 Image = NDArray[np.floating[Any]]
 
 _SSIM_WINDOW = 7
-"""Pixels a side; scikit-image's default."""
+"""Pixels a side: the default of scikit-image."""
 _LIMITS_DB = 10.0
-"""How far above an image's PSNR the truth must be: nearer, it makes more than a tenth of the squared error."""
+"""The truth makes more than a tenth of the squared error if its own PSNR is less than this above the image's."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """How close an image is to the truth.
+    """PSNR [dB] and SSIM of an image, and the rms standard error of the truth.
 
-    Attributes
-    ----------
-    psnr_db
-        as :func:`psnr`.
-    ssim
-        as :func:`ssim`; None for images smaller than its window.
-    truth_error
-        standard error of the truth, rms over the image; None where nobody stated it.
+    ``ssim`` is None for images smaller than its window, ``truth_error`` if it is unknown.
     """
 
     psnr_db: float
@@ -44,14 +37,14 @@ class Quality:
 
     @property
     def truth_db(self) -> float | None:
-        """PSNR [dB] of the truth against exact values: no image can be judged beyond it."""
+        """PSNR [dB] of the truth itself, beyond which no image can be judged; None if the error is unknown."""
         if self.truth_error is None:
             return None
         return float("inf") if self.truth_error == 0 else float(-20 * np.log10(self.truth_error))
 
     @property
     def limited_by_truth(self) -> bool:
-        """Whether the truth's own error makes more than a tenth of the squared error."""
+        """True if the truth's own error makes more than a tenth of the squared error."""
         return self.truth_db is not None and self.truth_db - self.psnr_db < _LIMITS_DB
 
     def __str__(self) -> str:
@@ -62,39 +55,38 @@ class Quality:
 
     @property
     def is_image(self) -> bool:
-        """Whether the rms error is below the whole range of reflectance, 0 dB; a gain over a worse image is none."""
+        """True if the rms error is below the whole range of reflectance (0 dB)."""
         return self.psnr_db > 0
 
     @classmethod
     def of(cls, image: Image, truth: Image, truth_error: float | None = None) -> Quality:
-        """That of an image.
-
-        Parameters
-        ----------
-        image, truth
-            (rows, columns) each.
-        truth_error
-            rms standard error of the truth, where known.
-
-        Raises
-        ------
-        MitsimError
-            as :func:`psnr`.
-        """
+        """Return the quality of an image against the truth, both (rows, columns) [reflectance]."""
         similar = ssim(image, truth) if min(truth.shape) >= _SSIM_WINDOW else None
         return cls(psnr(image, truth), similar, truth_error)
 
 
 def summary_of(quality: Quality | None) -> dict[str, float | None]:
-    """A ``quality`` by the keys of the command line's JSON; None of each without one."""
+    """Return the values for JSON; all are None if there is no quality."""
     keys = {"psnr": "psnr_db", "ssim": "ssim", "truth_error": "truth_error"}
     return {key: None if quality is None else getattr(quality, name) for key, name in keys.items()}
 
 
 def psnr(image: Image, truth: Image) -> float:
-    """Peak signal-to-noise ratio in dB, peak 1: -10 log10(mean((image - truth)^2)); inf when they are equal.
+    """Return the peak signal-to-noise ratio in dB for a peak of 1: -10 log10(mean((image - truth)^2)).
 
-    ``image`` and ``truth`` are (rows, columns). MitsimError when the shapes differ or a value is not finite.
+    Parameters
+    ----------
+    image, truth : (rows, columns) arrays, reflectance
+
+    Returns
+    -------
+    float
+        Infinite if both are equal.
+
+    Raises
+    ------
+    MitsimError
+        If the shapes differ, or a value is not finite.
     """
     image, truth = _pair(image, truth)
     mean_square = float(np.mean((image - truth) ** 2))
@@ -102,9 +94,16 @@ def psnr(image: Image, truth: Image) -> float:
 
 
 def ssim(image: Image, truth: Image) -> float:
-    """Structural similarity (Wang et al. 2004; scikit-image, 7 x 7 uniform window, data range 1), 1 = equal.
+    """Return the structural similarity (Wang et al. 2004) with a uniform window of 7 x 7 pixels and data range 1.
 
-    ``image`` and ``truth`` are (rows, columns). MitsimError as :func:`psnr`, and for images smaller than the window.
+    Parameters
+    ----------
+    image, truth : (rows, columns) arrays, reflectance
+
+    Raises
+    ------
+    MitsimError
+        If the shapes differ, a value is not finite, or the images are smaller than the window.
     """
     from skimage.metrics import structural_similarity
 
@@ -115,23 +114,21 @@ def ssim(image: Image, truth: Image) -> float:
 
 
 def relative_error(values: Image, reference: Image) -> float:
-    """||a - b|| / ||b|| over all entries of ``values`` a and a ``reference`` b of one shape."""
+    """Return ||values - reference|| / ||reference|| over all entries of two arrays of one shape."""
     b = np.asarray(reference, dtype=np.float64)
     return float(np.linalg.norm(np.asarray(values, dtype=np.float64) - b) / np.linalg.norm(b))
 
 
 def truth_for(shots: Capture, board_reflectance: float | None = None) -> NDArray[np.float64] | None:
-    """(n, n) apparent reflectance that was written beside the ``shots``; None for frames of a real camera.
+    """Return the true (n, n) apparent reflectance that a simulated capture carries; None for frames of a real camera.
 
-    It is relative to a board of ``board_reflectance`` where that and the truth's own board are known, otherwise to the
-    latter, that of the shipped session recipe.
+    The truth is relative to a board of ``board_reflectance`` if that and the board of the truth are known.
     """
     return None if shots.truth is None else shots.truth * _rescaling(shots, board_reflectance)
 
 
 def truth_error_for(shots: Capture, board_reflectance: float | None = None) -> float | None:
-    """Standard error of :func:`truth_for` the ``shots`` and ``board_reflectance``, rms over the image; None where
-    nobody stated it."""
+    """Return the rms standard error of :func:`truth_for`; None if it is unknown."""
     error = shots.truth_standard_error
     return None if error is None else float(np.sqrt(np.mean(np.square(error)))) * _rescaling(shots, board_reflectance)
 

@@ -24,7 +24,6 @@ import pytest
 
 import mitsim
 from mitsim.studies import EXPERIMENTS
-from tests import prose
 from tests.conftest import write_small_scene
 from tests.exchanged import made
 from tests.robustness import Recorder, Row, page_of
@@ -380,31 +379,6 @@ def test_each_tile_of_the_gallery_has_its_picture_a_sentence_and_commands_that_m
 
 # ---- how the text reads ----------------------------------------------------------------------------------------------
 
-MOST_WORDS = {"sentence": 18, "paragraph": 90}
-"""Words of a page's median sentence, and of its longest paragraph."""
-
-
-@pytest.mark.parametrize("page", REWRITTEN)
-def test_sentences_and_paragraphs_are_short(page: str) -> None:
-    found = prose.style(text_of(page))
-    assert found.median <= MOST_WORDS["sentence"]
-    assert max(found.paragraphs) <= MOST_WORDS["paragraph"], found.longest
-
-
-LABELS = ("What", "Why", "Formula", "Limit", "Check")
-"""What a section says, in this order; it may leave some out."""
-
-
-@pytest.mark.parametrize("page", ["docs/physics.md", "docs/rare_light.md", "docs/reconstruction.md"])
-def test_sections_say_what_why_formula_limit_and_check_in_this_order(page: str) -> None:
-    sections = re.split(r"^(?=#+ )", text_of(page), flags=re.M)
-    orders = [
-        [LABELS.index(label) for label in re.findall(rf"\*\*({'|'.join(LABELS)})\.\*\*", one)] for one in sections
-    ]
-    assert sum(len(order) > 2 for order in orders) >= 5
-    assert not [one.splitlines()[0] for one, order in zip(sections, orders, strict=True) if order != sorted(order)]
-
-
 OLDER_WORDS = {"anatomy", "deposits", "filed", "filing", "foreseen", "foretell", "foretells", "foretold", "glint"}
 OLDER_WORDS |= {"lamplight", "lanes", "ledger", "rig", "rigs", "tray"}
 """Words that docs/glossary.md replaces, and that mean nothing else here."""
@@ -421,14 +395,6 @@ def test_pages_use_the_words_of_the_glossary(page: str) -> None:
 def test_no_line_of_text_begins_as_a_comment_does(page: str) -> None:
     """The site leaves a line out that begins with a per cent sign."""
     assert not re.findall(r"^\s*%.*$", text_of(page), flags=re.M)
-
-
-def test_how_a_page_reads_is_counted() -> None:
-    page = (
-        "# Title\n\nOne `a b c` two. Three four\nfive $x + y$.\n\n- An item.\n\n| a | table |\n\n```math\nx y z\n```\n"
-    )
-    found = prose.style(page)
-    assert (found.sentences, found.paragraphs) == ([3, 4, 2], [7, 2])
 
 
 # ---- what the text says ----------------------------------------------------------------------------------------------

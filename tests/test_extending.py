@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 
 from tests.extended import ROOT, Section, copied, sections
-from tests.test_architecture import participles
-from tests.test_docstrings import missing, public_functions
 
 SECTIONS = sections()
 
@@ -38,16 +36,6 @@ def test_every_line_that_a_section_names_is_there(title: str, tmp_path: Path) ->
     for name in section.files:
         if name.endswith(".py"):
             compile((tmp_path / name).read_text(encoding="utf-8"), name, "exec")
-
-
-@pytest.mark.parametrize("title", SECTIONS)
-def test_the_code_of_a_section_keeps_the_rules(title: str) -> None:
-    """Public functions say what they take, and none is named by a participle."""
-    for step in SECTIONS[title].steps:
-        if step.file.startswith("mitsim/") and "def " in step.code:
-            for name, names, text in public_functions(step.code):
-                assert not missing(names, text), f"{step.file}: {name}"
-            assert not participles(step.code)
 
 
 QUICK = ("A mask", "A projector")
