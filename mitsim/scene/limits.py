@@ -177,7 +177,7 @@ def check_plugin(tag: Tag, plugin: str) -> None:
 
 
 def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
-    """Raise MitsimError if a ``variant`` lacks the ``plugin`` at ``tag``, or needs properties that are not ``given``."""
+    """Raise MitsimError if a ``variant`` lacks the ``plugin`` at ``tag``, or properties that it needs."""
     backend, _, kind = variant.rpartition("_")
     if plugin in _LACKED and kind != "spectral":
         rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"

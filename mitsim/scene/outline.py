@@ -324,7 +324,7 @@ class SceneFiles:
         self.used: dict[Path, None] = {}
 
     def scene(self, path: Path) -> Path:
-        """Return ``path``; raise MitsimError unless it is a plain file without native code where Mitsuba looks for it."""
+        """Return ``path``; raise MitsimError unless it is a plain file without native code beside it."""
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
         self.used[path] = None
