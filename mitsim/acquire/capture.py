@@ -1,7 +1,7 @@
-"""A capture: from a bench and a request to one noisy frame for each shot, in memory or in a folder as they are made.
+"""Capture of a pattern family: one noisy frame for each shot, in memory or in a folder.
 
-One path for light that is not told apart, for the lines of a projector one after the other, and for all of them at once
-behind colour filters: :class:`mitsim.acquire.spectral.SpectralBench` says which lines are traced and how they are read.
+One path serves mono light, the lines of a projector one after the other, and all lines at once behind colour filters:
+:class:`mitsim.acquire.spectral.SpectralBench` determines which lines are traced and how they are read.
 """
 
 from __future__ import annotations
@@ -52,62 +52,56 @@ from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.explain import known_losses
 
 _FIREFLIES = 0.72
-"""Part of the variance in one of four groups: a single heavy path gives 0.75, and ordinary noise 0.3 to 0.5.
-
-Normal noise gives 0.72 once in 12 runs if it is the same in all pixels of all frames, once in 150 if it is of two such
-kinds, once in 2000 if of three, and else never.
+"""Part of the variance in one of four groups above which single paths dominate: a heavy path gives 0.75, ordinary noise
+0.3 to 0.5.
 """
 _DROWNED = 1.0
-"""Noise over the projector's light at which ambient light has ended the dynamic range: 49 dots of lamp_bench give 29 dB
-at 0.03, 17 dB at 0.3, and 12 dB, next to no image, at 3."""
+"""Ratio of noise to the projector's light at which ambient light exhausts the dynamic range: 49 dots of lamp_bench give
+29 dB at 0.03, 17 dB at 0.3, and 12 dB at 3.
+"""
 _DILUTED = 10.0
-"""Error relative to the projector's light, over the accuracy, from which a run is flagged: another order of magnitude
-than was asked for. It is stated in all runs; lamp_bench as shipped has 7."""
+"""Error relative to the projector's light, over the accuracy, from which a run is flagged."""
 _NOISIER = 2.0
-"""Monte Carlo error of a family's frames over that of the family the light was traced for, above which that is said:
-6 dB of an image. Families whose shots light as many pixels are alike to a tenth."""
+"""Ratio of the Monte Carlo error to that of the family that was traced above which a run says so (6 dB)."""
 _AS_DENSE = 0.45
-"""Part of the pixels that a shot lights, over that of the shots that light was planned for, from which the plan's bound
-tells what it leaves: at a half what was left came to 1.04 of it, at a quarter to 1.14 (docs/decisions, 0017)."""
+"""Ratio of lit pixels to those of the planned shots down to which the plan's bound holds (docs/decisions, 0017)."""
 _NEGLIGIBLE = 0.1
-"""Part of the accuracy below which it does not matter what the Monte Carlo error is made of."""
+"""Part of the accuracy below which the cause of the Monte Carlo error does not matter."""
 
 
 # -------- Light, and frames of it
 
 
 class Light(SampledLight):
-    """Sampled light of one scene, ready to be exposed; its attributes are those of
-    :class:`mitsim.light.light.SampledLight`."""
+    """Sampled light of one scene, ready to be exposed; attributes as :class:`mitsim.light.light.SampledLight`."""
 
     @check_arguments
     def expose(
         self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
     ) -> Capture:
-        """One noisy frame for each shot of a family in this light.
+        """Expose one noisy frame for each shot of a family in this light.
 
         Parameters
         ----------
         patterns
-            the family.
+            Name of the family.
         output
-            folder that the frames are written to; None keeps them in memory.
+            Folder for the frames; None keeps them in memory.
         job
-            clock, progress and limits.
+            Clock, progress and limits.
         **request
-            ``seed``, ``exposure`` or ``exposure_fraction`` other than those that the light was traced with.
+            ``seed``, ``exposure`` or ``exposure_fraction`` other than those with which the light was traced.
 
         Raises
         ------
         MitsimError
-            for patterns that do not fit, an output that cannot be written, or a field that would need other light.
+            For patterns that do not fit, an output that cannot be written, or a field that needs other light.
         """
         return expose(self, patterns, output, job, **request)
 
     @check_arguments
     def check_serves(self, patterns: str) -> None:
-        """ArgumentError for ``patterns`` whose total error the light's plan does not tell: their shots light fewer
-        pixels than those that it was planned for."""
+        """Raise ArgumentError for ``patterns`` that light fewer pixels than planned: their error is unknown."""
         sparser = _sparser(self, self.bench.family(patterns, self.seed).lighting)
         if sparser:
             raise ArgumentError("patterns", f"{patterns!r}: {sparser}; trace light for {patterns}, which serves both")
@@ -115,45 +109,37 @@ class Light(SampledLight):
     @staticmethod
     @check_arguments
     def load(path: Path | str, bench: Apparatus) -> Light:
-        """The light in a file that :meth:`save` or ``mitsim transport`` wrote, to single precision.
+        """Load light that :meth:`save` or ``mitsim transport`` wrote, in single precision.
 
         Parameters
         ----------
         path
-            of the file.
+            HDF5 file.
         bench
-            that the light was traced on.
+            Bench on which the light was traced.
 
         Raises
         ------
         MitsimError
-            for a file that cannot be read or holds no such light, and light of another bench, with what differs.
+            If the file cannot be read or holds other data, and for light of another bench, with the difference.
         """
         light = read_light(Path(path), bench)
         return Light(**{each.name: getattr(light, each.name) for each in fields(light)})
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the light to the HDF5 file ``path``, which is replaced; returns it. Frames are formed of it without
-        mitsim, as docs/exchange.md shows.
+        """Write the light to the HDF5 file ``path`` and return it; docs/exchange.md forms frames from it.
 
-        MitsimError for light that was traced by class, or where the file cannot be written.
+        Raises MitsimError for light that was traced by class, or if the file cannot be written.
         """
         write_light(Path(path), self)
         return Path(path)
 
 
 def trace_request(bench: Apparatus, plan: Plan, job: Job | None = None, seed: int | None = None) -> Light:
-    """Light by projector pixel, as a plan asks.
+    """Trace light by projector pixel as a plan asks; ``seed`` None takes the plan's.
 
-    Parameters
-    ----------
-    bench, plan
-        what is traced, and a plan of it.
-    job
-        clock, progress and limits; MitsimError for work beyond them.
-    seed
-        root of the light's random streams; None: the plan's.
+    Raises MitsimError for work beyond the limits of the job.
     """
     job, request = job or Job(), plan.known_request
     if plan.cost:
@@ -173,16 +159,9 @@ def expose(
     resume: bool = False,
     **request: Any,
 ) -> Capture:
-    """One noisy frame for each shot of a family in given light.
+    """Expose one noisy frame for each shot of a family in given light; see :meth:`Light.expose`.
 
-    Parameters
-    ----------
-    light
-        that the family is shown in.
-    patterns, output, job, request
-        as for :meth:`Light.expose`, which has the errors raised as well.
-    resume
-        go on with an interrupted capture of the same light in ``output``.
+    ``resume`` continues an interrupted capture of the same light in ``output``.
     """
     if request.get("noise_fraction") is not None:
         raise ArgumentError("noise_fraction", f"{request['noise_fraction']}: light is traced already; leave it out")
@@ -192,9 +171,9 @@ def expose(
 
 
 def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
-    """The request of a ``plan`` or a family's name, with ``changes`` by field.
+    """Return the request of a ``plan`` or a family's name, with ``changes`` by field.
 
-    MitsimError for a value that a field cannot have, or a change that would need another plan.
+    Raises MitsimError for an invalid value, or a change that needs another plan.
     """
     if isinstance(plan, str):
         if "patterns" in changes:
@@ -204,19 +183,10 @@ def request_of(plan: Plan | str, changes: Mapping[str, Any]) -> Request:
 
 
 def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
-    """Refuse a plan that is not one of this bench and request, for which it would be wrong in silence.
+    """Refuse a plan of another bench or request, because its frames would be wrong in silence.
 
-    Parameters
-    ----------
-    plan
-        that was made already.
-    bench, request
-        what it is to serve. Another seed does, and other patterns that light the same classes of pixels alike.
-
-    Raises
-    ------
-    ArgumentError
-        with what differs.
+    Another seed, and other patterns that light the same classes of pixels alike, are accepted. Raises ArgumentError
+    with the difference.
     """
     plan.check_made_of(bench.whole.deciding)
     planned = plan.known_request
@@ -229,7 +199,7 @@ def check_plan(plan: Plan, bench: SpectralBench, request: Request) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Captured:
-    """What a capture leaves: a run of each reading, and the truth of each line."""
+    """Result of a capture: a run of each reading, and the truth of each line."""
 
     runs: tuple[Capture, ...]
     truths: tuple[Truth, ...]
@@ -250,16 +220,11 @@ def capture(
     Parameters
     ----------
     bench, request, task
-        what is captured, and where it goes: of one reading a RUN folder, else a folder of those.
+        Bench, request and output: a RUN folder for one reading, else a folder of those.
     plan
-        made already.
+        Existing plan.
     lights
-        of each line, traced already, by pixel or for this family.
-
-    Raises
-    ------
-    MitsimError
-        as there.
+        Light of each line, traced by pixel or for this family.
     """
     task = task or Task()
     job, spent = task.job, task.job.clock.seconds()
@@ -319,7 +284,6 @@ def capture(
 def _run(
     bench: Apparatus, light: SampledLight, plan: Plan, request: Request, job: Job, head: RunHead, recorder: Recorder
 ) -> Capture:
-    """The run of one reading: a ``light`` is exposed, and kept by a ``recorder`` under a ``head``."""
     family = bench.family(request.patterns, request.seed)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     with job.clock.stage("truth"):
@@ -387,10 +351,10 @@ def _close(
     exposer: Exposer,
     recorder: Recorder,
 ) -> ClosingFile | None:
-    """Record the closing frame of a run, if the ``request`` has one, and return what the manifest states of it.
+    """Record the closing frame of a run if requested, and return its manifest entry.
 
-    The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time where
-    it would otherwise be brighter than frames of an automatic exposure.
+    The first shot has the same expectation again, speckle included. A uniform frame is exposed for a shorter time if it
+    would be brighter than frames of an automatic exposure.
     """
     if request.closing_frame is None:
         return None
@@ -412,20 +376,7 @@ def _close(
 
 @contextmanager
 def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]:
-    """The folder that lines' folders are in; colour.json is written when all of them are finished.
-
-    Parameters
-    ----------
-    task
-        whose output it is; None in memory.
-    manifest
-        of the lines.
-
-    Raises
-    ------
-    MitsimError
-        where the output cannot be written.
-    """
+    """Claim the folder of the lines' folders; colour.json is written when all of them are finished."""
     if task.output is None:
         yield None
         return
@@ -436,25 +387,13 @@ def colour_folder(task: Task, manifest: ColourManifest) -> Iterator[Path | None]
 
 
 def capture_lines(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> dict[str, Capture]:
-    """A run for each line, by its name.
-
-    Parameters
-    ----------
-    bench, request, task, plan
-        as for :meth:`mitsim.api.bench.Bench.capture_lines`, which has the errors raised as well.
-    """
+    """Capture a run for each line, by its name; see :meth:`mitsim.api.bench.Bench.capture_lines`."""
     lines = SpectralBench.of(bench, RUN)
     return dict(zip(lines.names, capture(lines, request, task, plan).runs, strict=True))
 
 
 def capture_mosaic(bench: Apparatus, request: Request, task: Task, plan: Plan | None = None) -> MosaicCapture:
-    """A run of all lines at once.
-
-    Parameters
-    ----------
-    bench, request, task, plan
-        as for :meth:`mitsim.api.bench.Bench.capture_mosaic`, which has the errors raised as well.
-    """
+    """Capture a run of all lines at once; see :meth:`mitsim.api.bench.Bench.capture_mosaic`."""
     lines = SpectralBench.of(bench, MOSAIC)
     assert isinstance(lines.manifest, MosaicManifest)
     captured, board = capture(lines, request, task, plan), load_recipe().board_reflectance
@@ -503,8 +442,6 @@ def _warnings(light: SampledLight, totals: Totals, shooting: Shooting, request: 
 
 
 def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
-    """Why frames are noisier than the light was planned for, or their error is not known, and what to do; empty where
-    neither is so."""
     traced = light.plan.request.patterns if light.plan.request else request.patterns
     if traced == request.patterns:
         return ""
@@ -519,8 +456,6 @@ def _foreign(light: SampledLight, totals: Totals, request: Request) -> str:
 
 
 def _sparser(light: SampledLight, lighting: Lighting) -> str:
-    """That shots of a ``lighting`` light fewer pixels than those that a ``light`` was planned for, so that more of what
-    the plan left out shows; empty where they do not."""
     planned = light.plan.known_request.patterns
     both = light.bench.family(planned, light.seed).lighting, lighting
     made, other = (each.lit for each in both)

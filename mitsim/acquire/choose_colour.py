@@ -1,14 +1,10 @@
-"""Which colours a scene calls for: a bench and a request in; mono, bands or lines of light, with its plan, out.
+"""Choice of the colours to simulate: mono, bands or lines of light, with its plan.
 
-A monochrome camera that sees all lines l of a projector at once makes, of their irradiances E_l, electrons in
-proportion to
-
-    sum_l q_l lambda_l E_l,
-
-q being its quantum efficiency. A band of lines is simulated as one line at their mean wavelength, *mono* all of them by
-one panchromatic reflectance behind the mean of their shadows. What either leaves is the relative rms difference of its
-frames from that sum over its lines. Both are formed of the same few rays a projector pixel, so that the difference
-holds no noise of the light's geometry, of direct light alone.
+A monochrome camera that sees all lines l of a projector at once makes electrons from their irradiances E_l in
+proportion to sum_l q_l lambda_l E_l, with its quantum efficiency q. A band of lines is simulated as one line at their
+mean wavelength; *mono* replaces all by one panchromatic reflectance behind the mean of their shadows. The error of
+either is the relative rms difference of its frames from the sum over lines. Both are formed from the same few rays per
+projector pixel, so that the difference contains no noise of the geometry; only direct light is compared.
 """
 
 from __future__ import annotations
@@ -37,26 +33,25 @@ from mitsim.light.simulation import Simulation, expected_of
 from mitsim.transport.records import PathSamples
 
 _RAYS_OF_BANDS, _SHOTS = 4, 4
-"""Rays of each pixel, a tenth of a second, and shots that are compared, as the pilot's."""
+"""Rays per pixel (a tenth of a second), and shots that are compared."""
 _NONE = 1e-6
-"""Difference that single precision may leave of none (photograph: 3e-8)."""
+"""Difference that counts as none in single precision (photograph: 3e-8)."""
 _PART = 0.5
-"""Part of the accuracy that colours may take: the rest of the frames then keeps 0.87 of it, at a third more paths."""
+"""Part of the accuracy that colours may use: the frames then keep 0.87 of it, at a third more paths."""
 _ONCE, _TRACED = ("start", "plan"), ("transport", "truth")
-"""Stages of a prediction that lines share, and those in which they share paths; of the others each has its own."""
+"""Stages that lines share, and stages in which they share paths."""
 
 
 @dataclass(frozen=True)
 class Coloured(Generic[Opened]):
-    """What was chosen, ready to be captured.
+    """The choice, ready for a capture.
 
     Attributes
     ----------
     plan
-        of the frames, with what was weighed (:attr:`Plan.colour`). Its accuracy is what the colours leave of the one
-        that was asked for.
+        Plan of the frames, with the alternatives (:attr:`Plan.colour`); its accuracy is reduced by the colours' error.
     bench
-        in the variant that the choice is traced in, its projector in the bands chosen.
+        Bench in the variant in which the choice is traced, with its projector in the chosen bands.
     """
 
     plan: Plan
@@ -64,23 +59,14 @@ class Coloured(Generic[Opened]):
 
     @property
     def mono(self) -> bool:
-        """Whether light is not told apart."""
+        """Return True if wavelengths are not distinguished."""
         return self.plan.colour is not None and self.plan.colour.chosen == MONO
 
 
 def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
-    """The cheapest of mono, bands and lines that is predicted to keep the accuracy; see
-    :meth:`mitsim.api.bench.Bench.choose_colour`.
+    """Choose the fastest of mono, bands and lines that is predicted to keep the accuracy.
 
-    Parameters
-    ----------
-    bench, request
-        as there.
-
-    Raises
-    ------
-    MitsimError
-        as there.
+    See :meth:`mitsim.api.bench.Bench.choose_colour`, also for errors.
     """
     check_untimed(request.seconds)
     check_undecided(bench.variant)
@@ -112,7 +98,6 @@ def choose_colour(bench: Opened, request: Request) -> Coloured[Opened]:
 
 
 def _runs(bench: Apparatus) -> dict[str, int]:
-    """Runs that each candidate takes of a ``bench``, the fewest first."""
     lines = bench.projector.lines
     bands = range(1, min(len(lines.shining.shares) - 1, MOST_LINES) + 1)
     every = {LINES: len(lines.shares)} if len(lines.shares) <= MOST_LINES else {}
@@ -120,22 +105,10 @@ def _runs(bench: Apparatus) -> dict[str, int]:
 
 
 def _in_greys(bench: Apparatus) -> bool:
-    """Whether nothing of a ``bench`` but the mask's shadow differs by wavelength, which mono frames have in them."""
     return not bench.loaded.coloured and bench.sensor.quantum_efficiency_curve is None
 
 
 def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: bool) -> float:
-    """Seconds of so many other runs, from those of some.
-
-    Parameters
-    ----------
-    predicted
-        seconds by stage.
-    runs, others
-        that they are of, and that are asked for.
-    parted
-        whether they share no paths.
-    """
     shared = sum(predicted.get(stage, 0.0) for stage in _ONCE)
     traced = sum(predicted.get(stage, 0.0) for stage in _TRACED)
     own = sum(predicted.values()) - shared - traced
@@ -143,17 +116,6 @@ def _seconds(predicted: Mapping[str, float], runs: int, others: int, parted: boo
 
 
 def _with_choice(plan: Plan, choice: ColourChoice, request: Request) -> Plan:
-    """A plan with what was chosen.
-
-    Parameters
-    ----------
-    plan
-        of the choice.
-    choice
-        what was weighed.
-    request
-        what was asked for.
-    """
     error, mono = choice.taken.error or 0.0, choice.candidates[0].error
     warnings = plan.warnings
     if error > _PART * request.accuracy:
@@ -173,7 +135,7 @@ def _with_choice(plan: Plan, choice: ColourChoice, request: Request) -> Plan:
 
 
 class _ColourPilot(Generic[Opened]):
-    """Frames of few rays by candidate, in electrons but for a factor that all share."""
+    """Frames of few rays by candidate, in electrons up to a common factor."""
 
     def __init__(self, bench: Opened, request: Request) -> None:
         family = bench.family(request.patterns, request.seed).lighting
@@ -189,11 +151,9 @@ class _ColourPilot(Generic[Opened]):
 
     @cached_property
     def spectral(self) -> Opened:
-        """The bench in the variant that knows wavelengths, which is set from then on."""
         return reopen(self._bench, spectral_of(self._bench.variant))
 
     def errors(self, names: Iterable[str]) -> dict[str, float]:
-        """What each candidate leaves, by the ``names``."""
         mono = self._electrons(self._bench, self._path_samples(self._bench)[0])  # before another variant is set
         lines = self._bench.projector.lines.shining
         cut = {name: lines.bands(bands_of(name)) for name in names if name.startswith(BANDS)}
@@ -210,7 +170,6 @@ class _ColourPilot(Generic[Opened]):
         return {name: known[name] for name in names}
 
     def _of_lines(self, lines: tuple[Lines, ...]) -> Iterator[tuple[Lines, FloatArray]]:
-        """Frames of single ``lines``, traced as many at a time as paths carry."""
         for first in range(0, len(lines), MOST_LINES):
             some = lines[first : first + MOST_LINES]
             together = Lines(tuple(line.wavelengths_nm[0] for line in some), tuple(line.shares[0] for line in some))
@@ -219,12 +178,10 @@ class _ColourPilot(Generic[Opened]):
                 yield line, self._electrons(line_alone(self.spectral, line), path_samples)
 
     def _path_samples(self, bench: Apparatus) -> list[PathSamples]:
-        """Direct light of a ``bench`` by line, on the same paths whatever the variant."""
         found = Simulation(bench, self._settings).direct.trace(self._seed, 0, _RAYS_OF_BANDS)
         return found.by_line(1 if bench.lines is None else len(bench.lines.shares))
 
     def _electrons(self, bench: Apparatus, path_samples: PathSamples) -> FloatArray:
-        """(shots, rows, columns) of the light in ``path_samples``, by the photons and the efficiency of a ``bench``."""
         simulation, lighting = Simulation(bench, self._settings), self._lighting
         accumulated = simulation.accumulate("direct", path_samples, lighting.labels, _RAYS_OF_BANDS)
         rows = np.arange(lighting.weights.shape[1])
@@ -235,7 +192,6 @@ class _ColourPilot(Generic[Opened]):
 
 
 def _relative(found: FloatArray, true: FloatArray) -> float:
-    """||found - true|| / ||true||, rounded up to two digits, so that what follows does not hang on a sum's order."""
     whole = float(np.linalg.norm(true))
     error = float(np.linalg.norm(found - true)) / whole if whole else 0.0
     if error < _NONE:

@@ -1,9 +1,9 @@
-"""A drift in; a bench, and a camera's exposure, as they are after it, out.
+"""Drift of a bench and of a camera's exposure.
 
-Light is traced up to the mask, so a mask that moved, turned or shakes changes the optics of traced light alone
-(:meth:`mitsim.light.light.SampledLight.behind`): a moved shadow is averaged over the same cells, so cells that hold
-frames to an accuracy hold what the drift changes in them as well. A moved projector lights other places: its light is
-traced anew. All else - power, lamps, temperature, exposure time, black level - is in the exposure.
+Light is traced up to the mask, so that a mask that moved, turned or shakes changes only the optics of traced light
+(:meth:`mitsim.light.light.SampledLight.behind`). The cells suffice because a moved shadow is averaged over the same
+cells. The light of a moved projector is traced anew because it reaches other places. Power, lamps, temperature,
+exposure time and black level are part of the exposure.
 """
 
 from __future__ import annotations
@@ -30,21 +30,20 @@ from mitsim.sensor.chain import (
 )
 
 _OF_TERMS = ("mask_rotation_mrad", "mask_tilt_rows_mrad", "mask_tilt_columns_mrad", "vibration_um")
-"""Kinds after which the mask's shadow is formed of other separable terms than at rest."""
+"""Kinds of drift after which other separable terms form the mask's shadow."""
 
 
 def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float = 0.0) -> FloatArray:
-    """(count,) light of a source in frames one after the other, 1 at their begin.
+    """Return the (count,) relative light of a source in successive frames; 1 at their begin.
 
     Parameters
     ----------
     seed, name
-        of the random stream.
+        Random stream.
     count
-        frames, of which each stands for its middle.
+        Number of frames; each takes the value at its middle.
     ramp, flicker
-        even change from the begin of the first frame to the end of the last, and normal deviation of each, both as
-        parts of the light; none goes below 0.
+        Linear change from the begin of the first frame to the end of the last, and normal deviation of each.
     """
     changed = 1 + ramp * (np.arange(count) + 0.5) / count
     if flicker:
@@ -53,11 +52,10 @@ def levels(seed: int, name: str, count: int, ramp: float = 0.0, flicker: float =
 
 
 def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
-    """A ``bench`` whose mask has moved as a ``drift`` says, for all that is made of light traced before.
+    """Return a ``bench`` whose mask has moved by a ``drift``, for light that was traced before.
 
-    MitsimError for a mask that turns, tilts or shakes before mirrors, whose light is formed ray by ray, or whose
-    shadow is drawn on a raster; for one that tilts and is thick, or is tilted too far; and for one that moves into the
-    sensor or the scene.
+    Raises MitsimError for a mask that turns, tilts or shakes before mirrors or is drawn on a raster, for a thick mask
+    that tilts or one that tilts too far, and for one that moves into the sensor or the scene.
     """
     row, column, axis = drift.mask_mm
     camera, kinds = bench.geometry, " and ".join(kind for kind in drift.kinds if kind in _OF_TERMS)
@@ -97,7 +95,7 @@ def drift_mask(bench: Apparatus, drift: Drift) -> Apparatus:
 
 
 def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
-    """A ``bench`` whose projector's picture has moved as a ``drift`` says, whose light is to be traced."""
+    """Return a ``bench`` whose projector's picture has moved by a ``drift``; its light must be traced anew."""
     if not (drift.projector_rows or drift.projector_columns):
         return bench
     loaded, grid = bench.loaded, bench.loaded.pixels
@@ -109,7 +107,7 @@ def drift_projector(bench: Apparatus, drift: Drift) -> Apparatus:
 
 
 def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
-    """A ``sensor`` so many ``kelvin`` warmer; one whose file says nothing of temperature stays as it is."""
+    """Return a ``sensor`` that is ``kelvin`` warmer, or the same if its file states no temperature."""
     if sensor.dark_current_temperature_c is None or sensor.dark_doubling_c is None or not kelvin:
         return sensor
     now = sensor.dark_current_temperature_c if sensor.temperature_c is None else sensor.temperature_c
@@ -118,16 +116,16 @@ def warmer(sensor: SensorModel, kelvin: float) -> SensorModel:
 
 @dataclass(frozen=True)
 class DriftedExposer(Exposer):
-    """A camera whose user knows it as it was: frames are exposed as it is, and read as it was.
+    """A camera that has drifted: frames are exposed in its true state and interpreted in its known one.
 
     Attributes
     ----------
     drift
-        what has changed.
+        The drift.
     family
-        patterns whose frames are exposed, in the order of its shots.
+        Patterns in the order of the shots.
     ambient
-        (m, m') light of lamps [W m^-2], as it was when their frame was taken.
+        (m, m') light of lamps [W m^-2] when the ambient frame was taken.
     """
 
     drift: Drift = field(default_factory=Drift)
@@ -135,11 +133,11 @@ class DriftedExposer(Exposer):
     ambient: FloatArray | float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Expected photoelectrons (m, m') of ``frame`` in the time that the shutter is open."""
+        """Return the expected photoelectrons (m, m') of ``frame`` while the shutter is open."""
         return self._open.electrons(frame)
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Expected photoelectrons of the ``frame`` that ``names`` find, projector and lamps at their level."""
+        """Return the expected photoelectrons of ``frame`` with projector and lamps at their level."""
         rows = len(frame.irradiance)
         power, lamp = (
             level * self._ripple(source, rows, *names)
@@ -149,17 +147,13 @@ class DriftedExposer(Exposer):
         return super().shot_electrons(replace(frame, irradiance=light + (lamp - 1) * self.ambient), *names)
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
-        """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
+        """Draw noisy digital numbers of expected ``electrons``."""
         if names[0] == "ambient":
             level = self.ambient_levels[int(names[1])] * self._ripple("lamp", len(electrons), *names)
             electrons = level * electrons
         return self._open.digital(electrons, *names)
 
     def _ripple(self, source: str, rows: int, *names: str | int) -> FloatArray | float:
-        """(rows, 1) level of a ``source`` that ripples, in the frame that ``names`` find; 1 of one that does not.
-
-        The camera runs free of it: each frame has a phase of its own.
-        """
         if source not in self.drift.ripples:
             return 1.0
         amplitude, hertz = self.drift.ripples[source]
@@ -169,7 +163,6 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def _open(self) -> Exposer:
-        """The camera as it is."""
         sensor, drift = warmer(self.devices.sensor, self.drift.temperature_k), self.drift
         black = {"black_level_dn": sensor.black_level_dn + drift.black_level_dn}
         devices = replace(self.devices, sensor=sensor.model_copy(update=black))
@@ -177,7 +170,7 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def levels(self) -> dict[tuple[str | int, ...], tuple[float, float]]:
-        """Level of the projector and of the lamps in each shot, by its names; 1 as they were."""
+        """Return the relative level of projector and lamps in each shot, by its names."""
         assert self.family is not None
         shots, drift = self.family.shots, self.drift
         power = (1 + drift.power) * levels(self.seed, "power", len(shots), drift.power_ramp, drift.power_flicker)
@@ -187,6 +180,6 @@ class DriftedExposer(Exposer):
 
     @cached_property
     def ambient_levels(self) -> FloatArray:
-        """(shots,) level of the lamps in each shot of the ambient frame."""
+        """Return the (shots,) relative level of the lamps in each shot of the ambient frame."""
         assert self.family is not None
         return levels(self.seed, "ambient", ambient_shots(self.family), flicker=self.drift.lamp_flicker)

@@ -1,5 +1,4 @@
-"""One exposure setting of a camera, at rest or drifted: from expected irradiance to digital numbers, and back to
-electrons a second; and from all expected frames of a family to noisy ones that are recorded."""
+"""Exposure of a camera, at rest or drifted: noisy digital numbers from expected irradiance, and back to electrons/s."""
 
 from __future__ import annotations
 
@@ -36,8 +35,10 @@ Item = TypeVar("Item", bound=tuple[Any, ...])
 
 @dataclass(frozen=True)
 class Exposer:
-    """A camera at one exposure time, whose frames have speckle of a contrast (0: none); every frame's noise has streams
-    of its own, found by its names."""
+    """A camera at one exposure time, with speckle of a contrast (0 for none).
+
+    Every frame has random streams of its own, which its names select.
+    """
 
     devices: Devices
     exposure_s: float
@@ -45,44 +46,43 @@ class Exposer:
     speckle: float = 0.0
 
     def electrons(self, frame: Frame) -> FloatArray:
-        """Expected photoelectrons (m, m') of ``frame``, without dark current."""
+        """Return the expected photoelectrons (m, m') of ``frame`` without dark current."""
         return electrons_from_irradiance(
             frame.irradiance, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
         )
 
     def shot_electrons(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Expected photoelectrons of ``frame``, with the speckle of its own that ``names`` find."""
+        """Return the expected photoelectrons of ``frame`` with its own speckle."""
         return add_speckle(self.electrons(frame), self.speckle, stream(self.seed, "speckle", *names))
 
     def digital(self, electrons: FloatArray, *names: str | int) -> Digital:
-        """Noisy digital numbers of expected ``electrons``; ``names`` find the frame's own noise."""
+        """Draw noisy digital numbers of expected ``electrons``."""
         shot, read = (stream(self.seed, noise, *names) for noise in ("shot", "read"))
         return expose(electrons, self.exposure_s, self.devices.sensor, shot, read)
 
     def rate(self, digital: Digital) -> FloatArray:
-        """What a user of frames computes of ``digital`` numbers: photoelectrons a second, dark current taken off."""
+        """Return photoelectrons per second, as a user computes them from ``digital`` numbers."""
         sensor = self.devices.sensor
         return dn_to_electrons(digital, sensor) / self.exposure_s - sensor.superpixel_dark_current_e_per_s
 
     def rendering_noise(self, frame: Frame) -> float:
-        """Root mean square Monte Carlo error of ``frame`` [electrons]."""
+        """Return the rms Monte Carlo error of ``frame`` [electrons]."""
         unit = electrons_from_irradiance(
             1.0, self.exposure_s, self.devices.sensor, self.devices.projector.effective_wavelength_nm
         )
         return float(np.sqrt(frame.variance) * unit)
 
     def sensor_noise(self, electrons: FloatArray) -> float:
-        """Root mean square noise of the sensor on expected ``electrons``, from its closed form [electrons]."""
+        """Return the closed-form rms noise of the sensor for expected ``electrons`` [electrons]."""
         variance = mean_variance(electrons, self.exposure_s, self.devices.sensor)
         return math.sqrt(variance) / self.devices.sensor.gain_dn_per_e
 
     def saturates(self, digital: Digital, electrons: FloatArray) -> bool:
-        """Whether a pixel of a ``digital`` frame, of expected ``electrons``, reached the full well or the ADC's end."""
+        """Return True if a pixel of the frame reached the full well or the end of the ADC."""
         return saturated_pixels(digital, electrons, self.exposure_s, self.devices.sensor) > 0
 
     def measurements(self, family: PatternFamily, expected: ExpectedFrames) -> Iterator[tuple[FloatArray, int, int]]:
-        """Noisy measurement [electrons / s] of every pattern (i, j) of ``family``, from its ``expected`` frames: of a
-        signed pattern the difference of two."""
+        """Yield the noisy measurement [electrons/s] of every pattern (i, j), from two frames if signed."""
         positive: FloatArray | None = None
         for shots in in_chunks(zip(family.shots, expected, strict=True)):
             rates = in_threads(lambda item: self._measurement(item[1], *item[0].names), shots)
@@ -94,12 +94,11 @@ class Exposer:
                 positive = None
 
     def _measurement(self, frame: Frame, *names: str | int) -> FloatArray:
-        """Noisy electrons a second of the frame ``names``."""
         return self.rate(self.digital(self.shot_electrons(frame, *names), *names))
 
 
 def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
-    """Lists of ``items``, in order, as many as :func:`frames_at_once` has of the frame that each item ends with."""
+    """Split ``items`` into lists of as many as :func:`frames_at_once` allows."""
     remaining = iter(items)
     for first in remaining:
         yield [first, *islice(remaining, frames_at_once(first[-1].irradiance.size) - 1)]
@@ -107,22 +106,14 @@ def in_chunks(items: Iterable[Item]) -> Iterator[list[Item]]:
 
 @dataclass(frozen=True)
 class NoiseTarget:
-    """Monte Carlo error at which more sampling buys nothing: a part of the sensor's own relative noise.
-
-    Attributes
-    ----------
-    devices, exposure
-        the devices, and how its exposure time is found.
-    fraction
-        part of the noise.
-    """
+    """Monte Carlo error below which more sampling gains nothing: a ``fraction`` of the sensor's own relative noise."""
 
     devices: Devices
     exposure: Exposure
     fraction: float
 
     def __call__(self, expected: ExpectedFrames) -> float:
-        """Relative error to stop at, from the frames ``expected`` so far."""
+        """Return the relative error at which sampling stops."""
         peak = peak_irradiance(expected)
         if peak <= 0:
             return np.inf
@@ -136,12 +127,12 @@ class NoiseTarget:
 
 
 def peak_irradiance(expected: ExpectedFrames) -> float:
-    """Irradiance [W m^-2] of the brightest pixel of ``expected`` frames."""
+    """Return the irradiance [W m^-2] of the brightest pixel of ``expected`` frames."""
     return max(float(frame.irradiance.max()) for frame in expected)
 
 
 def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str]:
-    """What a ``sensor`` does to frames of a ``shape`` that an image of them does not know of."""
+    """Yield effects of a ``sensor`` that the model of an image does not contain."""
     if sensor.has_defects:
         own = specimen(sensor, (shape[0], shape[1]))
         yield (
@@ -172,31 +163,24 @@ def camera_warnings(sensor: SensorModel, shape: tuple[int, ...]) -> Iterator[str
 
 AmbientChoice = Literal["auto", "yes", "no"]
 _PART = 1 / 16
-"""Part of an image's noise variance that its ambient frame may bring, 0.26 dB: an exposure for every further tenth of a
-decibel would be better spent on the frames."""
+"""Part of an image's noise variance that its ambient frame may add (0.26 dB)."""
 
 
 def takes_ambient_frame(choice: AmbientChoice, family: PatternFamily, expected: ExpectedFrames) -> bool:
-    """Whether a capture takes an ambient frame.
+    """Return True if a capture takes an ambient frame.
 
-    Parameters
-    ----------
-    choice
-        what was asked for; ``auto`` takes it where lamps are on and the family has frames that show them.
-    family
-        a signed one needs none: in the difference of two shots ambient light cancels, and so would an ambient frame.
-    expected
-        the family's frames.
+    With ``auto`` it does if lamps are on and the family is unsigned: in the difference of two shots ambient light
+    cancels.
     """
     return choice == "yes" or (choice == "auto" and expected.has_ambient and not family.signed)
 
 
 def ambient_shots(family: PatternFamily) -> int:
-    """Shots that an ambient frame is the mean of, so that its noise is at most a sixteenth of the image's variance.
+    """Return the shots of an ambient frame that add at most a sixteenth of the image's noise variance.
 
-    An ambient frame is no noisier than a frame with the projector on, but its noise is the same in all frames of a
-    ``family``. Where patterns p_i are disjoint, as shifting dots, every scene pixel sees it once, like that of its own
-    frame; where they are alike it adds up, by |sum_i p_i|^2 / sum_i |p_i|^2 on either side.
+    An ambient frame is no noisier than others, but its noise is common to all frames of a ``family``. With disjoint
+    patterns p_i such as shifting dots, every scene pixel contains it once, like the noise of its own frame. With
+    overlapping patterns it adds up by |sum_i p_i|^2 / sum_i |p_i|^2 on either side.
     """
     alike = 1.0
     for side in (family.left, family.right):
@@ -207,18 +191,18 @@ def ambient_shots(family: PatternFamily) -> int:
 
 @dataclass(frozen=True, eq=False)
 class AmbientFrame:
-    """Mean of some shots with the projector off.
+    """Mean of several shots with the projector off.
 
     Attributes
     ----------
     shots
-        that were averaged.
+        Number of shots.
     electrons
-        (rows, columns) expected in each, without dark current.
+        (rows, columns) expected electrons of each, without dark current.
     digital
         (rows, columns) mean digital numbers.
     saturated
-        whether a pixel reached the full well or the ADC's end in a shot.
+        True if a pixel saturated in a shot.
     """
 
     shots: int
@@ -228,15 +212,7 @@ class AmbientFrame:
 
     @classmethod
     def expose(cls, exposer: Exposer, expected: ExpectedFrames, shots: int) -> AmbientFrame:
-        """The mean of noisy shots, each with streams of its own.
-
-        Parameters
-        ----------
-        exposer, expected
-            camera and exposure of a family's frames, and these.
-        shots
-            to average.
-        """
+        """Average noisy shots, each with random streams of its own."""
         electrons = exposer.electrons(expected.projector_off)
         total, saturated = np.zeros_like(electrons), False
         step = frames_at_once(electrons.size)
@@ -249,13 +225,7 @@ class AmbientFrame:
 
 
 def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames) -> FloatArray | float:
-    """What a user of frames takes off each of them [electrons/s], from an ambient frame if they need one.
-
-    Parameters
-    ----------
-    exposer, family, expected
-        camera and exposure, patterns, and their frames without noise.
-    """
+    """Return the ambient light [electrons/s] that a user subtracts from each frame, from an ambient frame if needed."""
     if not takes_ambient_frame("auto", family, expected):
         return 0.0
     return exposer.rate(AmbientFrame.expose(exposer, expected, ambient_shots(family)).digital)
@@ -266,10 +236,10 @@ def taken_off(exposer: Exposer, family: PatternFamily, expected: ExpectedFrames)
 
 @dataclass(frozen=True)
 class Totals:
-    """Over all expected frames: brightest pixel [W m^-2], relative Monte Carlo error, most light below zero.
+    """Brightest pixel [W m^-2], relative Monte Carlo error and largest negative light over all expected frames.
 
-    ``heaviest``: the largest part of the Monte Carlo variance that one group of the light brings; ``mc_bound``: what
-    that error is below, at 95 %.
+    ``heaviest`` is the largest part of the Monte Carlo variance from one group of the light; ``mc_bound`` the 95 %
+    bound.
     """
 
     peak: float
@@ -280,12 +250,12 @@ class Totals:
 
     @property
     def noise(self) -> Estimate:
-        """The Monte Carlo error, and its bound."""
+        """Return the Monte Carlo error and its bound."""
         return Estimate(self.mc_error, self.mc_bound)
 
     @classmethod
     def of(cls, expected: ExpectedFrames) -> Totals:
-        """Those of all ``expected`` frames, which are formed for it."""
+        """Form all ``expected`` frames and return their totals."""
         peak = energy = variance = removed = heaviest = 0.0
         parts = np.zeros((1, 1))
         for chunk in in_chunks((frame,) for frame in expected):
@@ -301,18 +271,12 @@ class Totals:
 
 
 def _peak_and_energy(item: tuple[Frame]) -> tuple[float, float]:
-    """Irradiance of the brightest pixel of a frame, and the sum of its squares."""
     (frame,) = item
     return float(frame.irradiance.max()), sum_of_squares(frame.irradiance)
 
 
 @dataclass(frozen=True, eq=False)
 class _Exposed:
-    """One exposed shot: expected electrons, digital numbers, the two noises [electrons, rms], sums over its pixels.
-
-    ``light``, ``energy`` and ``signal``: of the electrons, of their squares, and of the squares without ambient light.
-    """
-
     index: int
     shot: Shot
     electrons: FloatArray
@@ -327,18 +291,18 @@ class _Exposed:
 
 @dataclass(eq=False)
 class Shooting:
-    """Turns expected frames into noisy ones and records them; frames that a resumed run has already are kept.
+    """Exposes expected frames and records them; frames that a resumed run already has are kept.
 
     Attributes
     ----------
     family, recorder, exposer
-        the shots, where they are kept, and the camera.
+        Shots, storage and camera.
     ambient
-        what is taken off the frames.
+        Light that is subtracted from the frames.
     always
-        (m, m') expected electrons of ambient light, which is in every frame.
+        (m, m') expected electrons of ambient light.
     saturated, noise_ratio
-        frames with saturated pixels, and the largest ratio of rendering to sensor noise, so far.
+        Frames with saturated pixels, and the largest ratio of rendering noise to sensor noise.
     """
 
     family: PatternFamily
@@ -355,22 +319,22 @@ class Shooting:
 
     @property
     def sensor_noise(self) -> float:
-        """Relative noise of the sensor, ||noise|| / ||expected||, over all frames, in closed form."""
+        """Return the sensor's closed-form relative noise ||noise|| / ||expected|| over all frames."""
         return math.sqrt(self._noise_energy / self._energy) if self._energy else 0.0
 
     @property
     def dilution(self) -> float:
-        """Norm of the frames' light over that of the projector's: by so much lamps dilute an error relative to all."""
+        """Return ||frames|| / ||projector's light||: the factor by which lamps dilute a relative error."""
         return math.sqrt(self._energy / self._signal) if self._signal else 1.0
 
     @property
     def ambient_part(self) -> float:
-        """Ambient light in all light of the frames."""
+        """Return the part of ambient light in the frames."""
         return float(self.always.sum()) * len(self.family.shots) / self._light if self._light else 0.0
 
     @property
     def noise_to_signal(self) -> float:
-        """Noise of the frames less the ambient frame, ||noise|| / ||light of the projector||, over all frames."""
+        """Return ||noise|| / ||light of the projector|| over all frames less the ambient frame."""
         own = 0.0
         if self.ambient is not None and not self.family.signed:
             own = self.exposer.sensor_noise(self.always) ** 2 / self.ambient.shots
@@ -379,15 +343,15 @@ class Shooting:
 
     @property
     def ambient_file(self) -> AmbientFile | None:
-        """What the manifest says of the ambient frame."""
+        """Return the manifest's entry of the ambient frame."""
         if self.ambient is None:
             return None
         return AmbientFile(file=AMBIENT, shots=self.ambient.shots, part=self.ambient_part, noise=self.noise_to_signal)
 
     def shoot(self, expected: ExpectedFrames, job: Job) -> None:
-        """Expose and record the ``expected`` frames in chunks, one thread a processor; the ``job`` times its stages.
+        """Expose and record the ``expected`` frames in chunks, one thread per processor.
 
-        Files are written while the next chunk is formed and exposed: ``write`` is the time that work waits for them.
+        Files are written while the next chunk is formed; the stage ``write`` is the time that work waits for them.
         """
         chunks = in_chunks(zip(range(len(expected)), self.family.shots, expected, strict=True))
         job.progress("frames", 0.0)
@@ -408,7 +372,6 @@ class Shooting:
                 writing.wait()
 
     def _count(self, shot: _Exposed) -> None:
-        """Add what a ``shot`` says to what all say."""
         if shot.rendering_noise:
             ratio = shot.rendering_noise / shot.sensor_noise if shot.sensor_noise else np.inf
             self.noise_ratio = max(self.noise_ratio, ratio)
@@ -451,7 +414,7 @@ class Shooting:
 
 
 def frame_channels(digital: Digital, electrons: FloatArray) -> dict[str, Channel]:
-    """Return the channels of a frame's file, from its ``digital`` numbers and expected ``electrons``."""
+    """Return the channels of a frame's file."""
     # EXR has no 64-bit numbers: the real-valued output of a sensor without an ADC is kept in single precision.
     whole = digital.dtype == np.uint32
     dn: Channel = digital.astype(np.uint32, copy=False) if whole else digital.astype(np.float32)

@@ -1,4 +1,4 @@
-"""One expected frame of a scene under its own light: a bench in, irradiance and its error out, by either estimator."""
+"""Expected frame of a scene under its own light, by either estimator, with its error."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ if TYPE_CHECKING:
     from mitsim.scene.load import LoadedScene
 
 _SAMPLERS = ("IndependentSampler", "OrthogonalSampler")
-"""The others of Mitsuba 3.9.1 order their strata by a hash that is no random permutation of few of them: some two of a
-path's numbers correlate, over 2^19 paths by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 a pixel."""
+"""Samplers without correlated dimensions. Others of Mitsuba 3.9.1 permute few strata by a hash: some pairs of a path's
+numbers correlate by 0.8 (stratified), 0.26 (ldsampler) and 0.15 (multijitter) at 4 samples per pixel.
+"""
 _SAMPLES = 64
-"""Samples a pixel where neither request nor scene states them, as the shipped scenes have it: a few seconds."""
+"""Default samples per pixel, as in the shipped scenes."""
 _UNKNOWN = 1.0
-"""Relative noise from which a frame is not known: where each pixel's light is that of one pass, it is infinite."""
+"""Relative noise above which a frame counts as unknown."""
 _SAMPLES_A_PASS = 64
-"""Samples a pixel of one pass: 2^24 paths of a 512 x 512 sensor, which fit in memory."""
+"""Samples per pixel of one pass: 2^24 paths of a 512 x 512 sensor fit in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +52,13 @@ class Rendered:
     Attributes
     ----------
     mean, error
-        (m, m', channels) irradiance, and its standard error.
+        (m, m', channels) irradiance and its standard error.
     facts
-        estimator, spp (None: factored), seconds, variant, seed, notes (what the scene's objects were changed in, and
-        which effects of the bench the reference leaves out), and mc_error_bound: 95 % bound of the factored estimator's
-        relative Monte Carlo error.
+        estimator, spp (None for factored), seconds, variant, seed, notes (changes of the scene's objects, and effects
+        that the reference neglects), and mc_error_bound (95 % bound of the factored estimator's relative Monte Carlo
+        error).
     warnings
-        why the frame is flagged.
+        Reasons why the frame is flagged.
     """
 
     mean: FloatArray
@@ -67,21 +68,18 @@ class Rendered:
 
     @property
     def mc_error(self) -> float:
-        """||standard error|| / ||frame||, with the noise's own energy taken off the frame's."""
+        """Return ||standard error|| / ||frame||, where the energy of the noise is subtracted from the frame's."""
         noise = float(np.square(self.error).sum())
         energy = float(np.square(self.mean).sum()) - noise
         return math.sqrt(noise / energy) if energy > 0 else math.inf
 
     def summary(self) -> dict[str, Any]:
-        """What the command line reports, but for the file's name."""
+        """Return the values that the command line reports."""
         return {**self.facts, "mean": float(self.mean.mean()), "mc_error": self.mc_error, "warnings": self.warnings}
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the frame and its error to the OpenEXR file ``path``, which is replaced; returns it.
-
-        MitsimError when it cannot be written.
-        """
+        """Write the frame and its error to the OpenEXR file ``path`` and return it; raise MitsimError if that fails."""
         names = ("Y",) if self.mean.shape[2] == 1 else ("R", "G", "B")
         channels = {name: self.mean[..., i].astype(np.float32) for i, name in enumerate(names)}
         channels |= {f"error.{name}": self.error[..., i].astype(np.float32) for i, name in enumerate(names)}
@@ -91,8 +89,7 @@ class Rendered:
 
     @check_arguments
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the frame, the mean of its channels, with a colour bar, on matplotlib's axes ``ax`` or, where that is
-        None, those of a new figure; returns them."""
+        """Draw the mean of the channels with a colour bar on ``ax`` or a new figure, and return the axes."""
         from mitsim.core.images import from_above
 
         return from_above("report.result_plots", "draw_rendered")(self, ax)
@@ -113,29 +110,30 @@ class Rendered:
 def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) -> tuple[FloatArray, FloatArray]:
     """Render with the scene's own integrator in independent passes, summed in float64.
 
-    Within a pass the paths of a pixel start from Owen-scrambled Sobol points (place in the pixel, opening of the mask);
-    passes are scrambled anew, so that their spread is the error.
+    The paths of a pixel start from Owen-scrambled Sobol points within a pass (position in the pixel, opening of the
+    mask). Passes are scrambled anew, so that their spread gives the error.
 
     Parameters
     ----------
     loaded
-        the scene.
+        The scene.
     spp
-        samples a pixel, at least 4: passes are compared to tell the noise.
+        Samples per pixel, at least 4, because passes are compared to estimate the noise.
     seed
-        root of the passes' streams.
+        Root of the passes' random streams.
     job
-        progress, and limits that the first pass is held against.
+        Progress, and limits that the first pass is compared with.
 
     Returns
     -------
-    (m, m', channels) irradiance [W m^-2] and its standard error.
+    tuple
+        (m, m', channels) irradiance [W m^-2] and its standard error.
 
     Raises
     ------
     MitsimError
-        for too few or too many samples, an integrator that cannot render this sensor or would lose light of this scene,
-        or work beyond the job's limits.
+        For too few or too many samples, an integrator that cannot render this sensor or loses light of this scene, or
+        work beyond the limits.
     """
     import mitsuba as mi
 
@@ -180,7 +178,6 @@ def reference(loaded: LoadedScene, spp: int, seed: int, job: Job | None = None) 
 
 
 def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
-    """What is wrong with the numbers that the scene's sampler draws for a path's turns."""
     sampler = loaded.camera.sampler().class_name()
     if sampler in _SAMPLERS:
         return ()
@@ -191,7 +188,6 @@ def _of_sampler(loaded: LoadedScene) -> tuple[str, ...]:
 
 
 def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
-    """Samples a pixel: ``spp`` as asked for, or those of the scene; MitsimError for too few or too many."""
     check_samples(estimator, spp)
     stated = bench.loaded.samples
     if spp is not None or stated is None:
@@ -205,7 +201,7 @@ def _samples(bench: Apparatus, estimator: str, spp: int | None) -> int:
 
 @contextmanager
 def show_pattern(bench: Apparatus, pattern: FloatArray) -> Iterator[None]:
-    """Show a ``pattern`` (n, n) of 0..1 on the ``bench``'s projector while the context lasts, for the reference."""
+    """Show a ``pattern`` (n, n) of 0..1 on the projector within the context, for the reference."""
     import mitsuba as mi
 
     parameters = mi.traverse(bench.loaded.projector)
@@ -233,20 +229,9 @@ def render(
     effects: Mapping[str, bool] | None = None,
     job: Job | None = None,
 ) -> Rendered:
-    """One frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`.
+    """Render one frame of a bench under its own light; see :meth:`mitsim.api.bench.Bench.render`.
 
-    Parameters
-    ----------
-    bench
-        what is rendered; the reference works on any scene with a ``mitsim_lensless`` sensor and any integrator, the
-        factored estimator needs a projector too.
-    estimator, spp, accuracy, seed, effects, job
-        as there.
-
-    Raises
-    ------
-    MitsimError
-        as there.
+    The reference renders any scene with a ``mitsim_lensless`` sensor; the factored estimator needs a projector too.
     """
     job = job or Job()
     spp = _samples(bench, estimator, spp)
@@ -296,7 +281,6 @@ def render(
 
 
 def _of_the_factored(bench: Apparatus) -> tuple[str, ...]:
-    """A note of the effects that the ``bench`` has and the reference has not; of a white picture, without its black."""
     if bench.loaded.projector is None:
         return ()
     absent = names(lambda effect: effect.in_frames and not effect.in_reference) - {"black-level"}
@@ -307,16 +291,16 @@ def _of_the_factored(bench: Apparatus) -> tuple[str, ...]:
 def rendered_psf(
     shape: tuple[int, int], pitch_mm: float, variant: str = DEFAULT_VARIANT, rays: int = 4096, seed: int = 0
 ) -> FloatArray:
-    """Light of a distant point behind the default diffuser of :mod:`mitsim.transport.plugins.diffuser`, of sum 1.
+    """Return the light of a distant point behind the default diffuser, normalised to a sum of 1.
 
     Parameters
     ----------
     shape, pitch_mm
-        rows and columns of the sensor, and its pixels' distance.
+        Rows and columns of the sensor, and pixel pitch.
     variant
-        of Mitsuba; it is selected for the process.
+        Variant of Mitsuba, which is selected for the process.
     rays, seed
-        as for :func:`mitsim.transport.plugins.diffuser.point_spread`.
+        As for :func:`mitsim.transport.plugins.diffuser.point_spread`.
     """
     load_variant(variant)
     from mitsim.transport.plugins.diffuser import Diffuser, point_spread

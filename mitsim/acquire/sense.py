@@ -1,7 +1,6 @@
-"""An image of irradiance or radiance in, what a camera's sensor makes of it out: digital numbers, in memory or a file.
+"""Response of a camera's sensor to an image of irradiance or radiance from any program.
 
-No scene and no renderer of ours: whatever writes OpenEXR or NPY can be put behind this sensor. Image pixels are the
-sensor's (binned) pixels; nothing is resampled.
+Image pixels are the sensor's (binned) pixels; nothing is resampled.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
 _PIXEL_BYTES = 100
-"""Of memory for a pixel: some ten arrays of double precision, as read, scaled, as electrons and as numbers."""
+"""Memory per pixel: some ten arrays of double precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +43,9 @@ class Sensed:
     digital
         (rows, columns) digital numbers.
     electrons
-        (rows, columns) expected photoelectrons, without dark current.
-    sensor, exposure_s, wavelength_nm, seed
-        what they were taken with.
+        (rows, columns) expected photoelectrons without dark current.
     notes
-        what was assumed of the image.
+        Assumptions about the image.
     """
 
     digital: Digital
@@ -61,20 +58,20 @@ class Sensed:
 
     @property
     def saturated(self) -> int:
-        """Pixels that reached the full well or the ADC's end, as a capture counts them."""
+        """Return the number of pixels that reached the full well or the end of the ADC."""
         from mitsim.sensor.moments import saturated_pixels
 
         return saturated_pixels(self.digital, self.electrons, self.exposure_s, self.sensor)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the frame is flagged."""
+        """Return the reasons why the frame is flagged."""
         if not self.saturated:
             return ()
         return (f"saturation: {self.saturated} pixels are at the full well or the ADC's end; expose for less",)
 
     def summary(self) -> dict[str, Any]:
-        """What the command line reports, but for the file's name."""
+        """Return the values that the command line reports."""
         return {
             "camera": self.sensor.name,
             "shape": list(self.digital.shape),
@@ -90,8 +87,7 @@ class Sensed:
 
     @check_arguments
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the digital numbers with a colour bar, on matplotlib's axes ``ax`` or, where that is None, those of a
-        new figure; returns them."""
+        """Draw the digital numbers with a colour bar on ``ax`` or a new figure, and return the axes."""
         return from_above("report.result_plots", "draw_sensed")(self, ax)
 
     def __repr__(self) -> str:
@@ -104,10 +100,10 @@ class Sensed:
 
     @check_arguments
     def save(self, path: Path | str) -> Path:
-        """Write the numbers to ``path``, which is replaced, by its ending; returns it.
+        """Write the numbers to ``path`` and return it.
 
-        ``.exr`` has channels DN and electrons with metadata, ``.npy`` the numbers, ``.png`` 16 bits of grey.
-        MitsimError for another ending, for a PNG of numbers that 16 bits do not hold, or where nothing can be written.
+        ``.exr`` has channels DN and electrons with metadata, ``.npy`` the numbers, ``.png`` 16 bits of grey. Raises
+        MitsimError for another ending, for numbers beyond 16 bits in a PNG, or if the file cannot be written.
         """
         path = Path(path)
         check_ending(path, self.sensor)
@@ -137,28 +133,28 @@ def sense(
     wavelength_nm: float = 550.0,
     notes: tuple[str, ...] = (),
 ) -> Sensed:
-    """What a sensor reads under an image of irradiance.
+    """Return the frame that a sensor reads under an image of irradiance.
 
     Parameters
     ----------
     irradiance
         (rows, columns) mean over each (binned) pixel [W m^-2].
     sensor
-        the camera.
+        The camera.
     exposure
-        seconds, or the part of the full well that the brightest pixel fills; 0.8 unless given.
+        Seconds, or the part of the full well that the brightest pixel fills; default 0.8.
     seed
-        of the noise; the camera's fixed pattern has its own.
+        Seed of the noise; the camera's fixed pattern has its own.
     wavelength_nm
-        one that stands for the light, and turns watts into photons.
+        Wavelength that converts watts to photons.
     notes
-        what is assumed of the image, for the result.
+        Assumptions about the image, for the result.
 
     Raises
     ------
     MitsimError
-        for an image that is no frame of numbers from 0, no light where the exposure is to follow from it, or a camera
-        whose file has no quantum efficiency.
+        For an image with other than finite numbers >= 0, no light although the exposure depends on it, or a camera
+        without quantum efficiency.
     """
     check_wavelength(wavelength_nm)
     if sensor.mosaic is not None:
@@ -189,11 +185,11 @@ def sense(
 
 
 def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray, tuple[str, ...]]:
-    """The image in an OpenEXR or NPY file ``path`` (rows, columns), and what was assumed of it.
+    """Return the image (rows, columns) in an OpenEXR or NPY file, and the assumptions about it.
 
-    Of several channels ``channel`` is taken; where it is None, the only one, or Y, or the luminance of R, G and B.
-    Channels whose names begin with "error." are those of `mitsim render`, and no light. MitsimError for a file that is
-    missing, damaged or of another kind, or a channel that is not there.
+    Without ``channel``, the only channel is read, or Y, or the luminance of R, G and B. Channels "error.*" of `mitsim
+    render` are ignored. Raises MitsimError for a file that is missing, damaged or of another kind, or a missing
+    channel.
     """
     path = Path(path)
     check_image(path)
@@ -227,14 +223,14 @@ def _light_of(channels: Mapping[str, Channel], channel: str | None, path: Path) 
 
 
 def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
-    """Irradiance [W m^-2] on the axis behind a lens: E = pi L / (4 N^2), for an object far away.
+    """Return the irradiance [W m^-2] on the axis behind a lens: E = pi L / (4 N^2), for a distant object.
 
     Parameters
     ----------
     radiance
         (rows, columns) [W m^-2 sr^-1].
     f_number
-        N, 0.5 or more; ArgumentError otherwise.
+        N, at least 0.5; ArgumentError otherwise.
     """
     check_f_number(f_number)
     return np.asarray(radiance * (math.pi / (4 * f_number**2)))

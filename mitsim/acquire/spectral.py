@@ -1,19 +1,15 @@
-"""A bench by the spectral lines of its light: a bench in; the plan of all lines together, and light of each, out.
+"""A bench by the spectral lines of its light: the plan of all lines together, and light of each.
 
 Wavelength is an axis of light. Paths carry a wavelength for each line (:func:`mitsim.light.light.trace_lines`); from
-there on every line is a bench of its own, with the line's power, diffraction and photons. Light that is not told apart
-is one line. A camera without colours sees one line of the projector at a time, and each is a run of its own; one under
-colour filters reads all of them in one run.
+there on every line is a bench of its own, with the line's power, diffraction and photons. Mono light is one line. A
+camera without colours sees one line of the projector at a time, each in a run of its own; a camera behind colour
+filters reads all of them in one run.
 
 With w_pl the electrons that a pixel of plane p of the 2 x 2 filters makes of a photon of line l, its expected electrons
-are
-
-    e_p = t A sum_l w_pl E_l lambda_l / (h c),
-
-those of a pixel without a filter, one electron a photon, in an irradiance sum_l w_pl E_l lambda_l / lambda of the
-projector's effective wavelength lambda. Frames of that irradiance go through the sensor as any other's. Lamps shine at
-wavelengths of their own, which each colour of filters counts for itself (:mod:`mitsim.devices.lamps`): a count c is an
-irradiance c / lambda.
+are e_p = t A sum_l w_pl E_l lambda_l / (h c). They equal those of a pixel without filter, one electron per photon, in
+an irradiance sum_l w_pl E_l lambda_l / lambda at the projector's effective wavelength lambda. Frames of that irradiance
+pass the sensor like any other. Lamps have wavelengths of their own, which each colour of filters counts by itself
+(:mod:`mitsim.devices.lamps`): a count c is an irradiance c / lambda.
 """
 
 from __future__ import annotations
@@ -51,9 +47,7 @@ from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTra
 from mitsim.transport.records import PathSamples
 
 _RAYS, _ALIKE = 4, 0.9
-"""Rays of each pixel that tell how rough a line's light is, and paths of each cell that tell lamps' light, a tenth of a
-second; and the part of the roughest line's differences from which a line counts as rough: what a plan leaves follows
-their root, of which this is a twentieth."""
+"""Rays per pixel for a line's roughness, paths per cell for lamps, and the relative roughness that counts."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +57,9 @@ class SpectralBench:
     Attributes
     ----------
     whole
-        all lines, which paths carry together.
+        All lines, which paths carry together.
     manifest
-        names of the lines; None: light is not told apart, and ``whole`` is the one line.
+        Names of the lines; None if ``whole`` is the one line of mono light.
     """
 
     whole: Apparatus
@@ -73,8 +67,11 @@ class SpectralBench:
 
     @classmethod
     def of(cls, bench: Apparatus, kind: str) -> SpectralBench:
-        """Of all lines of a ``bench``, for folders of a ``kind``. MitsimError where its light cannot be traced by line,
-        and for :data:`MOSAIC` where its camera has no colour filters that pass the lines."""
+        """Return all lines of a ``bench`` for folders of a ``kind``.
+
+        Raises MitsimError if light cannot be traced by line, and for :data:`MOSAIC` without filters that pass the
+        lines.
+        """
         if kind == MOSAIC:
             bench = without_filters(bench)
         if not bench.variant.endswith("_spectral"):
@@ -93,35 +90,35 @@ class SpectralBench:
 
     @cached_property
     def benches(self) -> tuple[Apparatus, ...]:
-        """The bench of each line alone."""
+        """Return the bench of each line alone."""
         if self.manifest is None or self.whole.lines is None:
             return (self.whole,)
         return tuple(line_alone(self.whole, line) for line in self.whole.lines.single)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the lines; none where light is not told apart."""
+        """Return the names of the lines; empty for mono light."""
         return self.manifest.names if self.manifest else ()
 
     @property
     def readings(self) -> tuple[Apparatus, ...]:
-        """The bench of each run of frames: all lines at once behind colour filters, else each line's."""
+        """Return the bench of each run of frames: all lines behind colour filters, else each line."""
         return (self.whole,) if self.whole.filters else self.benches
 
     def read(self, lights: Sequence[SampledLight]) -> Sequence[SampledLight]:
-        """The light of each of :attr:`readings`, from ``lights`` of the lines."""
+        """Return the light of each of :attr:`readings` from ``lights`` of the lines."""
         if self.whole.filters is None or self.manifest is None:
             return lights
         return [MosaicLight.of(self.whole, lights, self.manifest.wavelengths_nm)]
 
     def sampling(self, request: Request) -> Sampling:
-        """How light is sampled for one family's frames by a ``request``."""
+        """Return the sampling of light for the frames of a ``request``."""
         fraction = request.noise_fraction
         target = NoiseTarget(self.whole.devices, request.timing, fraction) if fraction else None
         return Sampling(by_pixel=False, target=target, excess=excess_behind_filters if self.whole.filters else None)
 
     def check(self, request: Request) -> None:
-        """MitsimError for what of a ``request`` the camera cannot have, or is not simulated in colour."""
+        """Raise MitsimError for options of a ``request`` that the camera lacks or that are not simulated in colour."""
         request.timing.check(self.whole.sensor, self.whole.devices.camera_file)
         if self.manifest is None:
             return
@@ -136,26 +133,13 @@ class SpectralBench:
             )
 
     def lit_by_lamps(self, effects: Mapping[str, bool], seed: int) -> SpectralBench:
-        """The same with lamps that shine at wavelengths of their own; itself where they do, and where light is not told
-        apart.
-
-        Parameters
-        ----------
-        effects, seed
-            as :func:`mitsim.acquire.spectral.lit_by_lamps` takes them.
-
-        Raises
-        ------
-        MitsimError
-            as there.
-        """
+        """Return a copy whose lamps have wavelengths of their own, if they shine and light is traced by line."""
         if self.manifest is None or self.whole.counted_lamps is not None:
             return self
         return replace(self, whole=lit_by_lamps(self.whole, effects, seed))
 
     def plan(self, request: Request) -> Plan:
-        """The plan of all lines together, which is that of the roughest, for a ``request``. MitsimError as
-        :func:`plan_request`, and for what is not simulated in colour."""
+        """Return the plan of all lines together for a ``request``, which is that of the roughest line."""
         if self.manifest is None:
             return plan_request(self.whole, request)
         self.check(request)
@@ -169,18 +153,10 @@ class SpectralBench:
         return replace(plan, made_of=self.whole.deciding)
 
     def roughest(self, seed: int, lit: float = 1.0) -> Apparatus:
-        """The line that is planned for: that whose light differs most between neighbouring pixels of the projector,
-        as a part of all light.
+        """Return the line that is planned for: the one whose light differs most between neighbouring projector pixels.
 
-        What a plan makes coarse leaves most of such light. Of lines that are alike the longest, whose shadow has the
-        widest fringes, is the worst.
-
-        Parameters
-        ----------
-        seed
-            of a few rays for each pixel.
-        lit
-            part of the pixels that a shot lights in the mean, beside which lamps shine.
+        Discretisation errs most for such light. Of equal lines the longest is the worst because its fringes are the
+        widest. ``lit`` is the part of the pixels that a shot lights on average.
         """
         bench, count = self.whole, len(self.benches)
         simulation = Simulation(bench, Settings(bench.geometry.scene_distance, effects=frozenset({"ambient"})))
@@ -200,32 +176,23 @@ class SpectralBench:
         return max(alike, key=lambda each: each.projector.effective_wavelength_nm)
 
     def with_truths(self, lights: Sequence[SampledLight], seed: int) -> list[SampledLight]:
-        """The ``lights`` of the lines with their truths, traced on the same paths from a ``seed``."""
+        """Return the ``lights`` of the lines with their truths, traced on the same paths."""
         errors = np.stack([light.flux_error for light in lights])
         truths = trace_truths(self.whole, lights[0].plan.settings, seed, errors)
         return [replace(light, known_truth=truth) for light, truth in zip(lights, truths, strict=True)]
 
 
 def line_alone(bench: Apparatus, line: Lines) -> Apparatus:
-    """The ``bench`` whose projector shows a ``line`` alone."""
+    """Return the ``bench`` whose projector shows a ``line`` alone."""
     devices = replace(bench.devices, projector=bench.projector.at(line.wavelengths_nm[0]))
     return replace(bench, devices=devices, lines=line)
 
 
 def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
-    """The plan of a capture, with the request that it is for and what it takes on this bench.
+    """Return the plan of a capture with its request and predicted cost.
 
-    Parameters
-    ----------
-    bench, request
-        what is asked for.
-    lines
-        that share the paths, of which the bench shows one; what it takes is told of all.
-
-    Raises
-    ------
-    MitsimError
-        when the request does not fit the bench, or no light of the projector reaches the camera.
+    ``lines`` is the number of lines that share the paths. Raises MitsimError if the request does not fit the bench, or
+    no light of the projector reaches the camera.
     """
     family, effects = bench.family(request.patterns, request.seed), request.effects
     lighting = family.lighting
@@ -244,9 +211,9 @@ def plan_request(bench: Apparatus, request: Request, lines: int = 1) -> Plan:
 
 
 def without_filters(bench: Opened) -> Opened:
-    """A ``bench`` whose frames are formed without its colour filters, which are kept beside.
+    """Return a ``bench`` without its colour filters, which are kept beside.
 
-    MitsimError for a camera that has none, or an odd number of pixels.
+    Raises MitsimError for a camera without filters or with an odd number of pixels.
     """
     sensor = bench.sensor
     if sensor.mosaic is None:
@@ -271,9 +238,9 @@ class MosaicLight(SampledLight):
     Attributes
     ----------
     by_line
-        light of each, traced on the same paths.
+        Light of each line, traced on the same paths.
     passed
-        (lines, m, m') part of each line's irradiance that counts, as that of the effective wavelength.
+        (lines, m, m') part of each line's irradiance that counts, at the effective wavelength.
     """
 
     by_line: tuple[SampledLight, ...] = ()
@@ -281,15 +248,7 @@ class MosaicLight(SampledLight):
 
     @classmethod
     def of(cls, bench: Apparatus, lights: Sequence[SampledLight], wavelengths_nm: Sequence[float]) -> MosaicLight:
-        """Of all lines together.
-
-        Parameters
-        ----------
-        bench
-            with all lines, as :func:`without_filters` makes it.
-        lights, wavelengths_nm
-            of each line.
-        """
+        """Combine the ``lights`` of all lines of a bench from :func:`without_filters`."""
         weights = np.array(bench.counting.planes(wavelengths_nm))
         counted = weights * np.asarray(wavelengths_nm) / bench.projector.effective_wavelength_nm
         first = lights[0]
@@ -308,23 +267,16 @@ class MosaicLight(SampledLight):
 
     @property
     def lost(self) -> float:
-        """The largest of any line."""
+        """Return the largest loss of any line."""
         return max(light.lost for light in self.by_line)
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Expected frames of all lines together; see :meth:`Light.frames`.
-
-        Parameters
-        ----------
-        lighting, seed, leaking
-            as there.
-        """
+        """Return the expected frames of all lines together; see :meth:`Light.frames`."""
         assert self.passed is not None, "made by of()"
         lines = [light.frames(lighting, seed, leaking).of_projector for light in self.by_line]
         return MosaicFrames(lines, self.passed, self._lamps(seed), self.by_line[0].simulation.lamps_apart)
 
     def _lamps(self, seed: int) -> Frame | None:
-        """Lamps' light behind the filters, with its error by probes of a ``seed``; None without lamps."""
         counted_lamps = self.bench.counted_lamps
         if counted_lamps is None:
             return None
@@ -346,12 +298,11 @@ class MosaicLight(SampledLight):
         return Frame(irradiance, variance, max(each.removed for each in frames), heaviest, parts)
 
     def speckle(self, family: PatternFamily | None = None) -> float:
-        """None, of any ``family``: a projector with speckle is refused."""
+        """Return None: a projector with speckle is refused."""
         return 0.0
 
 
 def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames:
-    """One frame of lamps of a ``light``, of some ``bands`` of theirs; a ``seed`` of its probes."""
     counted_lamps = light.bench.counted_lamps
     assert counted_lamps is not None, "asked before"
     accumulated = light.simulation.of_lamps(light.groups, light.groups[0].rows - len(counted_lamps.bands), bands)
@@ -359,11 +310,9 @@ def _lamps_alone(light: SampledLight, bands: slice, seed: int) -> ExpectedFrames
 
 
 def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
-    """By how much the error of lamps' light behind filters exceeds that of their mean over all pixels, which is in
-    every line's light; 1 without ``lights`` of lamps.
+    """Return the ratio of the error of lamps' light behind filters to that of their mean over all pixels.
 
-    A filter's few wavelengths are sampled worse than all. Its frames weigh by their energy, which for the same scene is
-    that of what a pixel counts.
+    The few wavelengths of a filter are sampled worse than all. Frames are weighted by their energy.
     """
     light, counted_lamps = lights[0], lights[0].bench.counted_lamps
     if counted_lamps is None or counted_lamps.shares is None:
@@ -381,19 +330,19 @@ def excess_behind_filters(lights: Sequence[SampledLight]) -> float:
 class MosaicFrames(ExpectedFrames):
     """Frames of every shot behind the filters; iterate as often as needed.
 
-    Lines are traced on the same paths, so their errors go together: that of the sum is at most the sum of theirs.
-    So do they with that of lamps' light, but where no other light is on lamps' paths.
+    Lines share their paths, so that their errors are correlated: that of the sum is at most the sum of theirs. The same
+    holds for lamps' light unless no other light is on its paths.
 
     Parameters
     ----------
     lines
-        frames of each line, of the projector's light alone.
+        Frames of each line, of the projector's light alone.
     passed
         (lines, m, m') part of its irradiance that counts.
     lamps
-        their light, as it counts, which is in every frame.
+        Light of lamps in every frame.
     independent
-        whether no other light is on their paths.
+        True if no other light is on the lamps' paths.
     """
 
     def __init__(
@@ -407,12 +356,12 @@ class MosaicFrames(ExpectedFrames):
 
     @property
     def has_ambient(self) -> bool:
-        """Whether lamps shine."""
+        """Return True if lamps shine."""
         return self._lamps is not None
 
     @property
     def projector_off(self) -> Frame:
-        """The frame of lamps alone, dark where there are none; its Monte Carlo error is that of all frames."""
+        """Return the frame of lamps alone, with the Monte Carlo error of all frames."""
         return (
             self._lines[0].projector_off
             if self._lamps is None
@@ -431,8 +380,6 @@ class MosaicFrames(ExpectedFrames):
             yield Frame(light, variance, removed, heaviest, parts)
 
     def _sum_of_products(self, products: FloatArray) -> FloatArray:
-        """Return the (G, G) inner products of groups' noise in the sum of the lines' light and lamps', from (lights, G,
-        G) those of each. Noise that goes together is taken for multiples of the same frames."""
         roots = np.sign(products) * np.sqrt(np.abs(products))
         own, lamps = (
             np.tensordot(self._spread, roots[: len(self._lines)], axes=1),
@@ -444,8 +391,6 @@ class MosaicFrames(ExpectedFrames):
 
 
 def _truth_of_all(lights: Sequence[SampledLight], counted: FloatArray) -> Truth:
-    """What a perfect image of all pixels together would show: the lines' truths by the light that is ``counted``
-    (lines,) of each on the board."""
     truths = [light.apparent for light in lights]
     shape = truths[0].reflectance.shape
     board = counted[:, None] * np.stack([truth.board_flux for truth in truths])
@@ -461,30 +406,29 @@ def _truth_of_all(lights: Sequence[SampledLight], counted: FloatArray) -> Truth:
 # -------- Lamps at wavelengths of their own, as the camera counts them
 
 _STEP_NM = 24.0
-"""Widest part of a band whose light diffracts as that of its middle: a shadow's fringes hardly move over it, as for
-ambient light without colours."""
+"""Widest part of a band whose light diffracts like that of its middle."""
 _CELLS, _SAMPLES = 32, 16
-"""Cells a side, and paths of each: a part of 5 % of the light is told to some percent, in a tenth of a second."""
+"""Cells per side and paths per cell: they find 5 % of the light to some percent."""
 _END_NM = 10.0
-"""Of spectra, what tells how much light there is beyond their end."""
+"""Range at the end of spectra from which the light beyond is estimated."""
 
 
 def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Apparatus:
-    """The same bench, whose lamps shine at wavelengths of their own; as it is without lamps.
+    """Return the bench with lamps at wavelengths of their own, or unchanged without lamps.
 
     Parameters
     ----------
     bench
-        of a spectral variant.
+        Bench of a spectral variant.
     effects
-        switched on or off by the user.
+        Effects that the user switched on or off.
     seed
-        root of the random streams.
+        Root of the random streams.
 
     Raises
     ------
     MitsimError
-        for a camera whose efficiency is not known where lamps' spectra are, or that is blind to the projector's lines.
+        For a camera whose efficiency is unknown in the lamps' spectra, or that is blind to the projector's lines.
     """
     if not bench.loaded.lamps or not effects.get("ambient", True):
         return bench
@@ -509,28 +453,16 @@ def lit_by_lamps(bench: Apparatus, effects: Mapping[str, bool], seed: int) -> Ap
 
 @dataclass(frozen=True)
 class _LampRuns:
-    """What one response counts: ``light`` (bands,) and ``spectra`` of each of its bands, and the part ``unknown``."""
-
     light: FloatArray
     spectra: tuple[Spectrum, ...]
     unknown: float
 
     @classmethod
     def of(cls, response: Response, tracer: FromCameraTracer, stream: int) -> _LampRuns:
-        """By a few paths.
-
-        Parameters
-        ----------
-        response
-            that counts.
-        tracer, stream
-            whose paths they are, and their random numbers.
-        """
         (first, last), (begin, end) = response.range_nm, SPECTRA_NM
         parts = math.ceil((last - first) / MOST_LINES / _STEP_NM)
 
         def fit_response(*bands: Band) -> FloatArray:
-            """(bands,) light of each."""
             light = LampTracer(tracer, LampResponse(response, bands, (1.0,))).trace(stream, 0, _SAMPLES)
             return np.asarray(np.bincount(light.pixel - tracer.projector.n**2, light.value, MOST_LINES) / _SAMPLES)
 
@@ -546,23 +478,11 @@ class _LampRuns:
 
 
 def _spectrum(wavelengths: FloatArray, light: FloatArray) -> Spectrum:
-    """Of a band whose ``light`` is (parts,) at ``wavelengths`` [nm]; where there is none, even."""
     lit = light > 0 if light.any() else np.ones(len(light), dtype=bool)
     weights = light[lit] if light.any() else np.ones(len(light))
     return Spectrum(wavelengths[lit], weights / weights.sum())
 
 
 def _unknown(response: Response, light: FloatArray, counted: float) -> float:
-    """Part of the light that is not counted but would be, if efficiency and spectra went on as they end.
-
-    Parameters
-    ----------
-    response
-        of the camera.
-    light
-        (bands,) before its range, after it, and at the spectra's end.
-    counted
-        light that is.
-    """
     missing = float(light[0] + light[1] + light[2] / _END_NM * response.beyond_nm)
     return missing / (missing + counted) if missing else 0.0

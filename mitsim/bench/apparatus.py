@@ -1,4 +1,4 @@
-"""Names or files of a scene, a camera and a projector in; what they are together, loaded, or a refusal, out."""
+"""A scene with camera and projector, opened from names or files, or a refusal."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ if TYPE_CHECKING:
 
 
 _OF_COLOURS = {"quantum_efficiency_curve", "mosaic", "mosaic_curves"}
-"""Fields of a sensor that weigh light of some wavelengths against that of others."""
+"""Fields of a sensor that weight wavelengths."""
 _NOT_SIMULATED = {
     "name", "luminous_flux_lm", "luminous_efficacy_lm_per_w", "radiant_flux_w", "throw_ratio", "columns", "rows",
     "pixel_aspect", "laser_class", "assumed", "derived", "source",
 }  # fmt: skip
-"""Fields of a projector that say what it is, and change no light."""
+"""Fields of a projector that describe it and change no light."""
 _SPECKLED_SHOTS = 8
-"""Shots whose contrast stands for a family's: those of dots differ by less than a percent, by where the window ends."""
+"""Shots whose contrast stands for a family's."""
 
 
 # -------- What is loaded
 
 
 def check_depth(depth: float) -> float:
-    """``depth`` [mm], or ArgumentError when it is not in front of the camera."""
+    """Return ``depth`` [mm], or raise ArgumentError if it is not in front of the camera."""
     if not 0 < depth < math.inf:
         raise ArgumentError("depth", f"{depth:g}: give millimetres above 0")
     return depth
@@ -65,25 +65,24 @@ class Apparatus:
     Attributes
     ----------
     loaded
-        the scene.
+        The scene.
     devices
-        camera, sensor and projector, as pure data.
+        Camera, sensor and projector as data.
     variant
-        of Mitsuba.
+        Variant of Mitsuba.
     defines
-        parameters that the scene was loaded with.
+        Parameters with which the scene was loaded.
     lines
-        lines of the projector's light that spectral variants trace; None: wavelengths drawn from all.
+        Lines of the projector that spectral variants trace; None draws wavelengths from all.
     counted_lamps
-        how the camera counts lamps' light of all wavelengths; None: as light of the projector's effective wavelength.
+        How the camera counts lamps' light of all wavelengths; None treats it like the projector's.
     filters
-        the camera with its colour filters, which are put over frames; the sensor in ``devices`` then has none, and
-        makes one electron of a photon. None: frames are as the sensor has them.
+        The camera with its colour filters, which are applied to frames; the sensor in ``devices`` then has none and
+        makes one electron per photon. None without filters.
     board
-        reflectance, depth and shape of the board that stands in the scene's place; None: the scene itself.
+        Reflectance, depth and shape of the board that replaces the scene; None for the scene itself.
     opened
-        ``camera``, ``projector`` (whole paths; None: the usual one) and ``allow_outside_files``, as it was opened by;
-        of no influence on what it does. None: not known.
+        ``camera``, ``projector`` (absolute paths or None) and ``allow_outside_files`` as given; None if unknown.
     """
 
     loaded: LoadedScene
@@ -98,32 +97,32 @@ class Apparatus:
 
     @property
     def geometry(self) -> CameraGeometry:
-        """The camera's geometry, as the scene states it."""
+        """Return the camera's geometry."""
         return self.devices.camera
 
     @property
     def sensor(self) -> SensorModel:
-        """The camera's electronics."""
+        """Return the camera's electronics."""
         return self.devices.sensor
 
     @property
     def counting(self) -> SensorModel:
-        """The electronics whose efficiency counts lamps' light, with their colour filters."""
+        """Return the electronics whose efficiency counts lamps' light, with colour filters."""
         return self.filters or self.sensor
 
     @property
     def projector(self) -> ProjectorModel:
-        """The projector's light and lens."""
+        """Return the projector's light and lens."""
         return self.devices.projector
 
     @property
     def n(self) -> int:
-        """Projector pixels a side."""
+        """Return the projector pixels per side."""
         return self.loaded.pixels.n
 
     @cached_property
     def projector_optics(self) -> ProjectorOptics:
-        """The projector as the tracers want it."""
+        """Return the projector as tracers need it."""
         from mitsim.transport.projector import ProjectorOptics
 
         grid, model = self.loaded.pixels, self.projector
@@ -144,19 +143,19 @@ class Apparatus:
 
     @property
     def setup(self) -> OpticalSetup:
-        """What light is traced in."""
+        """Return the setup in which light is traced."""
         from mitsim.transport.connect import OpticalSetup
 
         return OpticalSetup(self.loaded.scene, self.loaded.camera, self.projector_optics, self.geometry)
 
     @property
     def spectrum(self) -> Spectrum:
-        """The projector's photons by wavelength."""
+        """Return the projector's photons by wavelength."""
         return self.projector.spectrum
 
     @cached_property
     def waves(self) -> Spectrum | None:
-        """Lines of that light whose diffraction at the mask is worked out; None: of none."""
+        """Return the lines whose diffraction is computed, or None."""
         from mitsim.optics.diffraction import narrowest_mm
         from mitsim.optics.fft_shadow import check_waves
 
@@ -171,7 +170,7 @@ class Apparatus:
 
     @cached_property
     def specular(self) -> SpecularLight:
-        """Light of the projector that mirrors alone bring to the sensor, or nothing but free space."""
+        """Return the light that reaches the sensor over mirrors or free space alone."""
         from mitsim.optics.mirror_frames import SpecularLight
         from mitsim.transport.specular import trace_specular_chains
 
@@ -179,12 +178,12 @@ class Apparatus:
 
     @property
     def windows(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Row and column tan-angles of the projector's window on the aligned plane."""
+        """Return row and column tan-angles of the projector's window on the aligned plane."""
         return self.loaded.pixels.row_tan, self.loaded.pixels.column_tan
 
     @check_arguments
     def windows_at(self, depth: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The same on a plane at ``depth`` [mm]; ArgumentError for one that is not in front of the camera."""
+        """Return the window's tan-angles at ``depth`` [mm]; raise ArgumentError for one behind the camera."""
         check_depth(depth)
         if depth == self.geometry.scene_distance:
             return self.windows
@@ -198,18 +197,16 @@ class Apparatus:
 
     @cached_property
     def _windows(self) -> dict[float, tuple[tuple[float, float], tuple[float, float]]]:
-        """Those that were asked for, by their depth."""
         return {}
 
     @property
     def parallax(self) -> Parallax:
-        """How the factors of a calibration on the aligned plane move with depth, as its manifest states it."""
+        """Return how factors of a calibration on the aligned plane change with depth."""
         return self.parallax_from(self.geometry.scene_distance)
 
     @check_arguments
     def parallax_from(self, depth: float) -> Parallax:
-        """The same of a calibration at ``depth`` [mm]; ArgumentError for one that is not beyond the mask, or farther
-        than 1e10."""
+        """Return the parallax of a calibration at ``depth`` [mm], which lies between the mask and 1e10 mm."""
         from mitsim.core.manifests import FARTHEST, Parallax
 
         if depth <= self.geometry.mask_distance:
@@ -242,13 +239,12 @@ class Apparatus:
         )
 
     def _centre(self, axis: int) -> float:
-        """Middle of a frame's rows (``axis`` 0) or columns (1) [mm], of a region of interest."""
         centres = self.geometry.centres(axis)
         return 0.0 if self.geometry.roi is None else float(centres[0] + centres[-1]) / 2
 
     @property
     def field_stop_cuts(self) -> bool:
-        """Whether some sensor point does not see all of the projector's window through the field stop."""
+        """Return True if a sensor point does not see the whole projector window through the field stop."""
         geometry = self.geometry
         return any(
             max(map(abs, window)) + half / geometry.scene_distance > geometry.tan_half_fov
@@ -257,15 +253,14 @@ class Apparatus:
 
     @check_arguments
     def family(self, patterns: str, seed: int = 0) -> PatternFamily:
-        """The family ``patterns`` on this projector, ``seed`` for random ones; MitsimError when it does not fit."""
+        """Return the pattern family on this projector; raise MitsimError if it does not fit."""
         from mitsim.devices.patterns import parse_patterns
 
         return parse_patterns(patterns, self.n, seed)
 
     @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
-        """Contrast of laser speckle in a sensor pixel: as the projector states it, or, computed, under the patterns of
-        a ``family`` (rms over some of its shots; None: a white picture)."""
+        """Return the speckle contrast in a sensor pixel, stated or computed for a ``family`` (None: white)."""
         if self.projector.speckle is None:
             return self.projector.speckle_contrast
         import numpy as np
@@ -283,12 +278,10 @@ class Apparatus:
 
     @cached_property
     def _contrasts(self) -> dict[tuple[bytes, bytes] | None, float]:
-        """Those that were computed, by their family's patterns."""
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """What must be equal for a calibration to fit a capture: camera geometry, electronics, projector grid, and the
-        lines of its light, of which the mask's diffraction depends."""
+        """Return all that must be equal for a calibration to fit a capture."""
         grid, lines = self.loaded.pixels, self.projector.lines
         of_lines: dict[str, Any] = {
             "lines_nm": list(lines.wavelengths_nm),
@@ -309,7 +302,7 @@ class Apparatus:
         }
 
     def provenance(self) -> dict[str, Any]:
-        """Where the scene came from: path, checksums of the XML and all that it reads, parameters, variant."""
+        """Return path, checksums, parameters and variant of the scene."""
         from mitsim.core.exr import checksum
 
         return {
@@ -329,8 +322,10 @@ class Apparatus:
 
     @property
     def deciding(self) -> dict[str, Any]:
-        """All that a plan of it hangs on, by name, as JSON has it: neither where files lie, nor what only
-        exposes frames: the sensor's noise, its full well, and an efficiency that is one number."""
+        """Return all that determines a plan, by name, for JSON.
+
+        Paths are excluded, and so are properties that only affect exposure: noise, full well, a constant efficiency.
+        """
         from mitsim.core.exr import checksum
 
         folder, own = self.loaded.path.parent, self.counting.model_dump(include=_OF_COLOURS, exclude_none=True)
@@ -355,8 +350,7 @@ class Apparatus:
 
     @cached_property
     def devices_digest(self) -> str:
-        """SHA-256 of the devices, where they are, and the projector's light: all that a board in the scene's place
-        shows. Scenes that differ in surfaces and lamps alone have the same."""
+        """Return the SHA-256 of all that a board in the scene's place shows: devices, places, light."""
         import mitsuba as mi
         import numpy as np
 
@@ -370,8 +364,7 @@ class Apparatus:
 
     @check_arguments
     def in_bands(self, count: int) -> Self:
-        """The same bench whose projector has ``count`` bands of its lines as lines; MitsimError as
-        :meth:`mitsim.devices.projector.ProjectorModel.in_bands`."""
+        """Return the bench whose projector has ``count`` bands of its lines as lines."""
         return replace(self, devices=replace(self.devices, projector=self.projector.in_bands(count)))
 
 
@@ -383,24 +376,24 @@ Opened = TypeVar("Opened", bound=Apparatus)
 def check_scene(
     scene: Path | str, defines: Mapping[str, str], outside: bool = False, patterns: Iterable[str] = ()
 ) -> Path:
-    """Where a scene lies, which is refused without the renderer where that is possible.
+    """Return the path of a scene, and refuse it without the renderer where possible.
 
     Parameters
     ----------
     scene
-        as of :func:`mitsim.api.bench.open_bench`.
+        Scene as for :func:`mitsim.api.bench.open_bench`.
     defines
-        values of its parameters by name.
+        Values of its parameters by name.
     outside
-        as ``allow_outside_files`` there.
+        Allow files outside its folder.
     patterns
-        families that its projector is to show.
+        Families that its projector is to show.
 
     Raises
     ------
     MitsimError
-        for a scene that there is not, a parameter that it does not have, XML that is not well-formed, and patterns that
-        need more pixels than the projector's picture lights.
+        For a missing scene, unknown parameters, malformed XML, and patterns that need more pixels than the projector
+        has.
     """
     path = locate(scene, "scenes", "scene.xml")
     pictures = Outline(path, defines, SceneFiles(path, outside)).projected
@@ -411,8 +404,7 @@ def check_scene(
 
 
 def check_devices(camera: Path | str | None, projector: Path | str | None) -> tuple[Path, Path]:
-    """Files of a ``camera`` and a ``projector``, as of :func:`mitsim.api.bench.open_bench`; MitsimError for one that
-    there is not."""
+    """Return the files of a ``camera`` and a ``projector``; raise MitsimError if one is missing."""
     found = ((camera, DEFAULT_CAMERA, CAMERA), (projector, "mp_cl1", PROJECTOR))
     first, second = (
         locate(default if name is None else name, "calibration", ".toml", field) for name, default, field in found
@@ -423,7 +415,6 @@ def check_devices(camera: Path | str | None, projector: Path | str | None) -> tu
 
 
 def _check_camera(path: Path) -> None:
-    """MitsimError for a camera file whose sensor breaks a rule, with the mistakes of its mask beside them."""
     from mitsim.devices.sensor import SensorModel, sensor_table
 
     table = read_toml(path)
@@ -446,13 +437,7 @@ def open_apparatus(
     for_render: bool = False,
     **parameters: object,
 ) -> Apparatus:
-    """Scene, camera and projector, loaded.
-
-    Parameters
-    ----------
-    scene, variant, camera, projector, allow_outside_files, for_render, **parameters
-        as for :func:`mitsim.api.bench.open_bench`, which has the errors raised as well.
-    """
+    """Load scene, camera and projector; parameters and errors as for :func:`mitsim.api.bench.open_bench`."""
     defines = {name: spelling(value) for name, value in parameters.items()}
     path = check_scene(scene, defines, allow_outside_files)
     sensor_path, projector_path = check_devices(camera, projector)
@@ -496,7 +481,6 @@ def open_apparatus(
 
 
 def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Path | str) -> None:
-    """MitsimError, which begins with ``where``, for the usual camera in a ``scene`` whose pixels are another's."""
     from mitsim.devices.sensor import PITCH_TOLERANCE
 
     pitches = zip(
@@ -512,8 +496,7 @@ def _check_pitch(loaded: LoadedScene, sensor: SensorModel, where: str, scene: Pa
 
 
 def reopen(bench: Opened, variant: str) -> Opened:
-    """The ``bench`` loaded anew into a ``variant``, which is set from then on. MitsimError as
-    :func:`mitsim.api.bench.open_bench`."""
+    """Load the ``bench`` anew in a ``variant``, which is set from then on."""
     from mitsim.devices.mask_profile import load_mask
 
     camera = Path(bench.devices.camera_file)
@@ -525,13 +508,11 @@ def reopen(bench: Opened, variant: str) -> Opened:
 
 
 def _wear(loaded: LoadedScene, mask: MaskProfile | None, camera: Path) -> None:
-    """Put a ``mask`` of the file of a ``camera``, where it has one, before the sensor of a ``loaded`` scene."""
     if mask is not None:
         loaded.camera.wear(mask.put_on(loaded.camera.geometry, camera.parent))
 
 
 def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
-    """Give glass of a ``loaded`` scene the one wavelength of a ``projector`` that is not told apart by line."""
     if loaded.parting:
         from mitsim.transport.plugins.glass import tune
 
@@ -540,7 +521,6 @@ def _tune(loaded: LoadedScene, projector: ProjectorModel) -> None:
 
 @pause_collector()
 def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) -> LoadedScene:
-    """A scene in a variant that is set from then on, as :func:`mitsim.scene.load.load_scene` takes it."""
     mitsuba = load_variant(variant)
     from mitsim.scene.load import load_scene
     from mitsim.transport import plugins
@@ -564,7 +544,6 @@ def _load(variant: str, path: Path, defines: Mapping[str, str], **options: Any) 
 
 
 def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) -> MitsimError | None:
-    """The refusal of a scene with a ``contact`` by an ``estimator``."""
     if contact is None:
         return None
     got, rule = contact.words(estimator)
@@ -574,5 +553,5 @@ def _refusal_of(loaded: LoadedScene, contact: Contact | None, estimator: str) ->
 
 
 def spelling(value: object) -> str:
-    """The ``value`` of a parameter as a scene spells it."""
+    """Return the ``value`` of a parameter as a scene spells it."""
     return str(value).lower() if isinstance(value, bool) else str(value)

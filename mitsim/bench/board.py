@@ -1,4 +1,4 @@
-"""A calibration's white board: its shape in a recipe in; a Mitsuba object, and the pixels that miss it, out."""
+"""White board of a calibration: a Mitsuba object from its shape in a recipe, and the pixels that miss it."""
 
 from __future__ import annotations
 
@@ -25,27 +25,19 @@ if TYPE_CHECKING:
     from mitsim.devices.camera import CameraGeometry
 
 _BEYOND = 1.1
-"""Half side of a board without a size, as a part of what the sensor's edge sees; chosen: more than rounding."""
+"""Half side of a board without a stated size, relative to what the sensor's edge sees."""
 _GRAZING = 0.05
-"""Least part by which a board without a size recedes from a ray: it is at most 20 times what is seen of a flat one."""
+"""Least cosine by which a board without a stated size recedes from a ray."""
 CELLS = 64
-"""Facets a side of a bowed board: they lie up to 1/4096 of the bow off the paraboloid."""
+"""Facets per side of a bowed board, within 1/4096 of the bow of the paraboloid."""
 _INSIDE = 1e-3
-"""Projector pixels from a pixel's corners to the rays that are tried: more than rounding moves a board's edge."""
+"""Distance in projector pixels from a pixel's corners to the rays that are tried."""
 
 
 def before_board(
     bench: Opened, reflectance: float, shape: BoardShape | None = None, depth: float | None = None
 ) -> Opened:
-    """The devices of a bench before a diffuse board.
-
-    Parameters
-    ----------
-    bench
-        whose scene is replaced.
-    reflectance, shape, depth
-        as for :meth:`mitsim.api.bench.Bench.with_board`, which has the errors raised as well.
-    """
+    """Return the devices of a bench before a diffuse board; see :meth:`mitsim.api.bench.Bench.with_board`."""
     if not 0 <= reflectance <= 1:
         raise ArgumentError("reflectance", f"{reflectance:g}: give a number from 0 to 1")
     where, shape = bench.geometry.scene_distance if depth is None else check_depth(depth), shape or BoardShape()
@@ -59,17 +51,7 @@ def before_board(
 
 
 def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth: float) -> Any:
-    """A diffuse board before the camera, as Mitsuba loads it.
-
-    Parameters
-    ----------
-    bench
-        whose camera it faces.
-    reflectance, shape
-        of the board.
-    depth
-        of its middle [mm].
-    """
+    """Return a diffuse board of the given ``reflectance`` and ``shape`` at ``depth`` [mm] for Mitsuba."""
     half = _half_side(shape, bench.geometry, depth)
     bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
     turned, camera = np.eye(4), np.eye(4)
@@ -84,9 +66,11 @@ def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth:
 
 
 def turn_of(shape: BoardShape) -> FloatArray:
-    """(3, 3) rotation of a board of that ``shape`` in the camera's frame, by the smallest angle that gives it its
-    slopes: its plane is z = tan(tilt_row) s_row + tan(tilt_column) s_column, s_row = -y and s_column = -x. So no axis
-    comes first."""
+    """Return the (3, 3) rotation of a board of that ``shape`` in the camera's frame.
+
+    It is the smallest rotation with the board's slopes, so that no axis comes first: its plane is z = tan(tilt_row)
+    s_row + tan(tilt_column) s_column, with s_row = -y and s_column = -x.
+    """
     slope = np.array([-math.tan(math.radians(tilt)) for tilt in (shape.tilt_column_deg, shape.tilt_row_deg)])
     steep = float(np.linalg.norm(slope))
     if steep == 0:
@@ -100,8 +84,6 @@ def turn_of(shape: BoardShape) -> FloatArray:
 
 
 def _half_side(shape: BoardShape, geometry: CameraGeometry, z: float) -> float:
-    """Half of the board's side [mm] at a distance ``z`` [mm] from a camera of that ``geometry``; without a size, beyond
-    what the camera sees of it."""
     if shape.size_mm is not None:
         return shape.size_mm / 2
     half = _BEYOND * (geometry.tan_half_fov * z + geometry.half_width)
@@ -114,13 +96,9 @@ def _half_side(shape: BoardShape, geometry: CameraGeometry, z: float) -> float:
 
 
 def bowed_surface(shape: BoardShape, half: float) -> tuple[FloatArray, FloatArray]:
-    """Points and normals (CELLS + 1, CELLS + 1, 3) of a bowed board in its own frame, its camera's side towards -z: the
-    paraboloid z = bow (x^2 + y^2) / half^2.
+    """Return points and normals (CELLS + 1, CELLS + 1, 3) of a bowed board: z = bow (x^2 + y^2) / half^2.
 
-    Parameters
-    ----------
-    shape, half
-        its bow, and half of its side [mm].
+    They are in the board's own frame, with the camera's side towards -z; ``half`` is half of its side [mm].
     """
     line = np.linspace(-half, half, CELLS + 1)
     x, y = np.meshgrid(line, line)
@@ -132,8 +110,7 @@ def bowed_surface(shape: BoardShape, half: float) -> tuple[FloatArray, FloatArra
 
 @keep_scenes()
 def missed_pixels(bench: Apparatus) -> int:
-    """Projector pixels of a ``bench`` before its board that do not light a whole piece of it, seen by the camera: the
-    ray of a corner misses the board, or meets a side that the projector or the camera does not see."""
+    """Return the projector pixels that do not light a whole piece of the board as the camera sees it."""
     n = bench.n
     rays, eye = PinholeRays(bench.projector_optics, [None]), camera_place(bench)[1]
     row, column = np.divmod(np.arange(n * n), n)
@@ -148,22 +125,11 @@ def missed_pixels(bench: Apparatus) -> int:
 
 
 def camera_place(bench: Apparatus) -> tuple[FloatArray, FloatArray]:
-    """(3, 3) turn and (3,) place [mm] of a ``bench``'s camera in the world."""
+    """Return the (3, 3) rotation and (3,) position [mm] of the camera in the world."""
     return turn_and_origin(bench.loaded.camera.world_transform())
 
 
 def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[str, Any]) -> mi.Mesh:
-    """A bowed board.
-
-    Parameters
-    ----------
-    shape, half
-        its bow, and half of its side [mm].
-    place
-        (4, 4) from its own frame to the world.
-    bsdf
-        of its surface.
-    """
     points, normals = bowed_surface(shape, half)
     side = CELLS + 1
     corner = (np.arange(CELLS)[:, None] * side + np.arange(CELLS)).reshape(-1, 1)

@@ -1,9 +1,8 @@
-"""Every effect that a scene may call for, in one table: a bench and the effects that are on in, the physics out.
+"""Table of all effects that a scene may call for, and the physics that result from a bench and its active effects.
 
-An effect that is off takes its neutral value, which passes light through unchanged. Plan, pilot, simulation, studies
-and tests read :data:`EFFECTS`; nothing else knows what effects there are. To add one: give it a field of
-:class:`Physics` (or of the camera or projector in it) and compute it where that field is read; enter it here; test it;
-describe it in docs/physics.md.
+An effect that is off takes its neutral value, which leaves light unchanged. Plan, pilot, simulation, studies and tests
+read :data:`EFFECTS`. To add an effect: give it a field of :class:`Physics` (or of the camera or projector in it),
+compute it where that field is read, enter it here, test it, and describe it in docs/physics.md.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from mitsim.transport.projector import ProjectorOptics
 
 DIRECT, FOLLOWED = "direct", "followed"
-"""Light of one surface from the projector, and all that is followed over more or from the camera: what is traced."""
+"""Kinds of traced light: from one surface, and over several surfaces or from the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +35,21 @@ class Physics:
     Attributes
     ----------
     geometry
-        the camera.
+        The camera.
     projector
-        the projector's pixels and lens.
+        The projector's pixels and lens.
     spectrum
-        light whose diffraction at the mask is simulated; None: the mask's shadow is geometric.
+        Light whose diffraction at the mask is simulated; None for a geometric shadow.
     black_level
-        light of a black projector pixel, as a part of a white one's.
+        Light of a black projector pixel relative to a white one.
     speckle
-        speckle contrast of the frames.
+        Speckle contrast of the frames.
     lamps
-        emitters beside the projector.
+        True for emitters beside the projector.
     mirrors
-        whether light is followed over surfaces that reflect or transmit in single directions.
+        True to follow light over surfaces that reflect or transmit in single directions.
     interreflection
-        whether light is followed over several surfaces.
+        True to follow light over several surfaces.
     """
 
     geometry: CameraGeometry
@@ -64,7 +63,7 @@ class Physics:
 
     @classmethod
     def of(cls, bench: Apparatus) -> Physics:
-        """Everything that ``bench`` has."""
+        """Return all effects of ``bench``."""
         return cls(
             geometry=bench.geometry,
             projector=bench.projector_optics,
@@ -78,7 +77,7 @@ class Physics:
 
     @classmethod
     def with_effects(cls, bench: Apparatus, effects: Collection[str]) -> Physics:
-        """What ``bench`` has of ``effects``; all others take their neutral values."""
+        """Return the given ``effects`` of ``bench``; all others take their neutral values."""
         physics = cls.of(bench)
         for effect in EFFECTS.values():
             if effect.name not in effects:
@@ -88,36 +87,36 @@ class Physics:
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: what it is, and all that others must know to simulate and to judge it.
+    """One effect, with all properties that are needed to simulate and judge it.
 
     Attributes
     ----------
     name
-        in plans, on the command line and in manifests.
+        Name in plans, on the command line and in manifests.
     neutral
-        its neutral values, by field of :class:`Physics`; ``part.field`` names one of the camera or projector.
+        Neutral values by field of :class:`Physics`; ``part.field`` names one of the camera or projector.
     what
-        it is, for who sees its name.
+        Description.
     absent
-        why a plan leaves it off where a bench does not have it.
+        Reason that a plan gives if a bench lacks the effect.
     note
-        what a plan says of a bench that has it.
+        Sentence of a plan about a bench with the effect.
     retraced
-        light (:data:`DIRECT`, :data:`FOLLOWED`) that must be traced anew to see the frames without it.
+        Light (:data:`DIRECT`, :data:`FOLLOWED`) that must be traced again to form frames without the effect.
     kind
-        kind of traced light that is left out to the same end; None: nothing is.
+        Kind of traced light that is omitted instead; None for none.
     first_pilot_run
-        whether it shapes direct light so much that the pilot has it on while it looks for anchors, layers and cells.
+        True if it shapes direct light so much that the pilot includes it while choosing anchors, layers and cells.
     followed
-        whether its light is followed over several surfaces or from the camera, which takes time.
+        True if its light is followed over several surfaces or from the camera.
     in_shadow
-        whether it costs time in the mask's shadow.
+        True if it costs time in the mask's shadow.
     in_frames
-        whether it is part of the expected frames; the others are drawn with the sensor's noise.
+        True if it is part of the expected frames; others are drawn with the sensor's noise.
     in_reference
-        whether the reference estimator has it.
+        True if the reference estimator has it.
     in_truth
-        whether a calibration board in the scene's place has it too, so that it cancels in apparent reflectance.
+        True if it also acts on a calibration board and therefore cancels in apparent reflectance.
     """
 
     name: str
@@ -135,12 +134,12 @@ class Effect:
     in_truth: bool = False
 
     def present(self, bench: Apparatus) -> bool:
-        """Whether ``bench`` has it: one of its values is not the neutral one."""
+        """Return True if ``bench`` has the effect."""
         physics = Physics.of(bench)
         return any(_value(physics, name) != value for name, value in self.neutral.items())
 
     def without(self, physics: Physics) -> Physics:
-        """``physics`` with its neutral values."""
+        """Return ``physics`` with the neutral values of the effect."""
         for name, value in self.neutral.items():
             owner, _, last = name.rpartition(".")
             if not owner:
@@ -288,29 +287,29 @@ EFFECTS: Mapping[str, Effect] = _registry(
         in_frames=False,
     ),
 )
-"""All effects, in the order of a plan's rows."""
+"""All effects in the order of a plan's rows."""
 
 DISCRETISED: Mapping[str, str] = MappingProxyType({
     "anchors": "points of the sensor that light is traced to, for what changes over it",
     "layers": "depths, each with a shadow of its own",
 })  # fmt: skip
-"""What a plan counts instead of switching it, and what it is; off means one."""
+"""Quantities that a plan counts instead of switching; off means one."""
 SWITCHES = (*DISCRETISED, *EFFECTS)
 """Names that a user may switch on or off."""
 
 
 def present(bench: Apparatus) -> tuple[str, ...]:
-    """Names of the effects that ``bench`` has."""
+    """Return the names of the effects that ``bench`` has."""
     return tuple(name for name, effect in EFFECTS.items() if effect.present(bench))
 
 
 def names(which: Callable[[Effect], bool]) -> frozenset[str]:
-    """Names of the effects for which ``which`` holds."""
+    """Return the names of the effects for which ``which`` is true."""
     return frozenset(name for name, effect in EFFECTS.items() if which(effect))
 
 
 def parse_switches(text: str) -> dict[str, bool]:
-    """A ``text`` such as ``+ambient,-diffraction`` as {name: on}; MitsimError for no effect, or a missing sign."""
+    """Parse a ``text`` such as ``+ambient,-diffraction`` as {name: on}; raise MitsimError for anything else."""
     switches: dict[str, bool] = {}
     for word in filter(None, (part.strip() for part in text.split(","))):
         if word[0] not in "+-" or word[1:] not in SWITCHES:
@@ -323,5 +322,5 @@ def parse_switches(text: str) -> dict[str, bool]:
 
 
 def check_switches(switches: Mapping[str, bool]) -> dict[str, bool]:
-    """``switches`` {name: on} as they are; MitsimError for a name that is no effect."""
+    """Return ``switches`` {name: on}; raise MitsimError for a name that is no effect."""
     return parse_switches(",".join(f"{'+' if on else '-'}{name}" for name, on in switches.items()))

@@ -20,18 +20,17 @@ from mitsim.scene.darkness import why_dark
 from mitsim.transport.direct import DirectTracer
 
 _SEEN = 0.25
-"""Part of the projector's pixels that must be seen; the shipped scenes have 0.96 to 1, and 0.75 beside a mirror."""
+"""Part of the projector's pixels that must be visible; shipped scenes have 0.96 to 1, and 0.75 beside a mirror."""
 MOST_LOST = 0.3
-"""Part of the mask without factors, rms, at which a calibration is refused: a tenth of the light's energy."""
+"""Part of the mask without factors (rms) from which a calibration is refused: a tenth of the light's energy."""
 _SEPARABLE = 0.01
-"""Residual of a mask that has two factors: as :data:`mitsim.reconstruct.estimate_factors.SEPARABLE_RESIDUAL`, whose
-import takes 0.1 s."""
+"""Residual of a separable mask, as :data:`mitsim.reconstruct.estimate_factors.SEPARABLE_RESIDUAL`."""
 _PLACES = 256
-"""Points of the mask along an axis that are compared; the singular values take 20 ms."""
+"""Points of the mask per axis that are compared; the singular values take 20 ms."""
 
 
 class Fault(NamedTuple):
-    """Why there is no image, what to do, and the part that an image lacks; 1: no image can be solved for."""
+    """Reason without image, remedy, and the missing part of the image; 1 if no image can be solved for."""
 
     reason: str
     remedy: str
@@ -39,14 +38,14 @@ class Fault(NamedTuple):
 
 
 def obstacles(bench: Apparatus, family: PatternFamily | None = None) -> tuple[str, ...]:
-    """Return why no calibration can give an image, with the remedy, in one sentence for each reason; () if it can.
+    """Return why no calibration can give an image, with the remedy, one sentence per reason; () if it can.
 
     Parameters
     ----------
     bench
-        scene, camera and projector.
+        Scene, camera and projector.
     family
-        patterns of the frames; None if they are not known yet, so that data are not counted.
+        Patterns of the frames; None if they are not known yet, so that data are not counted.
     """
     found = _unseen_scene(bench), mask_fault(bench), family and shortage(bench, family)
     return tuple(f"{fault.reason}; {fault.remedy}" for fault in found if fault)
@@ -57,8 +56,10 @@ def obstacles(bench: Apparatus, family: PatternFamily | None = None) -> tuple[st
 
 @keep_scenes()
 def seen_light(bench: Apparatus) -> tuple[int, tuple[float, float] | None]:
-    """Return how many projector pixels of a ``bench`` light what the sensor's centre sees, by one ray a pixel, and the
-    nearest and farthest depth [mm] of that light, None if there is none."""
+    """Return the number of projector pixels that light points visible from the sensor's centre, and their depths.
+
+    The nearest and farthest depth [mm] are None if there is none. One ray is traced per pixel.
+    """
     light = DirectTracer(bench.setup, 1).trace(0, 0, 1)
     inverse = light.inverse_depth[light.value > 0]
     depths = (1 / float(inverse.max()), 1 / float(inverse.min())) if len(inverse) else None
@@ -66,7 +67,6 @@ def seen_light(bench: Apparatus) -> tuple[int, tuple[float, float] | None]:
 
 
 def _unseen_scene(bench: Apparatus) -> Fault | None:
-    """Mirrors may show the scene where direct light does not, so that benches with mirrors are not judged."""
     if bench.loaded.mirrors:
         return None
     (seen, _), every = seen_light(bench), bench.n**2
@@ -89,7 +89,7 @@ def mask_fault(bench: Apparatus) -> Fault | None:
     """Return why the mask of a ``bench`` has no two factors, even without diffraction and tilt; None if it has.
 
     The part of the mask that the sensor sees is compared with the best product of a row and a column profile, with and
-    without the means that a solver takes off. The reason follows from the residual of the mask alone, and of its size.
+    without the means that a solver subtracts.
     """
     geometry, mask = bench.geometry, bench.geometry.build_mask()
     crossings = _crossings(bench)
@@ -124,13 +124,11 @@ def mask_fault(bench: Apparatus) -> Fault | None:
 
 
 def _beyond_one(values: FloatArray) -> float:
-    """Return the part of ``values`` (rows, columns), rms, that the best product of two profiles leaves."""
     energy = np.square(np.linalg.svd(values, compute_uv=False))
     return float(np.sqrt(energy[1:].sum() / energy.sum())) if energy.sum() > 0 else 0.0
 
 
 def _larger(feature_mm: float, needed_mm: float, of_a_file: bool) -> str:
-    """Scenes have codes of 2^order - 1 features. Masks of files get an odd prime, which a MURA needs."""
     least, feature = math.ceil(needed_mm / feature_mm), f"{feature_mm * 1e3:g} um"
     if of_a_file:
         return f"use at least {next(n for n in count(least) if is_odd_prime(n))} features of {feature}"
@@ -152,10 +150,10 @@ def _crossings(bench: Apparatus) -> list[FloatArray]:
 
 
 def shortage(bench: Apparatus, family: PatternFamily) -> Fault | None:
-    """Return how frames of a ``bench`` under the patterns of a ``family`` are too few, or None if they are enough.
+    """Return why frames of a ``bench`` under a ``family`` are too few, or None if they suffice.
 
-    Numbers are counted on the sensor rows and columns that the mask lights, and unknowns on the projector pixels that
-    any pattern lights. Behind colour filters, every line of the light has its own unknowns.
+    Data are counted on the sensor rows and columns that the mask lights, and unknowns on the projector pixels that any
+    pattern lights. Behind colour filters, every line of the light has its own unknowns.
     """
     geometry, n = bench.geometry, bench.n
     half = geometry.build_mask().extent_mm / 2

@@ -1,6 +1,6 @@
-"""A bench in; where its devices and surfaces stand before the camera, and two pictures of it in its own light, out.
+"""Positions of a bench's devices and surfaces before the camera, and two pictures of the bench in its own light.
 
-Places are in the camera's frame [mm]: +z to the scene, +y up, +x to the left of who looks along +z.
+Positions are in the camera's frame [mm]: +z to the scene, +y up, +x to the left of a viewer along +z.
 """
 
 from __future__ import annotations
@@ -24,28 +24,27 @@ from mitsim.transport.plugins.base import channels, device_vectors, host_values,
 from mitsim.transport.projector import PinholeRays
 
 _TRIANGLES = 24_000
-"""Triangles of all meshes that have fewer: a print on a square sheet then has 110 x 110 samples, and all are drawn in a
-second."""
+"""Triangles into which meshes are divided that have fewer."""
 _RAYS = 48
-"""Rays a side, from each of six sides, that meet a shape without triangles: its outline is 1/48 of its box fine."""
+"""Rays per side from each of six sides that hit a shape without triangles."""
 _JUMP = 3.0
-"""Cells by which neighbouring rays may end apart on one surface: 1.4 on a sphere, where another side sees it better."""
+"""Cells between neighbouring rays' ends that count as one surface: 1.4 on a sphere."""
 _EDGE_ON, _PASSED = 1e-6, 8
-"""Part of a shape's size below which it has no width, and surfaces of others that stand inside its box at most."""
+"""Part of a shape's size below which it has no width, and surfaces of others inside its box at most."""
 _FILL = 0.2
-"""Part of a preview's light that is of a lamp at its camera: chosen so that what is beside the window is seen."""
+"""Part of a preview's light from a lamp at its camera, so that surroundings of the window are visible."""
 _PIXELS, _SAMPLES, _TURNS = 320, 32, 4
-"""Pixels a side of a preview, samples a pixel and surfaces of a path: a second or two; noise that eyes do not mind."""
+"""Pixels per side, samples per pixel and surfaces of a path of a preview."""
 _WHITE = 99.5
-"""Percentile that a preview shows as white: mirrored light may be a thousand times as bright."""
+"""Percentile that a preview shows as white, because mirrored light may be a thousand times as bright."""
 _ASIDE = (0.6, 0.55, -0.75)
-"""Direction from the projector's window to the free place: left, above and before it, so that fronts are seen."""
+"""Direction from the window to the free camera: left, above and in front."""
 _MARGIN = 1.5
-"""How much wider than the window the view from there is; chosen: what stands around it is seen too."""
+"""Width of the free view relative to the window."""
 _EDGES = 2
-"""Rays a side of a pixel that show its surfaces: edges are smooth."""
+"""Rays per side of a pixel that show its surfaces."""
 _NEAR, _FAR = 1e-3, 1e7
-"""Where the view of a preview begins and ends [mm]: scenes are of millimetres to kilometres."""
+"""Near and far clip of a preview [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +54,15 @@ class Surface:
     Attributes
     ----------
     name
-        as the scene calls it, or its kind.
+        Name in the scene, or its kind.
     points
         (k, 3) corners [mm].
     triangles
-        (m, 3) numbers of corners.
+        (m, 3) indices of corners.
     reflectance
-        (k, channels) diffuse reflectance at the corners, 0 to 1; a half where it is not known.
+        (k, channels) diffuse reflectance at the corners, 0 to 1; 0.5 if unknown.
     is_lamp
-        whether it shines.
+        True if it emits.
     """
 
     name: str
@@ -75,26 +74,26 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where all of a bench stands.
+    """Positions of all parts of a bench.
 
     Attributes
     ----------
     surfaces
-        shapes of the scene.
+        Shapes of the scene.
     projector
-        (3,) place of the projector's pinhole.
+        (3,) position of the projector's pinhole.
     window
-        (4, 3) corners of the projector's window on the aligned plane, one after the other around it.
+        (4, 3) corners of the projector's window on the aligned plane, in order around it.
     lamps
-        (3,) places of lamps without a surface, by name.
+        (3,) positions of lamps without a surface, by name.
     seen
-        projector pixels whose light the camera's middle sees at once, of n x n.
+        Number of projector pixels whose light the camera's centre sees directly.
     depths
-        nearest and farthest depth [mm] that this light is seen at; None where there is none.
+        Nearest and farthest depth [mm] of this light, or None.
     moves
-        rows and columns of projector pixels by which a change of 1/z by 1/mm moves the window.
+        Rows and columns of projector pixels by which 1/mm of 1/z moves the window.
     obstacles
-        why no calibration can give an image of this bench, a sentence each.
+        Reasons why no calibration can give an image of this bench.
     """
 
     surfaces: tuple[Surface, ...]
@@ -108,23 +107,23 @@ class Layout:
 
     @property
     def parallax(self) -> tuple[float, float]:
-        """Rows and columns of projector pixels by which the window moves between the nearest and farthest light."""
+        """Return rows and columns of projector pixels by which the window moves between nearest and farthest light."""
         return (0.0, 0.0) if self.depths is None else self.parallax_between(*self.depths)
 
     def parallax_between(self, near: float, far: float) -> tuple[float, float]:
-        """The same between the depths ``near`` and ``far`` [mm]."""
+        """Return the movement of the window between the depths ``near`` and ``far`` [mm]."""
         step = 1 / near - 1 / far
         return self.moves[0] * step, self.moves[1] * step
 
     def window_at(self, depth: float) -> FloatArray:
-        """(4, 3) corners of the window on the plane at ``depth`` [mm]."""
+        """Return the (4, 3) corners of the window on the plane at ``depth`` [mm]."""
         rays = self.window - self.projector
         return np.asarray(self.projector + rays * ((depth - self.projector[2]) / rays[:, 2])[:, None])
 
 
 @keep_scenes()
 def layout_of(bench: Apparatus) -> Layout:
-    """Where all of a ``bench`` stands, and where the camera sees the projector's light: one ray a projector pixel."""
+    """Determine the layout of a ``bench`` with one ray per projector pixel."""
     loaded, geometry, n = bench.loaded, bench.geometry, bench.n
     turn, origin = camera_place(bench)
     rays = PinholeRays(bench.projector_optics, [None])
@@ -152,7 +151,6 @@ def layout_of(bench: Apparatus) -> Layout:
 
 
 def _surfaces(bench: Apparatus, turn: FloatArray, origin: FloatArray) -> tuple[Surface, ...]:
-    """All shapes of a scene, in the frame of a camera of that ``turn`` and ``origin``."""
     shapes, tags, found = bench.loaded.scene.shapes(), bench.loaded.shapes, []
     area = sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in shapes if shape.is_mesh())
     for number, shape in enumerate(shapes):
@@ -172,8 +170,6 @@ _Triangles = tuple[FloatArray, npt.NDArray[np.int64], FloatArray]
 
 
 def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
-    """World points, triangles and reflectances of a mesh, whose triangles are parted where all, of so much ``area``,
-    are few."""
     count = mesh.face_count()
     corners = mesh.face_indices(dr.arange(mi.UInt32, count))
     own = float(np.array(mesh.surface_area()).ravel()[0])
@@ -194,8 +190,6 @@ def _of_mesh(mesh: mi.Mesh, area: float) -> _Triangles:
 
 
 def _triangle_parts(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Barycentric weights (k, 3) of a triangle's points where each of its edges has so many ``parts``, and its smaller
-    triangles (parts^2, 3)."""
     place = [(i, j) for i in range(parts + 1) for j in range(parts + 1 - i)]
     number = {at: index for index, at in enumerate(place)}
     weights = np.array([(parts - i - j, i, j) for i, j in place]) / parts
@@ -205,7 +199,6 @@ def _triangle_parts(parts: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
 
 
 def _of_rays(scene: mi.Scene, shape: mi.Shape) -> _Triangles:
-    """The same of a ``shape`` of a ``scene`` without triangles, of what parallel rays from six sides meet of it."""
     box = shape.bbox()
     low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
     size, sides = high - low, np.float64(np.linalg.norm(high - low))
@@ -235,7 +228,6 @@ def _of_rays(scene: mi.Scene, shape: mi.Shape) -> _Triangles:
 
 
 def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteraction3f:
-    """What rays meet of a ``shape``, behind what stands before it."""
     own = mi.ShapePtr(shape)
     met = scene.ray_intersect(ray)
     for _ in range(_PASSED):
@@ -248,7 +240,6 @@ def _meet(scene: mi.Scene, ray: mi.Ray3f, shape: mi.Shape) -> mi.SurfaceInteract
 
 
 def _reflectance(bsdf: Any, at: mi.SurfaceInteraction3f, count: int) -> FloatArray:
-    """(count, channels) diffuse reflectance of a ``bsdf`` at some points, 0 to 1."""
     try:
         values = channels(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(at)), count)
     except (RuntimeError, NotImplementedError, AttributeError):  # materials need not know it
@@ -263,16 +254,16 @@ def _reflectance(bsdf: Any, at: mi.SurfaceInteraction3f, count: int) -> FloatArr
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What a pinhole camera sees of a bench.
+    """View of a bench by a pinhole camera.
 
     Attributes
     ----------
     picture
-        (rows, columns, 1 or 3) linear light, 0 black, 1 white, as where there is nothing.
+        (rows, columns, 1 or 3) linear light, 0 black, 1 white (also where there is nothing).
     place
-        (4, 4) from the bench's frame to this camera's, where it looks along +z, +x to the left.
+        (4, 4) transform from the bench's frame to this camera's.
     half_tan
-        tangent of half the angle of its view.
+        Tangent of half the field angle.
     """
 
     picture: FloatArray
@@ -280,7 +271,7 @@ class Preview:
     half_tan: float
 
     def project(self, points: FloatArray) -> FloatArray:
-        """(k, 2) where ``points`` (k, 3) [mm] of the bench are in the picture: columns, rows; NaN behind the camera."""
+        """Return (k, 2) columns and rows of ``points`` (k, 3) [mm] in the picture; NaN behind the camera."""
         local = points @ self.place[:3, :3].T + self.place[:3, 3]
         rows, columns = self.picture.shape[:2]
         ahead = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
@@ -290,14 +281,9 @@ class Preview:
 
 @keep_scenes()
 def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
-    """What is seen from the sensor's place, through the field stop, and from a free place.
+    """Render the views from the sensor through the field stop, and from a free camera.
 
-    The projector is lit white, and a weak lamp at the camera's own place shows what that does not light.
-
-    Parameters
-    ----------
-    bench, layout
-        what is seen, and where it stands.
+    The projector shows white, and a weak lamp at the camera lights the rest.
     """
     turn, origin = camera_place(bench)
     world = np.eye(4)
@@ -328,7 +314,6 @@ def previews(bench: Apparatus, layout: Layout) -> tuple[Preview, Preview]:
 
 
 def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
-    """(rows, columns, 1 or 3) picture of a ``scene`` from a ``place`` (4, 4) under a full ``angle`` [degrees]."""
     kind = "luminance" if mi.is_monochromatic else "rgb"
     film = {"type": "hdrfilm", "width": _PIXELS, "height": _PIXELS, "pixel_format": kind, "rfilter": {"type": "box"}}
     pose = mi.ScalarAffineTransform4f(place.tolist())
@@ -344,8 +329,6 @@ def _picture(scene: mi.Scene, place: FloatArray, angle: float) -> FloatArray:
 
 
 def _by_own_lamp(scene: mi.Scene, sensor: mi.Sensor) -> tuple[FloatArray, FloatArray]:
-    """Light of surfaces by a lamp at a ``sensor``, reflectance times cosine, and the part of each pixel that shows
-    nothing; (rows, columns, 1 or 3) and (rows, columns, 1)."""
     side = _PIXELS * _EDGES
     column, row = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
     place = mi.Point2f(*(mi.Float(axis.ravel().astype(np.float32)) for axis in (column, row)))
@@ -356,7 +339,6 @@ def _by_own_lamp(scene: mi.Scene, sensor: mi.Sensor) -> tuple[FloatArray, FloatA
     light = _reflectance(met.bsdf(ray), met, side * side) * cosine * hit
 
     def mean(values: FloatArray) -> FloatArray:
-        """Over each pixel's rays."""
         return np.asarray(values.reshape(_PIXELS, _EDGES, _PIXELS, _EDGES, -1).mean(axis=(1, 3)))
 
     return mean(light), 1 - mean(hit)

@@ -1,8 +1,8 @@
-"""A bench and a picture in; the same bench whose prints show it, and whether one tracing serves every picture, out.
+"""Pictures on the prints of a bench, and whether one tracing serves every picture.
 
-Light of a flat diffuse sheet that stands alone is linear in the reflectance of each of its points, and all of it comes
-straight from there to the sensor: light of a white sheet, times the picture, is that of the picture. Light over several
-surfaces is a product of reflectances, and is traced anew for each picture.
+Light of a flat diffuse sheet that stands alone is linear in the reflectance of each point, and comes directly from
+there to the sensor. Light of a white sheet times the picture is then that of the picture. Light over several surfaces
+contains products of reflectances, and is traced for each picture.
 """
 
 from __future__ import annotations
@@ -23,16 +23,15 @@ if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus
 
 _PARALLEL = 1e-6
-"""Sine of a sheet's tilt that is rounding in single precision: its edges then lie some 1e-4 mm nearer or farther."""
+"""Sine of a sheet's tilt that counts as rounding."""
 _BITMAP, _PLAIN = ("reflectance.data", "diffuse_reflectance.data"), "reflectance.value"
-"""What Mitsuba calls the reflectance of a print, and of an even surface, at the end of a parameter's name."""
+"""Endings of Mitsuba's parameter names for the reflectance of a print, and of an even surface."""
 _LARGEST_CODE = 255
-"""Code of reflectance 1 in a bitmap of eight bits."""
+"""8-bit code of reflectance 1."""
 
 
 def traced_anew(bench: Apparatus) -> str:
-    """Why light of a ``bench`` is to be traced anew for each picture on its prints; empty where light of white prints,
-    times the picture, is as good."""
+    """Return why light must be traced anew for each picture; empty if light of white prints can be multiplied."""
     loaded, shapes = bench.loaded, bench.loaded.scene.shapes()
     if len(shapes) != 1:
         return f"the scene has {len(shapes)} surfaces, which light each other"
@@ -50,10 +49,7 @@ def traced_anew(bench: Apparatus) -> str:
 
 @keep_scenes()
 def show_white(bench: Apparatus) -> None:
-    """Make all printed surfaces of a ``bench``, or the one surface of a scene without prints, reflect all light.
-
-    MitsimError for a scene of several surfaces without a print.
-    """
+    """Make all printed surfaces, or the only surface, reflect all light; raise MitsimError without either."""
     for surface, names in _prints(bench):
         for name in names:
             values = np.ones(np.shape(surface[name]))
@@ -63,20 +59,10 @@ def show_white(bench: Apparatus) -> None:
 
 @keep_scenes()
 def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None:
-    """Put a picture on all prints of a ``bench``: each point has the reflectance of the projector's pixel that lights
-    it, and beyond the projector's window that of the nearest.
+    """Put a picture on all prints: each point takes the reflectance of the projector's pixel that lights it.
 
-    Parameters
-    ----------
-    bench
-        whose scene is changed.
-    reflectance
-        (n, n), one number a projector pixel.
-
-    Raises
-    ------
-    MitsimError
-        for a scene without a print, or one whose bitmap has colours or is turned.
+    Points beyond the window take the nearest pixel. ``reflectance`` is (n, n). Raises MitsimError for a scene without a
+    print, or one whose bitmap has colours or is turned.
     """
     rays, n = PinholeRays(bench.projector_optics, [None]), bench.n
     for surface, names in _prints(bench):
@@ -102,8 +88,6 @@ def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None
 
 
 class _Surface:
-    """Parameters of a ``shape`` by name, and the shape itself."""
-
     def __init__(self, shape: mi.Shape) -> None:
         self.shape, self._parameters = shape, mi.traverse(shape)
 
@@ -114,16 +98,13 @@ class _Surface:
         self._parameters[name] = value
 
     def names(self, ending: str | tuple[str, ...]) -> list[str]:
-        """Of parameters with that ``ending``."""
         return [name for name in self._parameters.keys() if name.endswith(ending)]  # noqa: SIM118 - it is no dict
 
     def update(self) -> None:
-        """Tell the shape what has changed."""
         self._parameters.update()
 
 
 def _prints(bench: Apparatus) -> list[tuple[_Surface, list[str]]]:
-    """Surfaces with a bitmap for reflectance, and the bitmap's name; of a scene of one surface also an even one."""
     every = [_Surface(shape) for shape in bench.loaded.scene.shapes() if shape.bsdf()]
     found = [(surface, names) for surface in every if (names := surface.names(_BITMAP))]
     if not found and len(every) == 1:
@@ -137,7 +118,6 @@ def _prints(bench: Apparatus) -> list[tuple[_Surface, list[str]]]:
 
 
 def _as_stored(before: Any, values: npt.NDArray[np.float64]) -> Any:
-    """``values`` 0 to 1 of the type that a bitmap had ``before``: whole numbers of eight bits, or real ones."""
     whole = np.asarray(before).dtype == np.uint8
     stored = np.rint(_LARGEST_CODE * values).astype(np.uint8) if whole else values.astype(np.float32)
     return type(before)(stored)

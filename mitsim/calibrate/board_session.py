@@ -1,8 +1,8 @@
-"""A bench and a recipe in; what a rendered Hadamard calibration session on a white board shows, and its light, out.
+"""Patterns and light of a rendered Hadamard calibration session on a white board.
 
 The paper's procedure (section IV-A): every column h_i of a Hadamard matrix is shown as horizontal stripes h_i 1^T and
 as vertical ones 1 h_i^T, each +-1 pattern as two shots (or one and a uniform one), all at one exposure, with sensor
-noise. When n is no Hadamard order the next one is used and its first n rows: rows stay orthogonal.
+noise. If n is no Hadamard order, the first n rows of the next one are used, because rows stay orthogonal.
 """
 
 from __future__ import annotations
@@ -48,30 +48,27 @@ from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
 
 _IN_RAYS = 0.5
-"""Part of what no separable camera has, rms, that rays leave where the rest, three quarters of its energy, is said to
-be of diffraction."""
+"""Part (rms) of the geometric residual below which the residual is attributed to diffraction."""
 _PLACES = 128
-"""Sensor pixels along an axis that the mask is compared on: of many terms all pixels would take gigabytes."""
+"""Sensor pixels per axis on which the mask is compared, because all pixels would take gigabytes."""
 _LINES = 4
-"""Rows, and columns, of pixels that the plan looks at: chosen so that each quarter of the window shows."""
+"""Rows and columns of pixels that the plan examines, such that each quarter of the window is represented."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """What a calibration session shows, of a ``bench`` by a ``recipe``, at one depth.
+    """Calibration session of a ``bench`` by a ``recipe`` at one depth.
 
     Attributes
     ----------
-    bench, recipe
-        what is calibrated, and how.
     seed
-        of its noise and light.
+        Seed of its noise and light.
     depth
-        of the board [mm]; None: on the aligned plane.
+        Depth of the board [mm]; None for the aligned plane.
     filters
-        (pixels, pixels) part of the light that colour filters over them pass, which readings are divided by; None: all.
+        (pixels, pixels) transmission of colour filters, by which readings are divided; None without filters.
     whole
-        the session of all lines, of whose light this is one; None: itself.
+        Session of all lines, to whose light this one belongs; None for itself.
     """
 
     bench: Apparatus
@@ -83,24 +80,24 @@ class Session:
 
     @property
     def distance(self) -> float:
-        """From the sensor to the board's middle [mm]."""
+        """Return the distance from the sensor to the board's centre [mm]."""
         return self.depth or self.bench.geometry.scene_distance
 
     @cached_property
     def board(self) -> Apparatus:
-        """The bench with the white board instead of its scene."""
+        """Return the bench with the white board instead of its scene."""
         if self.whole is not None:
             return replace(self.bench, loaded=self.whole.board.loaded)
         return before_board(self.bench, self.recipe.board_reflectance, self.recipe.board, self.depth)
 
     @property
     def centre(self) -> bool:
-        """Whether row and column means are taken out of every response, as for a FlatCam mask."""
+        """Return True if row and column means are subtracted from every response, as for a FlatCam mask."""
         return self.bench.geometry.centred
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What board, mask and sensor do that factors do not know of."""
+        """Return effects of board, mask and sensor that factors do not contain."""
         return (
             *self.board_warnings,
             *self.mask_warnings,
@@ -109,7 +106,7 @@ class Session:
 
     @cached_property
     def board_warnings(self) -> tuple[str, ...]:
-        """Projector pixels that the board leaves dark."""
+        """Return a warning about projector pixels that miss the board."""
         shape = self.recipe.board
         missed = 0 if shape == BoardShape() else missed_pixels(self.board)
         if not missed:
@@ -123,7 +120,7 @@ class Session:
         )
 
     def check_mask(self, job: Job | None = None) -> None:
-        """Raise MitsimError for a mask without factors, and if the session takes more than a ``job`` allows."""
+        """Raise MitsimError for a mask without factors, and if the session exceeds the limits of a ``job``."""
         job, fault = job or Job(), mask_fault(self.bench)
         self._first_cost.check("calibration", job.limits)
         if fault and fault.lost > MOST_LOST:
@@ -133,15 +130,17 @@ class Session:
 
     @property
     def _first_cost(self) -> Cost:
-        """Memory and time of the session, as far as they are known before a look at the board."""
         count, first = self.signs.shape[1], Settings(self.distance)
         seconds = session_seconds(self.board, count, self.shots, first)
         return session_cost(self.board, count, first, sum(seconds.values()), len(self.recipe.exposure_ladder))
 
     @cached_property
     def mask_warnings(self) -> tuple[str, ...]:
-        """Return a warning if the best separable camera leaves more of the shadow than a calibration accepts, with the
-        residual and the part of it that diffraction makes. Stripes show less of it, since their lines add up."""
+        """Return a warning if the best separable camera leaves more of the shadow than a calibration accepts.
+
+        It states the residual and the part of it due to diffraction. Stripes show less of it because their lines add
+        up.
+        """
         geometry, fault = self.bench.geometry, mask_fault(self.bench)
         residual = rays = fault.lost if fault else 0.0
         if not geometry.is_drawn(waves=False):
@@ -163,15 +162,14 @@ class Session:
     def shadow(
         self, geometry: CameraGeometry, spectrum: Spectrum | None = None, places: int | None = None
     ) -> SeparableTerms:
-        """Return the transmissions from projector pixels at the board's distance to sensor pixels, centred where frames
-        are.
+        """Return the transmissions from projector pixels at the board's distance to sensor pixels.
 
         Parameters
         ----------
         geometry, spectrum
-            camera, and the light whose waves are meant; None: in rays.
+            Camera, and light whose waves are simulated; None for rays.
         places
-            about how many sensor pixels along an axis; None: all.
+            Approximate number of sensor pixels per axis; None for all.
         """
         rows, columns = (
             Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows_at(self.distance)
@@ -182,53 +180,51 @@ class Session:
 
     @cached_property
     def signs(self) -> FloatArray:
-        """(n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
+        """Return the (n, N) first n rows of the smallest Hadamard matrix that has them; column 0 is all +1."""
         return stripe_signs(self.bench.n).astype(np.float64)
 
     @property
     def lit_lines(self) -> float:
-        """Part of the lines that are +1, mean over patterns: about half."""
+        """Return the mean part of the lines that are +1."""
         return float((1 + self.signs).mean()) / 2
 
     @property
     def pairs(self) -> bool:
-        """Whether a +-1 pattern is the difference of two shots, and not taken from one and a uniform shot."""
+        """Return True if a +-1 pattern is the difference of two shots."""
         return self.recipe.signed_capture == "pair"
 
     def through_filters(self, light: FloatArray) -> FloatArray:
-        """What passes the filters of ``light`` (pixels, pixels)."""
+        """Return the part of ``light`` (pixels, pixels) that passes the filters."""
         return light if self.filters is None else light * self.filters
 
     @property
     def shots(self) -> int:
-        """Frames of the whole session."""
+        """Return the number of frames of the whole session."""
         lit = len(self.order) * self.recipe.repeats
         return (lit + self.recipe.dark_frames) * len(self.recipe.exposure_ladder)
 
     @property
     def order(self) -> list[Half]:
-        """What the lit frames show, as they are taken; each with all exposures, one after the other, and of each all
-        repeats. Dark frames come last."""
+        """Return the sequence of lit frames: all exposures of a pattern, all repeats of each; dark frames come last."""
         return halves_in_order(self.signs.shape[1], self.pairs, self.recipe.order, self.recipe.order_seed)
 
     @cached_property
     def powers(self) -> Mapping[tuple[str, int], FloatArray]:
-        """(exposures, repeats) power of the projector in frames of each shot, by side and number; 1 at the session's
-        begin."""
+        """Return the (exposures, repeats) power of the projector in each shot, by side and number; 1 at the begin."""
         drift, order = self.recipe.drift, self.order
         each = len(order), len(self.recipe.exposure_ladder), self.recipe.repeats
         found = levels(self.seed, "session", math.prod(each), drift.session_ramp, drift.session_flicker).reshape(each)
         return {self.shot(half): power for half, power in zip(order, found, strict=True)}
 
     def shot(self, half: Half) -> tuple[str, int]:
-        """Side and number of the shot that shows a ``half``, which name its noise."""
+        """Return side and number of the shot that shows a ``half``, which name its noise."""
         side, number, sign = half
         return side, 2 * number + (sign < 0) if self.pairs else number + (sign != UNIFORM)
 
     def plan(self, accuracy: float, job: Job) -> Plan:
-        """What to simulate for responses of this relative ``accuracy``, and what the session takes.
+        """Plan the simulation of responses with this relative ``accuracy``, and its cost.
 
-        MitsimError when that is more memory or time than the ``job`` allows: before the look at the board, or after it.
+        Raises MitsimError if memory or time exceed the limits of the ``job``.
         """
         n, count, spent = self.bench.n, self.signs.shape[1], job.clock.seconds()
         self._first_cost.check("calibration", job.limits)
@@ -249,7 +245,6 @@ class Session:
         return replace(plan, cost=cost)
 
     def _terms_of(self, settings: Settings) -> float:
-        """Terms of the shadow that ``settings`` have drawn on a raster, which their plan has looked at; 1 of others."""
         geometry, waves = self.board.geometry, in_waves(settings.effects)
         if not geometry.is_drawn(waves):
             return 1.0
@@ -257,20 +252,12 @@ class Session:
         return number_of_terms(raster(geometry, self.distance, self.board.waves if waves else None))
 
     def trace(self, plan: Plan, job: Job) -> SampledLight:
-        """The board's light, by projector pixel, sampled as the ``plan`` says; ``job`` is told how far it is."""
+        """Trace the board's light by projector pixel as the ``plan`` says."""
         (light,) = self.trace_lines((self.board,), plan, job)
         return light
 
     def trace_lines(self, boards: Sequence[Apparatus], plan: Plan, job: Job) -> list[SampledLight]:
-        """The same of every line of the board's light.
-
-        Parameters
-        ----------
-        boards
-            this session's with each line alone; the board itself where light is not told apart.
-        plan, job
-            as for :meth:`trace`.
-        """
+        """Trace the board's light of every line; ``boards`` show each line alone."""
         with job.clock.stage("transport"):
             sampling, lighting = Sampling(purpose="calibration"), _lines(self.bench.n)
             lights = trace_lines(self.board, boards, plan, lighting, self.seed, sampling, job.progress)
@@ -278,11 +265,11 @@ class Session:
 
 
 def _lines(n: int) -> Lighting:
-    """Shots of one row or one column of pixels each, evenly spread.
+    """Return shots of one row or one column of pixels each, evenly spread.
 
-    The accuracy of a session is that of single lines: by the patterns' orthogonality the squared errors of all +-1
-    responses add up to N times those of all lines, and so do the squared responses themselves. Frames of half the
-    pixels are far brighter than the responses that are taken from their differences.
+    The accuracy of a session is that of single lines: because patterns are orthogonal, the squared errors of all +-1
+    responses add up to N times those of all lines, and so do the squared responses. Frames of half the pixels are far
+    brighter than the responses from their differences.
     """
     chosen = np.unique(((np.arange(_LINES) + 0.5) * n / _LINES).astype(np.int64))
     rows = np.zeros((len(chosen), n, n))
@@ -294,42 +281,36 @@ def _lines(n: int) -> Lighting:
 # The reason of each figure is how :class:`mitsim.calibrate.session.LitSession` works.
 
 _UNIT_COSTS = replace(FIXED, product=1.1e-11)
-"""A multiplication of products as large as those of stripes: half of what it takes in small ones (2048 pixels a side,
-two processors)."""
+"""Cost of a multiplication in products as large as those of stripes: half of that in small ones."""
 _MIXED_S, _FORMED_S = 8e-9, 1e-8
-"""A pixel of a frame that is mixed or formed beside its multiplications: memory that is read and taken anew (sensors of
-512 and 1024 pixels mixed, of 2048 formed; two processors)."""
+"""Seconds per pixel of a frame beside its multiplications."""
 _READ_S = 1.75e-9
-"""A number of a drawn shadow's terms, all of one side of which a stripe's frame and its probes read; 0.7 of the
-processor seconds of 60 and 102 terms at 512 pixels (a drawing that is turned by 0.05 degrees: 1.05 of what it took)."""
+"""Seconds per number of a raster's terms that a stripe's frame and its probes read."""
 _UNWRITTEN = 0.55
-"""Of what exposing a capture's frame takes, that of one which no file is written of (0.62 at 512 pixels, 0.49 at
-1024)."""
+"""Cost of exposing a frame without writing it, relative to a capture's frame."""
 _HELD, _AT_WORK = 5.0, 5.0
-"""Frames in double precision: those that a session holds (the uniform one, its rate, a pair's both shots together, two
-noisy uniform ones), and what each response takes that is worked on (light of two shots, their numbers, rates)."""
+"""Frames in double precision: of a session, and of each response in progress."""
 _OF_AN_EXPOSURE = 2.0
-"""Frames more of a response for each exposure beyond the first: numbers of two shots, and one shot's electrons."""
+"""Further frames of a response for each exposure beyond the first."""
 _SUMS = 8.0
-"""Numbers of a side's sums for each pattern and pixel of a side of the sensor: of two sides and two kinds of responses,
-and once more while they are saved."""
+"""Numbers of a side's sums for each pattern and pixel of a side of the sensor."""
 
 
 def session_seconds(
     board: Apparatus, count: int, shots: int, settings: Settings, largest_terms: float = 1.0
 ) -> dict[str, float]:
-    """Seconds of forming the stripes of a session, and of exposing its shots and adding up responses.
+    """Predict the seconds for forming a session's stripes, exposing its shots and adding up responses.
 
     Parameters
     ----------
     board
-        the bench with the board.
+        Bench with the board.
     count, shots
         +-1 patterns of a side, and frames of the whole session.
     settings
-        what is simulated.
+        Simulation settings.
     largest_terms
-        terms that hold a shadow that must be drawn on a raster; 1, the fewest, before it is known.
+        Terms of a shadow that must be drawn on a raster; 1 before it is known.
     """
     n, pixels = board.n, board.geometry.frame_side
     cells = max(Simulation(board, settings).grids["fine"].bundle.cells)
@@ -361,17 +342,7 @@ def session_seconds(
 
 
 def session_cost(board: Apparatus, count: int, settings: Settings, seconds: float, exposures: int = 1) -> Cost:
-    """Memory, an upper estimate, and time of a session.
-
-    Parameters
-    ----------
-    board, count, settings
-        as for :func:`session_seconds`.
-    seconds
-        that it takes.
-    exposures
-        of every frame.
-    """
+    """Predict memory (an upper estimate) and time of a session."""
     n, pixels = board.n, board.geometry.frame_side
     lines = n if lines_held(n, count, pixels) else 0
     at_work = _AT_WORK + _OF_AN_EXPOSURE * (exposures - 1)
@@ -387,41 +358,33 @@ def session_cost(board: Apparatus, count: int, settings: Settings, seconds: floa
 # GiB.
 
 _LINES_BYTES = 7 * 2**28
-"""Frames of lines that are held at most, as of classes that are mixed."""
+"""Largest memory for frames of lines."""
 _COLUMNS = 2**14
-"""Pixels of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+"""Pixels per product, fixed because it affects the last bits."""
 
 
 def lines_held(lines: int, patterns: int, pixels: float) -> bool:
-    """Whether frames of lines are held to be mixed into those of patterns.
-
-    Parameters
-    ----------
-    lines, patterns
-        how many there are of a side.
-    pixels
-        a side of the sensor.
-    """
+    """Return True if frames of lines are kept in memory and mixed into those of patterns."""
     return mixes(lines, patterns, pixels) or (patterns >= lines and 8 * lines * pixels**2 <= _LINES_BYTES)
 
 
 def stripe_frames(
     light: SampledLight, stripes: Lighting, seed: int, shape: tuple[int, int], first: int
 ) -> Iterator[tuple[int, Frame]]:
-    """Numbers and frames of patterns, without what black pixels leak.
+    """Yield numbers and frames of patterns without light of black pixels and without Monte Carlo error.
 
-    The same bits whatever is the first. Frames come without a Monte Carlo error.
+    The bits do not depend on the ``first`` pattern.
 
     Parameters
     ----------
     light, seed
-        by projector pixel, and the seed of its probes.
+        Light by projector pixel, and seed of its probes.
     stripes
-        line of each projector pixel, and the power 0 or 1 of each line in every pattern.
+        Line of each projector pixel, and the power 0 or 1 of each line in every pattern.
     shape
-        rows and columns of a frame.
+        Rows and columns of a frame.
     first
-        number of the first pattern.
+        Number of the first pattern.
     """
     count, n = stripes.weights.shape
     lines, pixels = None, side_of(shape)
@@ -441,7 +404,6 @@ def stripe_frames(
 
 
 def _stripe_lines(light: SampledLight, lines: Lighting, seed: int, shape: tuple[int, int]) -> FloatArray | None:
-    """(lines, m m') frames of single lines; None where one lost light below zero, which patterns would lack."""
     frames = np.empty((len(lines.weights), math.prod(shape)))
     for start in range(0, len(frames), step := at_once(side_of(shape))):
         numbers = np.arange(start, min(start + step, len(frames)))
@@ -453,7 +415,6 @@ def _stripe_lines(light: SampledLight, lines: Lighting, seed: int, shape: tuple[
 
 
 def _mix(weights: FloatArray, lines: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """(patterns, m, m') sums of ``lines`` (lines, m m') by ``weights`` (patterns, lines), for frames of a ``shape``."""
     mixed = np.empty((len(weights), lines.shape[1]))
 
     def part(start: int) -> None:

@@ -1,4 +1,4 @@
-"""From a bench to the camera's factors and their error: a rendered session, estimated as a user's frames would be."""
+"""Rendered calibration sessions: factors of a camera and their error, estimated as from a user's frames."""
 
 from __future__ import annotations
 
@@ -49,47 +49,24 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 NOISY, NOISE_FREE = "noisy", "noise_free"
-"""Kinds of responses that factors are estimated from."""
+"""Kinds of responses from which factors are estimated."""
 _SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
-"""Responses between two checkpoints, half of those that are looked at at once, or twice as many at 2048 pixels; and
-seconds, as each takes some ten milliseconds."""
+"""Responses and seconds between two checkpoints."""
 _REPEATS_BEHIND_FILTERS = 4
-"""Of every shot of a session behind filters, unless a recipe says otherwise: most pixels see a tenth of a line that
-fills others, and of single shots some directions of the OV5647's filters over the IMX249 are not above the noise."""
+"""Default repeats behind filters, because most pixels see a tenth of a line that fills others."""
 
 
 def calibrate(bench: Apparatus, request: SessionRequest, task: Task) -> Factors:
-    """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`.
-
-    Parameters
-    ----------
-    bench
-        whose camera and projector are calibrated; its scene is replaced by the board.
-    request, task
-        what is wanted, and where it goes.
-
-    Raises
-    ------
-    MitsimError
-        as there.
-    """
+    """Run a calibration session and estimate the camera's factors; see :meth:`mitsim.api.bench.Bench.calibrate`."""
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     return _run_sessions([session], request, task, [task.output])[0]
 
 
 def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> dict[float, Factors]:
-    """The camera's factors at each of a recipe's ``depths``, by depth [mm].
+    """Estimate the camera's factors at each of a recipe's ``depths``, by depth [mm], in a folder for each.
 
-    Parameters
-    ----------
-    bench, request, task
-        as for :func:`calibrate`; of a folder for each depth, called by its millimetres. Each depth has light and noise
-        of its own, whatever others there are.
-
-    Raises
-    ------
-    MitsimError
-        as :func:`calibrate`, for a recipe without depths, and for one at which the mask or no light is.
+    Light and noise of each depth are independent of the others. Raises MitsimError as :func:`calibrate`, for a recipe
+    without depths, and for one at which the mask or no light is.
     """
     recipe, found = request.recipe or load_recipe(), {}
     if not recipe.depths:
@@ -108,19 +85,9 @@ def calibrate_depths(bench: Apparatus, request: SessionRequest, task: Task) -> d
 
 
 def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest, task: Task) -> Factors:
-    """What :func:`calibrate` does, and its frames in a folder as `mitsim calibrate --frames` reads it.
+    """Run :func:`calibrate` and write its frames to a folder that `mitsim calibrate --frames` reads.
 
-    Parameters
-    ----------
-    bench, request, task
-        as there.
-    frames
-        new or empty folder.
-
-    Raises
-    ------
-    MitsimError
-        as there, for a recipe with depths, a folder that holds something, and a disk without room.
+    Raises MitsimError as there, for a recipe with depths, a folder that holds something, and a full disk.
     """
     session = Session(bench, (request.recipe or load_recipe()).of_one_depth(), request.seed)
     with whole_folder(frames) as folder:
@@ -131,24 +98,12 @@ def write_session(bench: Apparatus, frames: Path | str, request: SessionRequest,
 
 
 def calibrate_lines(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Factors at each line, by its name.
-
-    Parameters
-    ----------
-    bench, request, task
-        as for :meth:`mitsim.api.bench.Bench.calibrate_lines`, which has the errors raised as well.
-    """
+    """Estimate factors at each line, by its name; see :meth:`mitsim.api.bench.Bench.calibrate_lines`."""
     return _by_line(SpectralBench.of(bench, CALIBRATION), request, task)
 
 
 def calibrate_mosaic(bench: Apparatus, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Factors at each line behind filters, by its name.
-
-    Parameters
-    ----------
-    bench, request, task
-        as for :meth:`mitsim.api.bench.Bench.calibrate_mosaic`, which has the errors raised as well.
-    """
+    """Estimate factors at each line behind filters; see :meth:`mitsim.api.bench.Bench.calibrate_mosaic`."""
     lines = SpectralBench.of(without_filters(bench), CALIBRATION)
     if request.recipe is None:
         request = replace(request, recipe=load_recipe().model_copy(update={"repeats": _REPEATS_BEHIND_FILTERS}))
@@ -156,8 +111,6 @@ def calibrate_mosaic(bench: Apparatus, request: SessionRequest, task: Task) -> d
 
 
 def _by_line(bench: SpectralBench, request: SessionRequest, task: Task) -> dict[str, Factors]:
-    """Factors at each line of a ``bench``, by its name: a session of each, dimmed by filters where there are such, in
-    light that is traced with the others'."""
     assert bench.manifest is not None
     names, filters = bench.names, bench.whole.filters
     passed: Sequence[FloatArray | None] = [None] * len(names)
@@ -188,19 +141,6 @@ def _run_sessions(
     places: Sequence[Path | None],
     frames: Path | None = None,
 ) -> list[Factors]:
-    """Factors of each line, whose light is traced with the others' when the first session has none kept.
-
-    Parameters
-    ----------
-    lines
-        the session of each; one where light is not told apart.
-    request, task
-        accuracy; job, and whether places may hold unfinished sessions.
-    places
-        CAL folder of each; None in memory.
-    frames
-        folder that the frames of a single one are written to.
-    """
     for session in lines:
         session.check_mask(task.job)
     found, job, whole = list[Factors](), task.job, lines[0].whole or lines[0]
@@ -235,7 +175,6 @@ def _run_sessions(
 
 
 def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
-    """Factors of a session, written where its ``checkpoint`` is."""
     session, plan = lit.session, lit.light.plan
     bench, digital = session.bench, digital_of(session.bench.sensor, lit.exposure_s)
     (noisy, clean), saturated, faults = estimates(lit, job, (NOISY, NOISE_FREE), checkpoint)
@@ -293,14 +232,9 @@ def _factors(lit: LitSession, checkpoint: Checkpoint, job: Job) -> Factors:
 def estimate(
     lit: LitSession, job: Job, noise_free: bool = False, checkpoint: Checkpoint | None = None
 ) -> tuple[Estimate, int]:
-    """Factors from the responses of a session, and how many of its shots have saturated pixels.
+    """Estimate factors from the responses of a session, and count its shots with saturated pixels.
 
-    Parameters
-    ----------
-    lit, job, checkpoint
-        as for :func:`session_sums`.
-    noise_free
-        whether to take the expected frames instead of noisy ones.
+    ``noise_free`` uses the expected frames; other parameters are those of :func:`session_sums`.
     """
     (found,), saturated, _ = estimates(lit, job, (NOISE_FREE if noise_free else NOISY,), checkpoint)
     return found, saturated
@@ -310,13 +244,7 @@ def estimate(
 def estimates(
     lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None
 ) -> tuple[list[Estimate], int, CheckedSession]:
-    """Factors from each kind of responses to a session, its saturated shots, and what noisy frames show of faults.
-
-    Parameters
-    ----------
-    lit, job, kinds, checkpoint
-        as for :func:`session_sums`.
-    """
+    """Estimate factors from each kind of responses, with saturated shots and faults that noisy frames show."""
     session, found = lit.session, session_sums(lit, job, kinds, checkpoint)
     drift = session.recipe.drift
     taken = SessionConditions(
@@ -338,8 +266,10 @@ def estimates(
 
 
 def _check_session(session: Session, sums: tuple[StripeSums, StripeSums], taken: SessionConditions) -> CheckedSession:
-    """Return the checked session; one that real frames would be refused for is flagged, because the frames are
-    simulated as the bench asks for them, and the exact factors show what they cost."""
+    """Return the checked session, flagged where real frames would be refused.
+
+    Simulated frames are not refused because the bench asks for them, and the exact factors show what they cost.
+    """
     try:
         return check_session(sums, session.signs, taken)
     except MitsimError as error:
@@ -347,18 +277,18 @@ def _check_session(session: Session, sums: tuple[StripeSums, StripeSums], taken:
 
 
 def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Checkpoint | None = None) -> SessionSums:
-    """Sums over all responses to a session, whose frames are formed once.
+    """Return sums over all responses to a session, whose frames are formed once.
 
     Parameters
     ----------
     lit
-        the session, its light traced.
+        Session with traced light.
     job
-        takes the time and is told how far the session is.
+        Clock and progress.
     kinds
-        of ``NOISY`` and ``NOISE_FREE``, one or both.
+        ``NOISY`` and ``NOISE_FREE``, one or both.
     checkpoint
-        where finished stripes are kept, and those of an interrupted session found.
+        Store of finished stripes, from which an interrupted session continues.
     """
     session, checkpoint = lit.session, checkpoint or Checkpoint()
     count = session.signs.shape[1]
@@ -396,8 +326,6 @@ def session_sums(lit: LitSession, job: Job, kinds: Sequence[str], checkpoint: Ch
 
 
 def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
-    """What ``clean`` factors lack of the camera that is simulated in a ``lit`` session; None where its shadow is no sum
-    of few terms."""
     physics = lit.light.simulation.physics
     if not physics.geometry.few_wave_terms:
         return None
@@ -405,9 +333,9 @@ def _lacking(lit: LitSession, clean: Estimate) -> Lacking | None:
 
 
 def _factor_error(noisy: Estimate, clean: Estimate) -> float:
-    """Relative error of both factors, in quadrature.
+    """Return the relative error of both factors in quadrature.
 
-    (left, right) and (-left, -right) are one camera; centred factors have no sum that would tell which it is.
+    (left, right) and (-left, -right) are one camera; centred factors have no sum that tells which it is.
     """
     sign = 1.0 if np.vdot(noisy.left, clean.left) >= 0 else -1.0
     left = np.linalg.norm(sign * noisy.left - clean.left) / np.linalg.norm(clean.left)

@@ -1,11 +1,8 @@
-"""What a calibration session leaves on disk: finished parts in its CAL folder until the whole is, and its frames where
-a user wants them.
+"""Files of a calibration session: finished parts in its CAL folder, and its frames if the user wants them.
 
-Only what a camera's user has: digital numbers, what each file shows, and how the camera is read. Expected light, exact
-factors, parallax, seeds and plan are left out.
-
-A part is a ``.npz`` file with a SHA-256 of the session's configuration and the file behind it: one that is damaged or
-of another session is computed again.
+Frames contain only what a real user has: digital numbers, patterns and camera settings; no expected light, exact
+factors, parallax, seeds or plan. A part is a ``.npz`` file with a SHA-256 of the session's configuration and of the
+data; a damaged or foreign part is computed again.
 """
 
 from __future__ import annotations
@@ -45,10 +42,9 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class Checkpoint:
-    """Parts of one session; without a folder nothing is kept."""
+    """Parts of one session; nothing is kept without a folder."""
 
     def __init__(self, folder: Path | None = None, configuration: Mapping[str, Any] | None = None) -> None:
-        """Parts in ``folder``, of the session with this ``configuration``."""
         self.folder, self.configuration = folder, dict(configuration or {})
         self._session = json.dumps(plain(self.configuration), sort_keys=True).encode()
 
@@ -60,7 +56,7 @@ class Checkpoint:
             write_json(self.folder / MANIFEST, head)
 
     def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        """Write ``arrays`` as the part ``name``, whole or not at all. MitsimError when it cannot be written."""
+        """Write ``arrays`` as the part ``name`` atomically; raise MitsimError if that fails."""
         if self.folder is None:
             return
         memory = io.BytesIO()
@@ -70,7 +66,7 @@ class Checkpoint:
             file.write(self._digest(memory.getbuffer()))
 
     def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
-        """The arrays of the part ``name``; None when it is not there, damaged, or of another session."""
+        """Return the arrays of the part ``name``; None if it is missing, damaged, or of another session."""
         path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
         if path is None or not path.is_file():
             return None
@@ -81,7 +77,7 @@ class Checkpoint:
             return dict(arrays)
 
     def clear(self) -> None:
-        """Remove the parts of a session that is complete."""
+        """Remove the parts of a complete session."""
         if self.folder is not None:
             for path in self.folder.glob(PARTS):
                 path.unlink()
@@ -94,22 +90,21 @@ class Checkpoint:
 def claimed_session(
     output: Path | None, configuration: Mapping[str, Any], resume: bool = False
 ) -> Iterator[Checkpoint]:
-    """The place for a session's parts, checked before any work; if the session fails before writing, a new folder is
-    removed.
+    """Claim the place for a session's parts before any work; remove a new folder if the session fails before writing.
 
     Parameters
     ----------
     output
         CAL folder; None keeps nothing.
     configuration
-        all that decides the factors.
+        All values that determine the factors.
     resume
-        whether the folder may hold a session of the same configuration.
+        Allow a folder with a session of the same configuration.
 
     Raises
     ------
     MitsimError
-        for a place that cannot be written, or that holds something else or another configuration.
+        If the place cannot be written, or holds other files or another configuration.
     """
     if output is None:
         yield Checkpoint(None, configuration)
@@ -122,7 +117,7 @@ def claimed_session(
 
 
 def is_finished(output: Path, configuration: Mapping[str, Any]) -> bool:
-    """Whether the folder ``output`` holds a finished session; MitsimError when its ``configuration`` is another."""
+    """Return True if the folder holds a finished session; raise MitsimError for another ``configuration``."""
     if not (output / MANIFEST).is_file():
         return False
     _check_same(output, plain(configuration))
@@ -144,15 +139,7 @@ def _check_same(path: Path, configuration: Mapping[str, Any]) -> None:
 
 
 def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
-    """The light of a session's board; None where there is none.
-
-    Parameters
-    ----------
-    checkpoint
-        that may hold it.
-    session, plan
-        whose light it is.
-    """
+    """Return the stored light of a session's board, or None."""
     arrays = checkpoint.load("light")
     if arrays is None:
         return None
@@ -191,13 +178,13 @@ def keep_light(checkpoint: Checkpoint, light: SampledLight) -> None:
 
 @dataclass
 class SessionSums:
-    """Sums over finished stripes by kind, horizontal and vertical ones, and ``saturated`` shots so far."""
+    """Sums over finished stripes by kind and side, and the number of ``saturated`` shots."""
 
     sums: dict[str, tuple[StripeSums, StripeSums]]
     saturated: int
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Put them down in a ``checkpoint``."""
+        """Save the sums in a ``checkpoint``."""
         arrays: dict[str, npt.ArrayLike] = {"saturated": self.saturated}
         for kind, both in self.sums.items():
             for sums in both:
@@ -206,8 +193,7 @@ class SessionSums:
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint, kinds: Sequence[str]) -> SessionSums | None:
-        """Those of an interrupted session in a ``checkpoint``, of some ``kinds`` of responses; None where there are
-        none."""
+        """Return the sums of an interrupted session for some ``kinds`` of responses, or None."""
         arrays = checkpoint.load("stripes")
         if arrays is None:
             return None
@@ -217,7 +203,6 @@ class SessionSums:
 
 
 def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
-    """Sums of one ``kind`` and ``side``, from what :meth:`SessionSums.save` put down."""
     own = {name.removeprefix(f"{kind}_{side}_"): values for name, values in arrays.items()}
     single = float(own["misfit"]), float(own["energy"]), int(own["done"])
     sums = StripeSums(side, bool(own["centre"]), own["common"], own["vectors"], *single)
@@ -229,37 +214,28 @@ def _kept_sums(arrays: Mapping[str, Any], kind: str, side: Side) -> StripeSums:
 # ---- Frames as a real camera's user has them ----
 
 MOST_TIFF = 2**16 - 1
-"""Largest digital number of a 16-bit TIFF; frames of larger or real numbers become NPY."""
+"""Largest digital number of a 16-bit TIFF; frames with larger or real numbers become NPY."""
 
 
 Names = tuple[str | int, ...]
-"""Of a frame's noise: side and number of its shot, or ``dark`` and numbers of exposure and frame; of a shot then
-``exposure`` and ``repeat``, each with its number where that is not 0."""
+"""Side and number of a frame's shot, or ``dark`` with numbers of exposure and frame."""
 
 
 def repeat_names(shot: tuple[str, int], exposure: int, repeat: int) -> Names:
-    """Names of a frame of a shot.
-
-    Parameters
-    ----------
-    shot
-        as :meth:`Session.shot` has it.
-    exposure, repeat
-        numbers of the frame.
-    """
+    """Return the names of a frame of a shot."""
     own: Names = ("exposure", exposure) if exposure else ()
     return (*shot, *own, "repeat", repeat) if repeat else (*shot, *own)
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFrames:
-    """Frames of a ``session`` in a ``folder`` that is held, called by the number at which they are taken."""
+    """Frames of a ``session`` in a ``folder``, named by the order in which they are taken."""
 
     session: Session
     folder: Path
 
     def write(self, names: Names, numbers: DigitalNumbers) -> None:
-        """Write one frame, by ``names`` of its noise; ``numbers`` (rows, columns) as read."""
+        """Write one frame of digital ``numbers`` (rows, columns)."""
         place = (self._dark if names[0] == "dark" else self._lit)[names].file
         with whole_file(self.folder / place) as part, part.open("wb") as file:
             if self._tiff:
@@ -268,7 +244,7 @@ class KeptFrames:
                 np.save(file, numbers)
 
     def finish(self, digital: Digital) -> None:
-        """Write the list, when all frames are there; ``digital`` is of the shortest exposure."""
+        """Write the list when all frames are complete."""
         session, recipe = self.session, self.session.recipe
         listed = FrameList(
             camera=session.bench.identity(),
@@ -295,7 +271,6 @@ class KeptFrames:
 
     @cached_property
     def _lit(self) -> dict[Names, StripeFile]:
-        """Frames of stripes, as they are taken."""
         found: dict[Names, StripeFile] = {}
         exposures, repeats = range(len(self.session.recipe.exposure_ladder)), range(self.session.recipe.repeats)
         for half, exposure, repeat in itertools.product(self.session.order, exposures, repeats):

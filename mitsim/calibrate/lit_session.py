@@ -1,5 +1,4 @@
-"""A calibration session whose light is traced in; its responses, as a user of noisy frames has them or without noise,
-out."""
+"""Responses of a calibration session with traced light, noisy as a user has them or noise-free."""
 
 from __future__ import annotations
 
@@ -27,16 +26,14 @@ from mitsim.sensor.chain import Digital as DigitalNumbers
 
 Result = TypeVar("Result")
 _NUMBERS_AT_ONCE = 2**15
-"""Numbers of frames that become a response at a time: so few stay in the cache. Whole frames of a sensor of 2048 pixels
-took ten times as long."""
+"""Numbers that become a response at a time, so that they stay in the cache."""
 SHOT, DARK, READ, ROUNDING = "shot noise", "dark current", "read noise", "quantisation"
 """Sources of a frame's noise."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """Response (m, m') to a +-1 pattern [electrons / s], how many of its shots had saturated pixels, and, of a pair,
-    the sum of its two shots."""
+    """Response (m, m') to a +-1 pattern [electrons / s], its saturated shots, and the sum of a pair."""
 
     rate: FloatArray
     saturated: int = 0
@@ -45,22 +42,22 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class LitSession:
-    """A session whose light is traced: its responses, with noise or without.
+    """A session with traced light: its responses, with or without noise.
 
     Attributes
     ----------
     session
-        what is shown.
+        The session.
     light
-        of the board, by projector pixel.
+        Light of the board by projector pixel.
     white
-        expected frame of the uniform shot.
+        Expected frame of the uniform shot.
     exposure_s
-        of every shot [s], the shortest where there are several.
+        Exposure time of every shot [s], the shortest of several.
     speckle
-        contrast of laser speckle in the frames.
+        Speckle contrast of the frames.
     kept
-        where its frames are written to; None: nowhere.
+        Folder for its frames, or None.
     """
 
     session: Session
@@ -72,15 +69,7 @@ class LitSession:
 
     @classmethod
     def of(cls, session: Session, light: SampledLight, job: Job) -> LitSession:
-        """The session in its light.
-
-        Parameters
-        ----------
-        session, light
-            what is shown, and the board's light.
-        job
-            takes the time of choosing the exposure.
-        """
+        """Choose the exposure of a session in its light."""
         with job.clock.stage("optics"):
             n, signs = session.bench.n, session.signs
             white = next(iter(light.frames(Lighting.uniform(n), session.seed)))
@@ -91,11 +80,11 @@ class LitSession:
 
     @property
     def response_noise(self) -> float:
-        """Root mean square noise of a +-1 response [electrons / s], from the sensor's closed form."""
+        """Return the closed-form rms noise of a +-1 response [electrons / s]."""
         return float(np.sqrt(np.mean([self.response_variance(side).mean() for side in SIDES])))
 
     def response_variance(self, side: str) -> FloatArray:
-        """(m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
+        """Return the (m, m') mean noise variance of the responses of a ``side`` [(electrons / s)^2], in closed form."""
         variance: FloatArray = np.zeros(self.uniform_rate.shape)
         for parts in self.response_variances(side):
             for part in parts.values():
@@ -103,14 +92,13 @@ class LitSession:
         return variance
 
     def response_variances(self, side: str) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-        """The same by source, (m, m') or one number each: what each response has of its own, and what all of
-        the ``side`` share.
+        """Return noise variances, (m, m') or one number: each response's own, and that shared by the ``side``.
 
         Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
-        variance R of reading and rounding. 2 Y(positive) - Y(uniform) of a part p of the lines, about half, has
-        (4 p L + 4 D) / t + 4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared, and that of a dark
-        frame's mean. Means of repeated shots have their number's part of it. Of several exposures each pixel has the
-        sum of these by the squares of its weights.
+        variance R of reading and rounding. 2 Y(positive) - Y(uniform) for a part p of the lines has (4 p L + 4 D) / t +
+        4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 and that of a dark frame's mean are shared. Means
+        of repeats have the corresponding part. With several exposures, each pixel has the sum weighted by the squares
+        of its weights.
         """
         sensor, recipe, ladder = self.session.bench.sensor, self.session.recipe, self.ladders[side]
         rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
@@ -137,18 +125,18 @@ class LitSession:
         return own, shared
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
-        """What a function makes of the +-1 patterns of a side, in order, some at a time in a thread each.
+        """Apply a function to the +-1 patterns of a side in order, some at a time in a thread each.
 
         Parameters
         ----------
         side
             ``horizontal`` or ``vertical`` stripes.
         use
-            of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
+            Function of a pattern's number and the expected frame of its +1 pixels. Number 0 is the uniform pattern.
         job
-            takes the time and is told how far it is.
+            Clock and progress.
         first
-            number of the first pattern.
+            Number of the first pattern.
         """
 
         def use_response(item: tuple[int, Frame]) -> Result:
@@ -168,7 +156,6 @@ class LitSession:
             yield from results
 
     def _stripes(self, side: str, first: int) -> Iterator[tuple[int, Frame]]:
-        """Numbers and frames from ``first`` on, without what black pixels leak; none is formed for number 0."""
         if first == 0:
             yield 0, self.white
         n = self.session.bench.n
@@ -178,7 +165,6 @@ class LitSession:
         yield from stripe_frames(self.light, stripes, self.session.seed, shape, max(first, 1))
 
     def _with_leak(self, frame: Frame) -> Frame:
-        """The ``frame`` with the light of black pixels: to form it with them would be twice the work."""
         black = self.light.simulation.physics.black_level
         if not black:
             return frame
@@ -188,19 +174,10 @@ class LitSession:
 
     @cached_property
     def _leak(self) -> FloatArray:
-        """(m, m') light of all pixels when they are black [W m^-2]."""
         return np.asarray(self.light.simulation.physics.black_level * self.white.irradiance)
 
     def noisy(self, side: str, number: int, frame: Frame) -> Response:
-        """Response to a +-1 pattern as a user of noisy frames has it.
-
-        Parameters
-        ----------
-        side
-            ``horizontal`` or ``vertical`` stripes.
-        number, frame
-            of the pattern, as :meth:`each` has them.
-        """
+        """Return the response to a +-1 pattern as a user of noisy frames has it."""
         if not self.session.pairs:
             shot, uniform = self._expose(frame.irradiance, side, number + 1), self._uniform[side]
             rate = self._rates(lambda rows: 2 * self._rate(shot, rows) - uniform.rate[rows], shot)
@@ -224,7 +201,7 @@ class LitSession:
         return Response(rate, sum(shot.saturated for shot in shots), light)
 
     def noise_free(self, frame: Frame) -> FloatArray:
-        """(m, m') the same of the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
+        """Return the (m, m') response from the expected ``frame``: 2 Y((1 + P)/2) - Y(1)."""
         rate = self._second.electrons(frame)
         rate *= 2
         rate -= self.uniform_rate
@@ -232,12 +209,11 @@ class LitSession:
 
     @property
     def _second(self) -> Exposer:
-        """An exposure of one second, whose electrons are rates."""
         return Exposer(self.session.bench.devices, 1.0, self.session.seed)
 
     @cached_property
     def exposures_s(self) -> tuple[float, ...]:
-        """Every exposure of a frame [s]."""
+        """Return every exposure time of a frame [s]."""
         return tuple(self.exposure_s * factor for factor in self.session.recipe.exposure_ladder)
 
     @cached_property
@@ -247,8 +223,10 @@ class LitSession:
 
     @cached_property
     def ladders(self) -> Mapping[str, Ladder]:
-        """How frames of several exposures of a side are merged: by the first uniform frame of the other one, which
-        shares no noise with them."""
+        """Return how frames of several exposures of a side are merged.
+
+        The first uniform frame of the other side is used because it shares no noise with them.
+        """
         digitals = tuple(digital_of(self.session.bench.sensor, time) for time in self.exposures_s)
         if len(digitals) == 1:
             return {side: Ladder(digitals) for side in SIDES}
@@ -263,7 +241,6 @@ class LitSession:
 
     @cached_property
     def _dark(self) -> Mapping[str, FloatArray] | None:
-        """(m, m') rate of the mean dark frame, as each side's frames are merged; None where none is taken."""
         number = self.session.recipe.dark_frames
         if not number:
             return None
@@ -278,12 +255,11 @@ class LitSession:
 
     @cached_property
     def uniform_rate(self) -> FloatArray:
-        """(m, m') expected photoelectrons a second of the uniform frame."""
+        """Return the (m, m') expected photoelectrons per second of the uniform frame."""
         return self._second.electrons(self.white)
 
     @cached_property
     def _both(self) -> FloatArray:
-        """(m, m') light of a pair's two shots together [W m^-2]: all of it, and what black pixels leak."""
         n = self.session.bench.n
         off = Lighting(np.zeros(n * n, dtype=np.int64), np.zeros((1, 1)))
         (dark,) = self.light.frames(off, self.session.seed)
@@ -291,12 +267,10 @@ class LitSession:
 
     @cached_property
     def _uniform(self) -> Mapping[str, Response]:
-        """Noisy uniform frames, from which each side's responses are taken where they are no pairs."""
         shots = {side: self._expose(self.white.irradiance, side, 0) for side in SIDES}
         return {side: Response(self._rate(shot, slice(None)), shot.saturated) for side, shot in shots.items()}
 
     def _expose(self, irradiance: FloatArray, side: str, index: int) -> _Shot:
-        """The noisy frames of shot number ``index`` of a ``side``, of expected ``irradiance`` (m, m')."""
         ladder = self.ladders[side]
         found = [
             self._mean_of_repeats(
@@ -311,24 +285,12 @@ class LitSession:
         return _Shot(ladder, tuple(digital for digital, _ in found), sum(saturated for _, saturated in found))
 
     def _shot_electrons(self, irradiance: FloatArray, exposure: int, *names: str | int) -> FloatArray:
-        """Expected electrons of a shot. Speckle of a board at rest is the same in all repeats and exposures."""
         passed = Frame(self.session.through_filters(irradiance), 0.0, 0.0, 0.0)
         return self._exposers[exposure].shot_electrons(passed, "calibration", *names)
 
     def _mean_of_repeats(
         self, lit: FloatArray, exposure: int, used: Chosen, side: str, index: int
     ) -> tuple[DigitalNumbers, int]:
-        """The mean of all repeats of a shot at one exposure, and how many have saturated pixels that are used.
-
-        Parameters
-        ----------
-        lit
-            expected electrons.
-        exposure, side, index
-            numbers of the exposure and of the shot.
-        used
-            pixels that count.
-        """
         exposer, repeats = self._exposers[exposure], self.session.recipe.repeats
         powers = self.session.powers[side, index][exposure]
 
@@ -351,25 +313,21 @@ class LitSession:
         return mean, count
 
     def _read(self, exposer: Exposer, lit: FloatArray, *names: str | int) -> DigitalNumbers:
-        """One noisy frame, which is kept where frames are; ``names`` find its noise."""
         digital = exposer.digital(lit, "calibration", *names)
         if self.kept is not None:
             self.kept.write(names, digital)
         return digital
 
     def _rate(self, shot: _Shot, rows: slice) -> FloatArray:
-        """Rates of some ``rows`` of a ``shot``."""
         each = zip(self._exposers, shot.digital, strict=True)
         merged = shot.ladder.merge((exposer.rate(digital[rows]) for exposer, digital in each), rows)
         return self._without_filters(merged, rows)
 
     def _without_filters(self, rate: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """What pixels without filters would read, from the ``rate`` of some ``rows``."""
         return rate if self.session.filters is None else rate / self.session.filters[rows]
 
     @staticmethod
     def _rates(of: Callable[[slice], FloatArray], shot: _Shot) -> FloatArray:
-        """(m, m') rates of all rows by those ``of`` some, a few at a time: their arrays stay in the cache."""
         rates: FloatArray = np.empty(shot.digital[0].shape)
         step = max(1, _NUMBERS_AT_ONCE // rates.shape[1])
         for start in range(0, len(rates), step):
@@ -380,8 +338,7 @@ class LitSession:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Noisy frames (m, m'), of each exposure the mean of its repeats, which a ``ladder`` merges; how many of
-    all have ``saturated`` pixels."""
+    """Noisy frames (m, m'): for each exposure the mean of its repeats, merged by a ``ladder``; and saturated frames."""
 
     ladder: Ladder
     digital: tuple[DigitalNumbers, ...]

@@ -1,8 +1,7 @@
-"""A bench and a few frames of a calibration session, simulated or real, in; factors of the fitted model, and what was
-fitted with its standard errors, out.
+"""Calibration by a model whose few unknown numbers are fitted to a few frames of a session, simulated or real.
 
-Measured factors need all patterns, as each tells one direction of the projector's pixels; a model has half a dozen
-unknowns, which a few frames tell. What it leaves unexplained is what no number of frames mends.
+Measured factors need all patterns, because each gives one direction of the projector's pixels. A model has half a dozen
+unknowns, for which a few frames suffice. The residual that it leaves does not shrink with more frames.
 """
 
 from __future__ import annotations
@@ -58,35 +57,35 @@ def calibrate_model(
     output: Path | str | None = None,
     job: Job | None = None,
 ) -> Factors:
-    """The camera's factors by a model whose few unknown numbers are fitted.
+    """Estimate the camera's factors by a fitted model.
 
     Parameters
     ----------
     bench
-        the camera and projector as they were to be built.
+        Camera and projector as designed.
     modelling
-        which model, by how many frames, and what is fitted.
+        Model, number of frames, and free parameters.
     frames
-        folder with a real session's frames, or what its list says; None: a session of the bench is simulated.
+        Folder or list of a real session's frames; None simulates a session of the bench.
     recipe
-        of a simulated session; None: the shipped one.
+        Recipe of a simulated session; None for the shipped one.
     seed
-        root of a simulated session's random streams.
+        Root of a simulated session's random streams.
     output
-        CAL folder that is written; None keeps the factors in memory.
+        CAL folder; None keeps the factors in memory.
     job
-        clock and progress.
+        Clock and progress.
 
     Returns
     -------
     Factors
-        flagged where the model leaves more than 1 % of the responses unexplained.
+        Flagged if the model leaves more than 1 % of the responses unexplained.
 
     Raises
     ------
     MitsimError
-        for numbers that these frames cannot tell apart, frames of another size than the bench's, an output that cannot
-        be written, and as :meth:`mitsim.api.bench.Bench.calibrate`.
+        For numbers that these frames cannot distinguish, frames of another size, an output that cannot be written, and
+        as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
     with nullcontext() if output is None else output_folder(output) as place:
         factors = _fit_factors(bench, modelling, frames, SessionRequest(seed, modelling.accuracy, recipe), job or Job())
@@ -132,8 +131,10 @@ def _fit_factors(
 
 
 def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
-    """The ``model``, geometric or wave, of a ``bench`` as it was to be built. MitsimError for a mask that is tilted, or
-    whose shadow is drawn on a raster: a fit moves a few profiles."""
+    """Return the geometric or wave ``model`` of a ``bench`` as designed.
+
+    Raises MitsimError for a mask that is tilted or drawn on a raster, because a fit moves a few profiles.
+    """
     geometry = bench.geometry
     if geometry.is_drawn(model == "wave" and geometry.diffracts) or any(geometry.mask_tilt):
         raise MitsimError(
@@ -144,7 +145,7 @@ def model_of(bench: Apparatus, model: Model) -> ModelledCamera:
 
 
 def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Shown], int]:
-    """Noisy responses of a session ``lit``, as many as a ``modelling`` uses, and of how many frames they are."""
+    """Return noisy responses of a session for a ``modelling``, and their number of frames."""
     session, n = lit.session, lit.session.bench.n
     pairs, repeats, signs = session.pairs, session.recipe.repeats, session.signs
     chosen = modelling.used_patterns(_changes(signs), pairs, repeats)
@@ -169,7 +170,6 @@ def simulate_responses(lit: LitSession, modelling: Modelling) -> tuple[list[Show
 
 
 def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -> tuple[list[Shown], Digital, int]:
-    """The same of a real session's frames, with their exposure."""
     listed, pairs = session.listed, session.pairs
     if listed.n != bench.n:
         raise MitsimError(
@@ -191,7 +191,6 @@ def _of_frames(bench: Apparatus, session: SessionFrames, modelling: Modelling) -
 
 
 def _changes(signs: FloatArray) -> list[int]:
-    """Changes of sign in each column of ``signs`` (n, N)."""
     found: list[int] = np.count_nonzero(np.diff(signs, axis=0), axis=0).tolist()
     return found
 
@@ -206,19 +205,7 @@ def _response(signs: FloatArray, side: Side, rate: FloatArray, noise: float, cen
 def modelled_factors(
     camera: ModelledCamera, fitted: Fitted, frames: int, manifest: CalibrationManifest, job: Job
 ) -> Factors:
-    """Factors of a fitted model.
-
-    Parameters
-    ----------
-    camera, fitted
-        the model, and where its parts are.
-    frames
-        that it was fitted to.
-    manifest
-        of which camera they are.
-    job
-        its clock's seconds are stated.
-    """
+    """Return the factors of a fitted model with their noise."""
     left, right = (side.astype(np.float32).astype(np.float64) for side in camera.factors(fitted.placement))
     noise = _noise(camera, fitted)
     model: Model = "wave" if camera.spectrum else "geometric"
@@ -265,7 +252,6 @@ def modelled_factors(
 
 
 def _noise(camera: ModelledCamera, fitted: Fitted) -> FactorNoise:
-    """How far the factors are off by what the fit does not know, rms over their numbers."""
     here, places = camera.factors(fitted.placement), []
     for name in fitted.free:
         step = STEPS.get(name, GAIN_STEP * fitted.placement.gain)
@@ -294,7 +280,6 @@ def _status(model: Model, fitted: Fitted, frames: int) -> Status:
 
 
 def _rotation(camera: ModelledCamera, fitted: Fitted) -> Sequence[str]:
-    """What separable factors lack of a mask that is turned."""
     angle, error = fitted.placement.mask_rotation, fitted.errors.get("mask_rotation")
     if error is None or abs(angle) < _SIGNIFICANT * error:
         return ()
@@ -328,31 +313,31 @@ STEPS = {
     "projector_row": 2.5e-4,
     "projector_column": 2.5e-4,
 }
-"""Of each number, in its unit: half a micrometre on the mask or less, where shadows are averaged over ten."""
+"""Step of each number in its unit: at most half a micrometre on the mask."""
 GAIN_STEP = 0.01
-"""That of the gain, as a part of it: the model is linear in it."""
+"""Relative step of the gain, in which the model is linear."""
 _ALIKE = 0.9999
-"""Correlation of two numbers from which they count as one: each is told 70 times worse than if the other were known."""
+"""Correlation from which two numbers count as one: each is then known 70 times worse than alone."""
 _FEATURES = 5
-"""Of the mask that it may be off by, along either axis: 0.3 mm of a mask of 60 um, more than a holder is off."""
+"""Features by which the mask may be displaced along either axis: 0.3 mm of a mask of 60 um."""
 _REACH = 10.0
-"""Steps of each number within which directions hold what a response would become: half a pixel on the mask, or less."""
+"""Steps within which the directions represent a changed response: half a pixel on the mask, or less."""
 _PASSES, _STILL = 20, 0.05
-"""Times that directions are taken at most, and standard errors that the fit may still move by at the end."""
+"""Largest number of passes, and standard errors by which the last may still move."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A response and what was shown.
+    """A response and its pattern.
 
     Attributes
     ----------
     rows, columns
-        (n,) weights: the pattern is their product.
+        (n,) weights, whose product is the pattern.
     rate
-        (m, m') response [electrons / s], centred where the camera's factors are.
+        (m, m') response [electrons / s], centred if the camera's factors are.
     noise
-        standard deviation of a number of it.
+        Standard deviation of one number of it.
     """
 
     rows: FloatArray
@@ -363,20 +348,20 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A camera as responses show it.
+    """Result of a fit.
 
     Attributes
     ----------
     placement
-        that explains them best.
+        Best placement.
     free
-        names of what was fitted, and the rest held.
+        Names of the fitted numbers.
     covariance
-        (free, free) of these numbers.
+        (free, free) covariance.
     chi_square
-        a datum, of what the fit uses of the responses: 1 for a right model.
+        Chi-square per datum: 1 for a correct model.
     unexplained
-        part of the responses, rms, that neither model nor stated noise explain.
+        Part of the responses (rms) that neither model nor stated noise explain.
     """
 
     placement: Placement
@@ -387,27 +372,27 @@ class Fitted:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Standard error of each number that was fitted."""
+        """Return the standard error of each fitted number."""
         return dict(zip(self.free, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 @single_threaded_blas()
 def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str]) -> Fitted:
-    """Where mask and projector are.
+    """Fit the placement of mask and projector.
 
     Parameters
     ----------
     camera
-        as it was to be built, from which the search starts.
+        Camera as designed, from which the search starts.
     shown
-        responses; the first one to uniform light.
+        Responses, the first one to uniform light.
     free
-        names of what is fitted, ``gain`` among them; the rest is held.
+        Names of the free numbers, ``gain`` among them.
 
     Raises
     ------
     MitsimError
-        for numbers that these responses cannot tell apart, and a mask that is off too far to be found.
+        For numbers that these responses cannot distinguish, and a mask that is too far off.
     """
     at = _first_guess(camera, shown[0], free)
     for _ in range(_PASSES):
@@ -427,7 +412,7 @@ def fit_placement(camera: ModelledCamera, shown: Sequence[Shown], free: Sequence
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """One least-squares problem: coefficients of responses, in directions that are right near ``start``."""
+    """One least-squares problem: coefficients of responses in directions that are valid near ``start``."""
 
     camera: ModelledCamera
     start: Placement
@@ -439,7 +424,6 @@ class _Pass:
 
     @classmethod
     def of(cls, camera: ModelledCamera, shown: Sequence[Shown], free: Sequence[str], start: Placement) -> _Pass:
-        """The problem near ``start``; other parameters as for :func:`fit_placement`."""
         steps = {name: STEPS.get(name, GAIN_STEP * start.gain) for name in free}
         turned = camera.rotation_terms(start) if "mask_rotation" in free else []
         empty = cls(camera, start, steps, turned, shown, [], np.zeros(0))
@@ -456,18 +440,15 @@ class _Pass:
         return cls(camera, start, steps, turned, shown, directions, np.concatenate(data))
 
     def placement(self, x: FloatArray) -> Placement:
-        """That of variables ``x``, in steps from the start."""
         return self.start.move(
             {name: step * float(value) for (name, step), value in zip(self.steps.items(), x, strict=True)}
         )
 
     def terms(self, placement: Placement) -> SeparableTerms:
-        """The model's operator, from projector pixels to sensor pixels."""
         angle = placement.mask_rotation
         return [self.camera.factors(placement), *((angle * left, right) for left, right in self.turned)]
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Model less data, in units of the noise."""
         terms, model = self.terms(self.placement(x)), []
         for each, (across, along) in zip(self.shown, self.directions, strict=True):
             frame = sum(np.multiply.outer(across.T @ left, along.T @ right) for left, right in _vectors_of(terms, each))
@@ -475,18 +456,15 @@ class _Pass:
         return np.asarray(np.concatenate(model) - self.data)
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Its derivatives, over one step each."""
         here = self.residual(x)
         return np.stack([self.residual(x + one) - here for one in np.eye(len(x))], axis=1)
 
 
 def _vectors_of(terms: SeparableTerms, shown: Shown) -> Iterable[tuple[FloatArray, FloatArray]]:
-    """u (pixels,) and v (pixels,) of the frame of each term under what was shown."""
     return [(left @ shown.rows, right @ shown.columns) for left, right in terms]
 
 
 def _inverse(jacobian: FloatArray, free: Sequence[str]) -> FloatArray:
-    """(J^T J)^-1; MitsimError where two numbers act alike."""
     lengths = np.linalg.norm(jacobian, axis=0)
     if not lengths.all():
         raise MitsimError(
@@ -506,8 +484,6 @@ def _inverse(jacobian: FloatArray, free: Sequence[str]) -> FloatArray:
 
 
 def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) -> Placement:
-    """The built placement, its mask moved to where the response to ``uniform`` light is most like the model's, with
-    the gain that fits."""
     shifts = np.zeros(1)
     if {"mask_shift_row", "mask_shift_column"} & {*free}:
         shifts = camera.geometry.mask_feature * np.arange(-_FEATURES, _FEATURES + 0.125, 0.25)
@@ -534,11 +510,10 @@ def _first_guess(camera: ModelledCamera, uniform: Shown, free: Sequence[str]) ->
 
 
 _SHIFTS = ("mask_shift_row", "mask_shift_column")
-"""That are looked for before the fit."""
+"""Shifts of the mask that are tried before the fit."""
 
 
 def _unexplained_part(terms: SeparableTerms, shown: Sequence[Shown]) -> float:
-    """Part of the responses, rms, that ``terms`` and the stated noise leave."""
     left = energy = 0.0
     for each in shown:
         frame = sum(np.multiply.outer(*pair) for pair in _vectors_of(terms, each))

@@ -1,17 +1,16 @@
-"""A bench, patterns of a capture to come and a wanted PSNR in; the calibration session that its image needs, out.
+"""Plan of the calibration session that an image of a wanted PSNR needs.
 
-A calibration's noise is its exposure's and its repeats'. The capture is simulated, the session's light traced and its
-responses formed, all once; then factors with the noise of any exposure are drawn in closed form, the image is solved
-with them as a user would, and judged by the truth. PSNR rises with the light of a session until the noise of the
-capture, or what the camera cannot resolve, is all that is left: the least light that reaches the wanted PSNR is found
-between two sessions of which one does and one does not.
+A calibration's noise depends on its exposure and repeats. The capture is simulated and the session's responses are
+formed once. Then factors with the noise of any exposure are drawn in closed form, the image is solved with them, and
+compared with the truth. PSNR rises with the light of a session until the noise of the capture or the resolution of the
+camera limits it. The least light that reaches the wanted PSNR is found between two sessions of which one reaches it.
 
-Noise of a session's frames is independent from pixel to pixel and shot to shot, and factors are linear in responses:
-u_i = Y_i v / |v|^2, Phi_L = U H^T / N. With V[k, l] the variance of a response at a pixel, a number of row k of Phi_L
-has variance sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated, since the rows of H are orthogonal. So
-factors are drawn without drawing a frame. Where each +-1 pattern is taken from one shot and a uniform one that all
-share, the noise of the latter comes into column p of Phi_L by sum_i H[p, i] / N: all of it into the column whose signs
-are all +1. The noise of v enters at second order and is left out, as are noise that a sensor row shares, and speckle.
+Noise of frames is independent between pixels and shots, and factors are linear in responses: u_i = Y_i v / |v|^2,
+Phi_L = U H^T / N. With V[k, l] the variance of a response at a pixel, a number in row k of Phi_L has the variance
+sum_l V[k, l] v_l^2 / (N |v|^4), and numbers are uncorrelated because the rows of H are orthogonal. If each +-1 pattern
+is one shot and all share a uniform one, the noise of the latter enters column p of Phi_L by sum_i H[p, i] / N, that is,
+only the column whose signs are all +1. The noise of v enters at second order and is neglected, as are speckle and noise
+that a sensor row shares.
 """
 
 from __future__ import annotations
@@ -47,24 +46,22 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.sensor.moments import frame_moments
 
 _DRAWS = 8
-"""Sessions whose mean PSNR is taken: single ones scatter by 0.4 dB, as few directions of an image carry most of what
-factors' noise does to it; the mean by 0.14 dB."""
+"""Sessions whose mean PSNR is used: single ones scatter by 0.4 dB, the mean by 0.14 dB."""
 _NEAR_DB = 0.05
-"""Beyond the wanted PSNR, at which no less light is looked for."""
+"""Excess over the wanted PSNR at which the search ends."""
 _STEP = 8.0
-"""By which light is changed until the wanted PSNR lies between two sessions: some 6 dB."""
+"""Factor of light until the wanted PSNR is bracketed: some 6 dB."""
 _TRIED = 0.1
-"""Part of a search that a session is: nine are the most, five the middle (images whose error falls to a floor)."""
+"""Part of a search that one session is: nine sessions at most, five in the median."""
 _DIGITS = 3
-"""Of an exposure fraction: a thousandth of the light is 0.004 dB."""
+"""Digits of an exposure fraction: a thousandth of the light is 0.004 dB."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Images with factors of a session by ``recipe`` (None: without noise): mean PSNR [dB], and its standard deviation
-    from session to session.
+    """Images with factors of a session by ``recipe`` (None: no noise): mean PSNR [dB] and its standard deviation.
 
-    ``largest`` is the source of most of the first image's stated uncertainty; empty where none is stated.
+    ``largest`` is the largest source of the first image's stated uncertainty; empty if none is stated.
     """
 
     recipe: SessionRecipe | None
@@ -75,26 +72,26 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationPlan:
-    """What a calibration session must be for a wanted image.
+    """Session for a wanted image.
 
     Attributes
     ----------
     psnr_asked, patterns
-        wanted PSNR [dB], and of the capture.
+        Wanted PSNR [dB], and patterns of the capture.
     recipe
-        of the session that reaches it; else of the one that comes nearest.
+        Recipe that reaches it, or that comes nearest.
     trial, ceiling
-        images with factors of that session, and with factors without noise.
+        Images with factors of that session, and with noise-free factors.
     frames, exposure_s
-        of the session, and of each [s].
+        Frames of the session, and exposure time of each [s].
     electrons, photons
-        that a pixel gets in a frame, mean over pixels and stripes.
+        Mean number per pixel and frame.
     simulation_s
-        predicted of `mitsim calibrate`, without the program's start [s].
+        Predicted seconds of `mitsim calibrate`, without the start of the program.
     seconds
-        that this plan took, by stage.
+        Time of this plan by stage.
     flags
-        why the promise may not hold.
+        Reasons why the prediction may fail.
     """
 
     psnr_asked: float
@@ -112,12 +109,12 @@ class CalibrationPlan:
 
     @property
     def reached(self) -> bool:
-        """Whether the wanted PSNR is."""
+        """Return True if the wanted PSNR is reached."""
         return self.trial.psnr_db >= self.psnr_asked
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why it is not, in a line, and what else may break the promise."""
+        """Return why the PSNR is not reached, and the flags."""
         if self.reached:
             return self.flags
         most = f", most of its error is {self.ceiling.largest}" if self.ceiling.largest else ""
@@ -134,7 +131,7 @@ class CalibrationPlan:
         return (sentence, *self.flags)
 
     def payload(self) -> dict[str, Any]:
-        """The JSON of the command line."""
+        """Return the values of the command line's JSON."""
         return {
             "psnr_asked": self.psnr_asked,
             "patterns": self.patterns,
@@ -159,7 +156,7 @@ class CalibrationPlan:
         }
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return the report as lines of text."""
         recipe, total = self.recipe, self.frames * self.exposure_s
         return [
             f"PSNR {self.psnr_asked:g} dB under {self.patterns}: predicted {self.trial.psnr_db:.1f} dB "
@@ -183,34 +180,32 @@ def plan_calibration(
     seed: int = 0,
     job: Job | None = None,
 ) -> CalibrationPlan:
-    """The least exposure, or where one shot of each frame is too little the fewest repeats, with which the image of a
-    capture reaches a PSNR.
+    """Find the least exposure, or fewest repeats, with which the image of a capture reaches a PSNR.
 
     Parameters
     ----------
     bench
-        scene, camera and projector.
+        Scene, camera and projector.
     psnr
-        that is wanted [dB].
+        Wanted PSNR [dB].
     patterns
-        of the capture, which is exposed as `mitsim capture` does by default.
+        Patterns of the capture, which is exposed as `mitsim capture` does by default.
     recipe
-        of the session; None: the shipped one. Its exposure fraction is the largest that is taken; its repeats are
-        found.
+        Recipe of the session; None for the shipped one. Its exposure fraction is the largest; its repeats are found.
     accuracy, seed
-        of the light, and of every random stream.
+        Accuracy of the light, and root of every random stream.
     job
-        clock, progress and limits.
+        Clock, progress and limits.
 
     Returns
     -------
     CalibrationPlan
-        flagged where no calibration reaches that PSNR.
+        Flagged if no calibration reaches that PSNR.
 
     Raises
     ------
     MitsimError
-        for another PSNR than 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
+        For a PSNR outside 1 to 100 dB, patterns that do not fit, and as :meth:`mitsim.api.bench.Bench.capture`.
     """
     check_psnr(psnr)
     recipe, job = (recipe or load_recipe()).of_one_depth(), job or Job()
@@ -260,15 +255,12 @@ def plan_calibration(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Images of ``shots`` by factors of ``predicted`` sessions of a ``recipe`` with another exposure or repeats."""
-
     shots: Capture
     predicted: PredictedSession
     recipe: SessionRecipe
     job: Job
 
     def trial(self, recipe: SessionRecipe | None) -> Trial:
-        """Images by sessions of a ``recipe``; None: without noise."""
         draws = range(_DRAWS if recipe else 1)
         images = [reconstruct(self.shots, self.predicted.factors(recipe, draw)) for draw in draws]
         found = [psnr_of(image.image, self._truth) for image in images]
@@ -277,8 +269,6 @@ class _Search:
         return Trial(recipe, float(np.mean(found)), float(np.std(found, ddof=1)) if len(found) > 1 else 0.0, largest)
 
     def least(self, wanted: float, ceiling: Trial) -> Trial:
-        """The session of least light whose images have the ``wanted`` PSNR; the one of most light if none has, and the
-        recipe's own where the ``ceiling`` is below."""
         trials: dict[float, Trial] = {}
 
         def quality(dose: float) -> float:
@@ -298,7 +288,6 @@ class _Search:
         return truth
 
     def _by(self, dose: float) -> SessionRecipe:
-        """The recipe with so many times the light of one shot of each frame, or of that part of one."""
         if dose > 1:
             return self.recipe.model_copy(update={"repeats": round(dose)})
         fraction = float(f"{dose * self.recipe.exposure_fraction:.{_DIGITS}g}")
@@ -306,16 +295,16 @@ class _Search:
 
 
 def least_dose(quality: Callable[[float], float], wanted: float, smallest: float) -> float:
-    """The least dose of light that is good enough; the largest one if none is.
+    """Return the least dose of light that suffices, or the largest one.
 
     Parameters
     ----------
     quality
-        PSNR [dB] by dose, which rises; asked for the same dose more than once. Beyond 1, doses are whole repeats.
+        PSNR [dB] by dose; it rises and is called repeatedly. Doses beyond 1 are whole repeats.
     wanted
-        that is good enough [dB].
+        PSNR that suffices [dB].
     smallest
-        dose; the largest has ``MOST_REPEATS``.
+        Smallest dose; the largest has ``MOST_REPEATS``.
     """
     low = high = 1.0
     while quality(low) >= wanted:
@@ -333,20 +322,10 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
 
 
 def _is_close(low: float, high: float, beyond_db: float) -> bool:
-    """Whether no dose between ``low`` and ``high`` is worth a look; ``beyond_db`` is what the latter has too much."""
     return (low >= 1 and high - low <= 1) or beyond_db <= _NEAR_DB or high / low < 1 + 10.0 ** (1 - _DIGITS)
 
 
 def _next_dose(low: float, high: float, under_db: float, over_db: float) -> float:
-    """The dose at which a straight line over log dose meets what is wanted, well within; whole repeats.
-
-    Parameters
-    ----------
-    low, high
-        doses.
-    under_db, over_db
-        their PSNR beyond what is wanted, below 0 and not.
-    """
     part = min(max((_NEAR_DB / 2 - under_db) / (over_db - under_db), 0.2), 0.8)
     dose = float(low * (high / low) ** part)
     return min(max(float(round(dose)), low + 1), high - 1) if low >= 1 else dose
@@ -362,9 +341,9 @@ class PredictedSession:
     Attributes
     ----------
     lit
-        the session in its light, by any recipe of its board and way of capturing signed patterns.
+        Session in its light, by any recipe of its board and signed capture.
     sums
-        of its noise-free responses, all of them in.
+        Sums over its noise-free responses.
     """
 
     lit: LitSession
@@ -373,11 +352,11 @@ class PredictedSession:
     @classmethod
     @single_threaded_blas()
     def of(cls, lit: LitSession, job: Job) -> PredictedSession:
-        """Those of a session ``lit``; ``job`` takes the time of forming its responses, and is told how far it is."""
+        """Form the noise-free responses of a session."""
         return cls(lit, session_sums(lit, job, (NOISE_FREE,)).sums[NOISE_FREE])
 
     def by(self, recipe: SessionRecipe) -> LitSession:
-        """The session with the exposure and the repeats of a ``recipe``, whose other fields are those it was lit by."""
+        """Return the session with exposure and repeats of a ``recipe``, which must be equal otherwise."""
         lit = self.lit
         exposure = Exposure(None, recipe.exposure_fraction).choose(
             lit.session.bench.devices, float(lit.white.irradiance.max())
@@ -385,15 +364,7 @@ class PredictedSession:
         return replace(lit, session=replace(lit.session, recipe=recipe), exposure_s=exposure)
 
     def estimate(self, lit: LitSession | None, draw: int = 0) -> Estimate:
-        """What the noise of a session leaves.
-
-        Parameters
-        ----------
-        lit
-            the session, as :meth:`by` gives it; None: no noise at all.
-        draw
-            number of the noise: equal numbers draw equal noise, larger or smaller by the recipe.
-        """
+        """Estimate factors with drawn noise; ``lit`` None omits it, and equal numbers ``draw`` give equal noise."""
         signs = self.lit.session.signs
         if lit is None:
             return factors_of_sums(*self.sums, signs, 0.0)
@@ -401,7 +372,7 @@ class PredictedSession:
         return factors_of_sums(left, right, signs, lit.response_noise)
 
     def factors(self, recipe: SessionRecipe | None, draw: int = 0) -> Factors:
-        """The same by a ``recipe``, or None, as factors of the camera; ``draw`` as for :meth:`estimate`."""
+        """Return the estimate as factors of the camera."""
         lit = None if recipe is None else self.by(recipe)
         session, exposure_s = self.lit.session, (lit or self.lit).exposure_s
         manifest = CalibrationManifest(
@@ -415,7 +386,6 @@ class PredictedSession:
 
 
 def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
-    """The ``sums`` with noise of a session ``lit``."""
     own, shared = _variances(lit)
     weights = np.square(sums.common / np.dot(sums.common, sums.common))
     by_row = own if sums.side == SIDES[0] else own.T
@@ -436,9 +406,10 @@ def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
 
 
 def _variances(lit: LitSession) -> tuple[FloatArray, FloatArray | None]:
-    """(m, m') noise variance of a +-1 response [(electrons/s)^2]: its own, and what all of a side share.
+    """Return (m, m') noise variances of a +-1 response [(electrons/s)^2]: its own, and that shared by a side.
 
-    Shots of a pattern are taken for half as bright as uniform light: over all patterns, and over a pair, that is exact.
+    Shots of a pattern are assumed to be half as bright as uniform light, which is exact over all patterns and over a
+    pair.
     """
     bench, time, recipe = lit.session.bench, lit.exposure_s, lit.session.recipe
     white = Exposer(bench.devices, time, lit.session.seed).electrons(lit.white)

@@ -1,14 +1,14 @@
-"""A camera's numbers, and how far its mask and projector are off them, in; the factors that its model has, out.
+"""Parametric model of a camera's factors: displacements of mask and projector as numbers that a fit can vary.
 
 Column p of a factor is the mask's shadow of light from projector pixel p, geometric or wave-optical, in closed form
-(:mod:`mitsim.optics.terms`), less what a flat diffuse board and a flat sensor take of slanted rays: both cosines and
-the square of the distance, z^2 / r^4 with r^2 = z^2 (1 + t_row^2 + t_column^2), t = tau - u / z seen from the sensor's
-pixel at u. As a product of the two axes, (1 + t_row^2)^-2 (1 + t_column^2)^-2, it is off by 2 t_row^2 t_column^2 at
-most. All projector pixels are taken to be equally bright.
+(:mod:`mitsim.optics.terms`), times the losses of slanted rays between a flat diffuse board and a flat sensor: both
+cosines and the square of the distance, z^2 / r^4 with r^2 = z^2 (1 + t_row^2 + t_column^2) and t = tau - u / z. As a
+product of the two axes, (1 + t_row^2)^-2 (1 + t_column^2)^-2, the error is at most 2 t_row^2 t_column^2. All projector
+pixels are assumed to be equally bright.
 
-A mask that is turned by a small angle phi from rows toward columns lets through r(s + phi t) c(t - phi s): no separable
-operator any more. To first order it is L (x) R + phi (dL/ds (x) T o R - S o L (x) dR/dt), with S and T the mask
-coordinates at which rays from pixels to directions pass.
+A mask that is turned by a small angle phi from rows toward columns transmits r(s + phi t) c(t - phi s), which is not
+separable. To first order it is L (x) R + phi (dL/ds (x) T o R - S o L (x) dR/dt), with S and T the mask coordinates of
+rays from pixels to directions.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 
 _ANGLE = 2.0
-"""Half the power of a cosine that light of a flat board to a flat sensor falls with: four."""
+"""Half the power of the cosine: light from a flat board to a flat sensor falls with the fourth power."""
 _DERIVED_MM = 5e-4
-"""Shift of the mask for derivatives: a twentieth of a pixel, over which shadows are averaged."""
+"""Shift of the mask for derivatives: a twentieth of a pixel."""
 _KEPT = 12
-"""Factors that are held: of a point, and of a step of each number from it."""
+"""Cached factors: one point, and one step of each number."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where mask and projector are, and how bright the board is.
+    """Positions of mask and projector, and brightness of the board.
 
     Attributes
     ----------
     mask_distance
-        sensor to mask [mm].
+        Sensor to mask [mm].
     mask_shift_row, mask_shift_column
-        of the mask's centre beyond the camera's own offset [mm], index coordinates.
+        Shift of the mask's centre beyond the camera's own offset [mm], index coordinates.
     mask_rotation
-        from rows toward columns, about its centre [rad].
+        Rotation about its centre from rows toward columns [rad].
     magnification
-        of the projector's window about its centre.
+        Scale of the projector's window about its centre.
     projector_row, projector_column
-        shift of the window [tangent of the angle].
+        Shift of the window [tangent of the angle].
     gain
-        electrons a second that a projector pixel of the board makes on a sensor pixel without the mask.
+        Electrons per second that a projector pixel on the board makes on a sensor pixel without the mask.
     """
 
     mask_distance: float
@@ -63,24 +63,24 @@ class Placement:
     gain: float = 1.0
 
     def move(self, steps: Mapping[str, float]) -> Placement:
-        """The same with ``steps`` added to some of its numbers, by name."""
+        """Return a placement with ``steps`` added to some of its numbers, by name."""
         return replace(self, **{name: getattr(self, name) + step for name, step in steps.items()})
 
 
 @dataclass(frozen=True, eq=False)
 class ModelledCamera:
-    """The model of a camera that was to be built so.
+    """Model of a camera as designed.
 
     Attributes
     ----------
     geometry
-        the camera.
+        The camera.
     windows
-        row and column tan-angles of the projector's window on the aligned plane.
+        Row and column tan-angles of the projector's window on the aligned plane.
     n
-        projector pixels a side.
+        Projector pixels per side.
     spectrum
-        lines of a wave-optical shadow; None: geometric.
+        Lines of a wave-optical shadow; None for a geometric shadow.
     """
 
     geometry: CameraGeometry
@@ -90,11 +90,11 @@ class ModelledCamera:
 
     @property
     def built(self) -> Placement:
-        """As it was to be."""
+        """Return the placement as designed."""
         return Placement(self.geometry.mask_distance)
 
     def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """(m, n) left and (m', n) right factor [sqrt(electrons / s)] of the mask at a ``placement``, but not turned."""
+        """Return the (m, n) left and (m', n) right factor [sqrt(electrons / s)] of an unturned mask."""
         built = self.built
         left, right = self._cached_factors(replace(placement, gain=built.gain, mask_rotation=built.mask_rotation))
         root = np.sqrt(placement.gain)
@@ -102,12 +102,10 @@ class ModelledCamera:
 
     @cached_property
     def _cached_factors(self) -> Callable[[Placement], tuple[FloatArray, FloatArray]]:
-        """The last factors: a fit asks for the same again, with other numbers that scale or turn them."""
         return lru_cache(maxsize=_KEPT)(self._form_factors)
 
     @cached_property
     def _cached_axis(self) -> Callable[[float, float, Directions], SeparableTerms]:
-        """The last shadows of an axis: most of what is fitted changes one of the two."""
         return lru_cache(maxsize=_KEPT)(self._axis)
 
     def _form_factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
@@ -123,7 +121,6 @@ class ModelledCamera:
         return best.left, best.right
 
     def _axis(self, distance: float, offset: float, directions: Directions) -> SeparableTerms:
-        """The shadow of one axis, as its left and as its right factors."""
         update = {"mask_distance": distance, "mask_offset_row": offset, "mask_offset_column": offset}
         camera = self.geometry.model_copy(update=update)
         of_rows, of_columns = (self._falloff(directions, axis) for axis in (0, 1))
@@ -131,7 +128,7 @@ class ModelledCamera:
         return [(left * of_rows, right * of_columns) for left, right in terms]
 
     def rotation_terms(self, placement: Placement) -> SeparableTerms:
-        """What a rotation of the mask at a ``placement`` adds to the product of its factors, for each radian."""
+        """Return the change of the product of the factors per radian of rotation of the mask at a ``placement``."""
         step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
         ahead = self.factors(placement.move(step))
         behind = self.factors(placement.move({name: -value for name, value in step.items()}))
@@ -151,13 +148,11 @@ class ModelledCamera:
         return Directions.cells(edges[0]), Directions.cells(edges[1])
 
     def _falloff(self, directions: Directions, axis: int) -> FloatArray:
-        """(m, n) part of the light that is left of ``directions`` at a pixel, along an ``axis``."""
         depth, pixels = self.geometry.scene_distance, self.geometry.centres(axis)
         squared = np.square(directions.centres - pixels[:, None] / depth)
         return np.asarray((1 + squared) ** -_ANGLE * self.geometry.angular_response(squared))
 
     def _crossings(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
-        """(m, n) and (m', n) mask coordinates, from its centre, of rays from pixels to directions, along both axes."""
         depth, distance = self.geometry.scene_distance, placement.mask_distance
         shifts = placement.mask_shift_row, placement.mask_shift_column
         return tuple(  # type: ignore[return-value]

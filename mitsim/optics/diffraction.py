@@ -1,24 +1,24 @@
-"""Wave-optical shadow of a mask: from sensor pixels, directions and wavelengths to irradiances, as separable terms.
+"""Wave-optical shadow of a mask as separable terms: scalar Fresnel diffraction.
 
-Scalar Fresnel diffraction (Goodman, Introduction to Fourier Optics, 4.2 and 4.5). A point source at tan-angle tau and
-depth z, a mask whose amplitude transmission is a sum of separable terms at distance d: the field of a term on the
-sensor is a product of two 1-D fields, each a function of s = u (1 - d/z) + d tau alone, of effective distance
-D = d (z - d) / z. A profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
+Goodman, Introduction to Fourier Optics, 4.2 and 4.5. A point source is at tan-angle tau and depth z, and a mask whose
+amplitude transmission is a sum of separable terms is at distance d. The field of a term on the sensor is a product of
+two 1-D fields. Each is a function of s = u (1 - d/z) + d tau alone, with the effective distance D = d (z - d) / z. A
+profile that jumps by J_k at e_k gives, relative to an unbounded open mask::
 
     U(s) = sum_k J_k E(s - e_k),    E(x) = 1/2 + (1 - i)/2 (C + i S)(x sqrt(2 / (lambda D)))
 
 with Fresnel's integrals C and S. E is split into its geometric shadow, the unit step, and the wave from the edge,
-g = E - step, so U is the profile plus one convolution of the jumps with g on a fine grid. At |x| = R, lambda D / 2 over
-the grid's step, the edge wave oscillates faster than the grid resolves, so it is faded out from 3 R / 4 to R. What is
-lost left the mask at tangents above 0.8 (a quarter micrometre, 550 nm), where nothing is paraxial any more: 4.5e-4 of
-the light, spread evenly.
+g = E - step, so that U is the profile plus one convolution of the jumps with g on a fine grid. Beyond |x| = R,
+lambda D / 2 over the grid's step, the edge wave oscillates faster than the grid resolves. Therefore it is faded out
+from 3 R / 4 to R. The light that is lost left the mask at tangents above 0.8 (a quarter micrometre, 550 nm), where the
+paraxial approximation fails: 4.5e-4 of the light, spread evenly.
 
-Intensity of ``t = sum_k w_k r_k c_k`` (real)::
+The intensity of ``t = sum_k w_k r_k c_k`` (real) is::
 
     |U|^2 = sum_k w_k^2 |R_k|^2 |C_k|^2 + sum_(k<l) 2 w_k w_l (Re[R_k R_l*] Re[C_k C_l*] - Im[R_k R_l*] Im[C_k C_l*])
 
-one separable term for one field, four for two (FlatCam). Through a thick mask the field is taken as that behind the
-clear aperture of both faces, propagated from the exit face: diffraction inside the mask is left out.
+which is one separable term for one field and four for two (FlatCam). Through a thick mask, the field is that behind
+the clear aperture of both faces, propagated from the exit face; diffraction inside the mask is neglected.
 """
 
 from __future__ import annotations
@@ -45,42 +45,47 @@ from mitsim.optics.shadow import Directions, SeparableTerms, ShadowGeometry, bot
 
 ComplexArray = npt.NDArray[np.complex128]
 _STEP_MM = 2.5e-4
-"""Widest grid cell. It leaves 3.2e-4 of the anchor geometry's shadow, half of it 1.4e-4, twice 7e-4 (against an
-eighth; tests/physics/test_diffraction.py)."""
+"""Widest grid cell: it changes the anchor geometry's shadow by 3.2e-4 (tests/physics/test_diffraction.py)."""
 _STEPS_PER_FRESNEL_LENGTH = 130
-"""Grid cells in sqrt(lambda D) where that is finer: what :data:`_STEP_MM` is of the anchor geometry's."""
+"""Grid cells in sqrt(lambda D) where that is finer than :data:`_STEP_MM`."""
 _THICK_STEPS = 2
-"""Grid of a thick mask, whose every direction needs fields of its own, in steps of the thin one's."""
+"""Grid step of a thick mask in steps of a thin one, because each direction needs fields of its own."""
 _DISTANCES = 3
-"""Of a tilted mask at which waves are worked out: it changes by a few percent, and waves less."""
+"""Distances at which the waves of a tilted mask are computed."""
 _NARROWEST = 0.5
-"""Mean width of a mask's openings, in wavelengths, from which its waves are worked out: between conducting edges half a
-wavelength is the cutoff of light polarised along them (Jackson, Classical Electrodynamics, 8.3), and below it hardly
-any passes that scalar theory would let through."""
+"""Least mean width of the openings in wavelengths. Between conducting edges, half a wavelength is the cutoff of light
+polarised along them (Jackson, Classical Electrodynamics, 8.3), so that scalar theory fails below it.
+"""
 _NODES = 12
-"""Of the rule for the wave from an edge: it leaves exp(-pi 12.5), 9e-18."""
+"""Nodes of the midpoint rule, whose error is exp(-pi 12.5) = 9e-18."""
 _LARGEST_GRID = 1 << 24
 """Cells of a grid: 256 MiB for each of a few complex arrays."""
 _KEPT, _LARGEST_KEPT = 24, 1 << 18
-"""Shadows that are kept, three lines at eight depths, and cells of the largest, of all products: 6 MiB each."""
+"""Cached shadows (three lines at eight depths), and cells of the largest one, 6 MiB each."""
 _PART_OF_RANGE = 1 / 4
-"""A grid that may be kept begins and ends at multiples of this part of its range or less, so that rows, columns, coarse
-and fine cells share it: it is a quarter longer at most, and a fifth on average."""
+"""A cached grid starts and ends at multiples of this part of its range, so that axes and cells of all sizes share
+it. The grid becomes at most a quarter longer.
+"""
 
 
 class EdgeWaves:
-    """Fresnel fields of 1-D apertures on a grid, prepared once; MitsimError for a grid that no memory holds.
+    """Fresnel fields of 1-D apertures on a grid, prepared once.
 
     Parameters
     ----------
     wavelength_nm, distance_mm
-        of the light, and effective distance D.
+        Wavelength, and effective distance D.
     step_mm, count
-        width and number of a result's grid cells.
+        Width and number of the grid cells.
     span_mm
-        the greatest distance from a result to an edge that matters.
+        Greatest distance from a cell to an edge that matters.
     single
-        whether fields are in single precision, which leaves 1e-6 of them in half the time.
+        Compute fields in single precision: half the time, relative error 1e-6.
+
+    Raises
+    ------
+    MitsimError
+        If the grid exceeds the memory limit.
     """
 
     def __init__(
@@ -110,17 +115,11 @@ class EdgeWaves:
         self._kernel = kernel.astype(np.complex64) if single else kernel
 
     def field(self, aperture: Steps, start_mm: float) -> ComplexArray:
-        """(count,) field behind ``aperture`` at the centres of the cells from ``start_mm`` on, 1 without a mask."""
+        """Return the (count,) field behind ``aperture`` at the cell centres from ``start_mm``; 1 without a mask."""
         return np.asarray(self.fields([aperture], start_mm)[0])
 
     def fields(self, apertures: Sequence[Steps], start_mm: float) -> ComplexArray:
-        """(apertures, count) the same of several, side by side: a transform of eight takes half as long as eight.
-
-        Parameters
-        ----------
-        apertures, start_mm
-            what they are, and where the first point is.
-        """
+        """Return the (apertures, count) fields of several apertures in one transform."""
         reach, count = self._reach, self._count
         start = start_mm - reach * self.step_mm
         profiles = np.stack([each.amplitude_means(start, self.step_mm, count + 2 * reach) for each in apertures])
@@ -140,11 +139,11 @@ class EdgeWaves:
 
 
 def edge_wave(x: FloatArray) -> ComplexArray:
-    """The wave g from an edge, E - 1 = (1 - i)/2 (C + i S)(x) - 1/2, at ``x`` > 0 in units of sqrt(lambda D / 2).
+    """Return the wave from an edge, E - 1 = (1 - i)/2 (C + i S)(x) - 1/2, at ``x`` > 0 in units of sqrt(lambda D / 2).
 
-    It is -erfc(z)/2 of z = exp(-i pi/4) sqrt(pi/2) x: the midpoint rule for an integral over exp(-t^2)/(t^2 + z^2), and
-    the pole that the rule passes over (Alazah, Chandler-Wilde and La Porte 2014, Numerische Mathematik 128, 635). Off
-    by 3e-16; scipy.special has Fresnel's integrals, and takes 0.1 s to import.
+    The value is -erfc(z)/2 at z = exp(-i pi/4) sqrt(pi/2) x: the midpoint rule for an integral over
+    exp(-t^2)/(t^2 + z^2), plus the pole that the rule misses (Alazah, Chandler-Wilde and La Porte 2014, Numerische
+    Mathematik 128, 635). The error is 3e-16. scipy.special is avoided because its import takes 0.1 s.
     """
     scale = ((_NODES + 0.5) * np.pi) ** 0.5
     y = (np.pi / 2) ** 0.5 * x
@@ -163,7 +162,7 @@ def edge_wave(x: FloatArray) -> ComplexArray:
 
 @cache
 def fast_length(least: int) -> int:
-    """The first number from ``least`` on without prime factors above 11: a transform of so many points is fast."""
+    """Return the first number from ``least`` without prime factors above 11, for fast transforms."""
     for length in count_from(least):
         left = length
         for prime in (2, 3, 5, 7, 11):
@@ -175,16 +174,9 @@ def fast_length(least: int) -> int:
 
 
 def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, spectrum: Spectrum) -> SeparableTerms:
-    """Wave-optical shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
+    """Return the wave-optical shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
 
-    Parameters
-    ----------
-    shadow
-        sensor, mask and depth.
-    rows, columns
-        r and c directions.
-    spectrum
-        its lines one after the other; the terms of each are in the order of the module's formula.
+    The terms of each line of the spectrum are in the order of the module's formula.
     """
     shadow = _of_fields(shadow)
     weights = _pair_weights(shadow.weights())
@@ -204,20 +196,21 @@ def wave_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions, sp
 def wave_profiles(
     shadow: ShadowGeometry, wavelength_nm: float, low_mm: float, high_mm: float, tau: float
 ) -> tuple[list[tuple[float, FloatArray]], float, float]:
-    """Intensity of a point source's shadow over the mask coordinate, before any averaging over pixel and cell.
+    """Compute the intensity of a point source's shadow over the mask coordinate, before averaging over pixel and cell.
 
     Parameters
     ----------
     shadow, wavelength_nm
-        sensor, mask and the source's depth; its light.
+        Sensor, mask and depth of the source; wavelength.
     low_mm, high_mm
-        range of the mask coordinate.
+        Range of the mask coordinate.
     tau
-        the source's tan-angle, which matters to thick masks.
+        Tan-angle of the source, which matters for thick masks.
 
     Returns
     -------
-    (weight, (cells,) profile) of each separable term, and the start and the step [mm] of the grid.
+    tuple
+        (weight, (cells,) profile) of each separable term, and the start and step [mm] of the grid.
     """
     shadow = _of_fields(shadow)
     light = _Propagation.of(shadow, wavelength_nm)
@@ -228,7 +221,6 @@ def wave_profiles(
 
 
 def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
-    """The ``shadow`` with the mask whose values are the factors of a field; MitsimError for one of many terms."""
     mask = shadow.mask.amplitude
     if isinstance(mask, Plate) and mask.crosses is None:
         raise MitsimError(
@@ -239,12 +231,12 @@ def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
 
 
 def narrowest_mm(wavelength_nm: float) -> float:
-    """Mean width of a mask's openings [mm] from which waves of ``wavelength_nm`` are worked out."""
+    """Return the least mean width [mm] of openings for which waves of ``wavelength_nm`` are computed."""
     return _NARROWEST * wavelength_nm * 1e-6
 
 
 def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
-    """MitsimError for a ``mask`` whose openings are too narrow for scalar waves of ``wavelength_nm``."""
+    """Raise MitsimError if the openings of a ``mask`` are too narrow for scalar waves of ``wavelength_nm``."""
     if mask.opening_mm < narrowest_mm(wavelength_nm):
         raise MitsimError(
             f"mask: its openings are {mask.opening_mm:.3g} mm wide, and diffraction of {wavelength_nm:.0f} nm needs "
@@ -254,8 +246,13 @@ def check_openings(mask: Mask | Plate, wavelength_nm: float) -> None:
 
 
 def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
-    """Width [mm] of a grid cell for ``shadow`` at ``wavelength_nm``; a feature that is wider holds a whole number of
-    them. MitsimError for a mask whose openings are too narrow for scalar waves."""
+    """Return the width [mm] of a grid cell, of which a wider feature holds a whole number.
+
+    Raises
+    ------
+    MitsimError
+        If the openings of the mask are too narrow for scalar waves.
+    """
     check_openings(shadow.mask, wavelength_nm)
     feature = shadow.mask.feature_mm
     fresnel_length = (wavelength_nm * 1e-6 * shadow.distance_mm * shadow.shrink) ** 0.5
@@ -266,9 +263,6 @@ def grid_step(shadow: ShadowGeometry, wavelength_nm: float) -> float:
 
 @dataclass(frozen=True)
 class _Propagation:
-    """Light on its way from one axis of a mask to the sensor: wavelength [nm], effective distance, the mask's extent,
-    and the step of the grid [mm]."""
-
     wavelength_nm: float
     distance_mm: float
     extent_mm: float
@@ -276,24 +270,20 @@ class _Propagation:
 
     @classmethod
     def of(cls, shadow: ShadowGeometry, wavelength_nm: float) -> _Propagation:
-        """That of a ``shadow``."""
         distance, step = shadow.distance_mm * shadow.shrink, grid_step(shadow, wavelength_nm)
         return cls(wavelength_nm, distance, shadow.mask.extent_mm, step)
 
     def waves(self, lows: FloatArray, highs: FloatArray) -> EdgeWaves:
-        """Waves on a grid that holds each range of mask coordinates [mm], wherever the grid's start is rounded to."""
         count = int(np.ceil((highs - lows).max() / self.step_mm)) + 3
         span = self.extent_mm / 2 + float(max(np.abs(lows).max(), np.abs(highs).max())) + 3 * self.step_mm
         return EdgeWaves(self.wavelength_nm, self.distance_mm, self.step_mm, count, span)
 
     def start(self, low: float) -> float:
-        """A coordinate at least a cell below ``low`` from which the mask's edges fall between cells."""
         first = -self.extent_mm / 2
         return float(first + (np.floor((low - first) / self.step_mm) - 1) * self.step_mm)
 
 
 def _integrate(apertures: tuple[Steps, ...], light: _Propagation, low: float, high: float) -> Antiderivative:
-    """Antiderivatives of the products of the fields behind ``apertures``, over mask coordinates ``low`` to ``high``."""
     waves, start = light.waves(np.array([low]), np.array([high])), light.start(low)
     return Antiderivative.of_samples(_products([waves.field(each, start) for each in apertures]), start, waves.step_mm)
 
@@ -304,8 +294,10 @@ _keep_integrated = lru_cache(maxsize=_KEPT)(_integrate)
 def _thin_means(
     shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
-    """(pairs, m, c) mean products of fields; one grid serves all directions. Behind a mask that is tilted along the
-    axis they are interpolated between those of some distances."""
+    """Return the (pairs, m, c) mean products of fields; one grid serves all directions.
+
+    Behind a tilted mask they are interpolated between those of a few distances.
+    """
     growth, beyond = shadow.tilt[0]
     if not growth:
         return _thin_means_at(beyond, shadow, profiles, directions, wavelength_nm)
@@ -322,7 +314,6 @@ def _thin_means(
 def _thin_means_at(
     beyond: float, shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
-    """The same of waves from ``beyond`` [mm] the mask's distance."""
     met, half_cell = shadow.on_tilted_mask(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
     low, high = float(met.min() - reach), float(met.max() + reach)
@@ -338,7 +329,6 @@ def _thin_means_at(
 def _thick_means(
     shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions, wavelength_nm: float
 ) -> FloatArray:
-    """(pairs, m, c) mean products of fields; each direction sees an aperture of its own."""
     crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
     reach = shadow.half_pixel + half_cell
     lows, highs = crossings.min(axis=0) - reach, crossings.max(axis=0) + reach
@@ -356,7 +346,6 @@ def _thick_means(
 
 
 def _products(fields: list[ComplexArray]) -> FloatArray:
-    """(pairs, n): |U_k|^2 of each field, then Re and Im of U_k U_l* for each k < l."""
     parts = [np.square(field.real) + np.square(field.imag) for field in fields]
     for first, second in combinations(fields, 2):
         product = first * second.conj()
@@ -365,6 +354,5 @@ def _products(fields: list[ComplexArray]) -> FloatArray:
 
 
 def _pair_weights(weights: list[float]) -> list[float]:
-    """Weights of the intensity's separable terms, in the order of :func:`_products`."""
     pairs = [(2 * first * second, -2 * first * second) for first, second in combinations(weights, 2)]
     return [*(weight**2 for weight in weights), *chain.from_iterable(pairs)]

@@ -1,12 +1,11 @@
-"""What lets light through one axis of a mask: from feature profiles to piecewise constant functions, and their means.
+"""Transmission of one axis of a mask as a piecewise constant function of the mask coordinate, and its means.
 
-A profile is a :class:`Steps` function of the mask coordinate s [mm]. A thick mask multiplies two of them, because light
-has to pass both faces. Means over a sensor pixel and a cell (two boxes, one after the other) come from the second
-antiderivative; the mean of the values is taken off first, so that the second difference has little to cancel: 1e-11 is
-left for values of order 1 (measured in tests/unit/optics/test_profile.py).
+A thick mask multiplies two :class:`Steps` because light has to pass both faces. Means over a sensor pixel and a cell
+(two boxes in succession) follow from the second antiderivative. The mean of the values is subtracted first, so that
+the second difference cancels little: 1e-11 remains for values of order 1 (tests/unit/optics/test_profile.py).
 
-Blurred by a Gaussian of standard deviation sigma, a unit step is the normal distribution function Phi(x / sigma), and
-its means over one and two boxes are differences of its antiderivatives, with phi the normal density::
+Blurred by a Gaussian of standard deviation sigma, a unit step is the normal distribution function Phi(x / sigma). Its
+means over one and two boxes are differences of its antiderivatives, with phi the normal density::
 
     x Phi + sigma phi    and    ((x^2 + sigma^2) Phi + x sigma phi) / 2
 """
@@ -22,34 +21,24 @@ import scipy
 from mitsim.core.arrays import ByValue, FloatArray
 
 _FEW = 4
-"""Edges in the narrower box that are taken one by one; with more, the box is wide enough for a second difference to
-keep 1e-11 (measured in tests/unit/optics/test_profile.py)."""
+"""Edges in the narrower box up to which edges are summed one by one; beyond, a second difference keeps 1e-11."""
 _DENSE = 2
-"""Points for each cell of a grid from which means are worked out once a cell and interpolated: a point then takes one
-look-up of four numbers instead of four of three."""
+"""Points per grid cell from which means are computed once per cell and interpolated."""
 _WIDE = 16
-"""Product of two boxes' half-widths, in steps of the grid, from which cubic interpolation leaves less than 4e-5 of a
-shadow, an eighth of what the grid itself leaves (measured in tests/physics/test_diffraction.py)."""
+"""Product of the half-widths of two boxes, in grid steps, from which cubic interpolation errs by less than 4e-5."""
 _BEYOND = 8.3
 """Standard deviations beyond which a blurred step is 0 or 1 to rounding."""
 _POINTLIKE = 1e-4
-"""Half-width of a box, in standard deviations of the blur, below which it counts as none: 2e-9 is left."""
+"""Half-width of a box in standard deviations of the blur below which the box is neglected (error 2e-9)."""
 _PER_CELL = 4
-"""Points of a grid's cell at which the root of a blurred profile is taken, which changes over its blur."""
+"""Points per grid cell at which the root of a blurred profile is computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Steps(ByValue):
     """A piecewise constant function: ``values[k]`` from ``edges[k]`` to ``edges[k + 1]`` [mm], 0 outside.
 
-    Attributes
-    ----------
-    edges
-        (k + 1,) increasing coordinates.
-    values
-        (k,) real numbers.
-    blur_mm
-        standard deviation of a Gaussian that blurs it [mm].
+    ``blur_mm`` is the standard deviation of a Gaussian that blurs it.
     """
 
     edges: FloatArray
@@ -58,54 +47,32 @@ class Steps(ByValue):
 
     @classmethod
     def of(cls, profile: npt.ArrayLike, feature_mm: float) -> Steps:
-        """The centred ``profile`` (N,) of features of ``feature_mm``, neighbours of equal value merged."""
+        """Return the centred ``profile`` (N,) of features of ``feature_mm``, with equal neighbours merged."""
         count = len(np.asarray(profile))
         return cls.between(profile, np.asarray((np.arange(count + 1) - count / 2) * feature_mm))
 
     @classmethod
     def between(cls, profile: npt.ArrayLike, lines_mm: FloatArray, blur_mm: float = 0.0) -> Steps:
-        """A profile with neighbours of equal value merged.
-
-        Parameters
-        ----------
-        profile, lines_mm
-            (N,) values between (N + 1,) lines.
-        blur_mm
-            as of the result.
-        """
+        """Return the profile of (N,) values between (N + 1,) lines, with equal neighbours merged."""
         values = np.asarray(profile, dtype=np.float64)
         starts = np.flatnonzero(np.diff(values, prepend=np.nan))
         return cls(np.append(lines_mm[starts], lines_mm[-1]), values[starts], blur_mm)
 
     def at(self, s: FloatArray) -> FloatArray:
-        """Values at points ``s`` [mm]; at an edge, those of the interval that begins there."""
+        """Return the values at points ``s`` [mm]; an edge belongs to the interval that begins there."""
         if self.blur_mm:
             return self._blurred_means(s, 0.0, 0.0)
         padded = np.concatenate(([0.0], self.values, [0.0]))
         return np.asarray(padded[np.searchsorted(self.edges, s, side="right")])
 
     def seen_through(self, far: Steps, scale: float, shift: float) -> Steps:
-        """The product ``self(s) * far(scale * s + shift)``.
-
-        Parameters
-        ----------
-        far
-            the second function.
-        scale, shift
-            above 0, and [mm].
-        """
+        """Return the product ``self(s) * far(scale * s + shift)``, with scale > 0 and shift in mm."""
         edges = np.unique(np.concatenate((self.edges, (far.edges - shift) / scale)))
         middle = (edges[:-1] + edges[1:]) / 2
         return Steps(edges, self.at(middle) * far.at(scale * middle + shift))
 
     def cell_means(self, start: float, step: float, count: int) -> FloatArray:
-        """(count,) means over equal cells; a cell with an edge in it gets its share.
-
-        Parameters
-        ----------
-        start, step, count
-            first edge and width [mm] of the cells, and their number.
-        """
+        """Return the (count,) means over equal cells of width ``step`` from ``start`` [mm]."""
         if self.blur_mm:
             return self._blurred_means(np.asarray(start + step * (np.arange(count) + 0.5)), step / 2, 0.0)
         bounds = start + step * np.arange(count + 1)
@@ -119,13 +86,7 @@ class Steps(ByValue):
         return np.asarray(means)
 
     def amplitude_means(self, start: float, step: float, count: int) -> FloatArray:
-        """The same of a field's factor whose square is blurred: that square is what a blur of power is.
-
-        Parameters
-        ----------
-        start, step, count
-            as for :meth:`cell_means`.
-        """
+        """Return the means of the root of the blurred profile, because a blur acts on power and not on the field."""
         if not self.blur_mm:
             return self.cell_means(start, step, count)
         power = Steps(self.edges, np.square(self.values), self.blur_mm)
@@ -133,11 +94,10 @@ class Steps(ByValue):
         return np.asarray(np.sqrt(np.maximum(power.at(points), 0)).reshape(count, _PER_CELL).mean(axis=1))
 
     def over(self, centres: FloatArray, half: FloatArray) -> FloatArray:
-        """Means over boxes of half-widths ``half`` [mm] about ``centres`` (the arrays broadcast); at 0 the value."""
+        """Return the means over boxes of half-widths ``half`` [mm] about ``centres``; at 0 the value."""
         return self._blurred_means(centres, half, 0.0)
 
     def _blurred_means(self, centres: FloatArray, half: FloatArray | float, other: float) -> FloatArray:
-        """Means over two boxes, edge by edge; half-widths [mm], the ``other``'s one for all, which may be 0."""
         reach = half + other + _BEYOND * self.blur_mm
         jumps = np.diff(self.values, prepend=0.0, append=0.0)
         first = np.searchsorted(self.edges, centres - reach, side="right")
@@ -150,15 +110,7 @@ class Steps(ByValue):
         return np.asarray(total)
 
     def box_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """Means over two boxes, one after the other.
-
-        Parameters
-        ----------
-        centres
-            of the boxes [mm], any shape, which the result has.
-        half_pixel, half_cell
-            their half-widths [mm].
-        """
+        """Return the means over two boxes in succession, of the shape of ``centres`` [mm]; half-widths in mm."""
         if self.blur_mm:
             return self._blurred_means(centres, half_pixel, half_cell)
         reach = half_pixel + half_cell
@@ -170,16 +122,16 @@ class Steps(ByValue):
 
 
 def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: float) -> FloatArray:
-    """Mean over two boxes about x of a unit step at 0 that a Gaussian blurs; all lengths in one unit.
+    """Return the mean over two boxes about x of a unit step at 0 that a Gaussian blurs; all lengths in one unit.
 
     Parameters
     ----------
     x
-        centres of the boxes; -inf is allowed.
+        Centres of the boxes; -inf is allowed.
     half, other
-        their half-widths, the other's at most one for all; below a ten-thousandth of the blur they count as none.
+        Half-widths. Below a ten-thousandth of the blur a box is neglected.
     blur
-        standard deviation, 0 or above; 0 with no second box alone.
+        Standard deviation; 0 only if there is no second box.
     """
     if other > _POINTLIKE * blur and other > 0:
         ends = (_twice(x + half + other, blur) - _twice(x + half - other, blur)) / (2 * other)
@@ -197,7 +149,6 @@ def _density(z: FloatArray) -> FloatArray:
 
 
 def _once(x: FloatArray, blur: float) -> FloatArray:
-    """Antiderivative of the blurred step."""
     if not blur:
         return np.asarray(np.maximum(x, 0))
     z = np.maximum(x / blur, -2 * _BEYOND)  # both parts are 0 before
@@ -205,7 +156,7 @@ def _once(x: FloatArray, blur: float) -> FloatArray:
 
 
 def _twice(x: FloatArray, blur: float) -> FloatArray:
-    """Its antiderivative."""
+    """Return the second antiderivative of the blurred step."""
     if not blur:
         return np.asarray(np.square(np.maximum(x, 0)) / 2)
     z = np.maximum(x / blur, -2 * _BEYOND)
@@ -213,10 +164,6 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
 
 
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
-    """(functions, *places.shape) values between ``nodes`` (functions, n) of functions, by Lagrange's cubic polynomials.
-
-    ``places`` counts intervals from the second node on.
-    """
     index = places.astype(np.intp)
     beyond = places - index
     result = np.empty((len(nodes), *places.shape))
@@ -233,18 +180,10 @@ def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
 
 
 class Antiderivative:
-    """First and second antiderivative of piecewise constant functions with their means taken off."""
+    """First and second antiderivative of piecewise constant functions whose means are subtracted."""
 
     def __init__(self, edges: FloatArray, values: FloatArray, step: float | None = None) -> None:
-        """Those of (functions, n) values.
-
-        Parameters
-        ----------
-        edges, values
-            (n + 1,) of the pieces [mm], and (functions, n) value of each.
-        step
-            width of all pieces [mm], where they are equal.
-        """
+        """Integrate (functions, n) values between (n + 1,) edges [mm]; ``step`` is the width of equal pieces."""
         width = np.diff(edges)
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
@@ -258,33 +197,18 @@ class Antiderivative:
 
     @classmethod
     def of_samples(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
-        """Those of functions that are constant on equal cells.
-
-        Parameters
-        ----------
-        values
-            (functions, n) on cells that hold every box.
-        start, step
-            first edge and width of the cells [mm].
-        """
+        """Integrate (functions, n) samples on equal cells of width ``step`` from ``start`` [mm]."""
         return cls(start + step * np.arange(values.shape[1] + 1), values, step)
 
     @staticmethod
     def _sums(parts: FloatArray) -> FloatArray:
-        """(functions, n + 1) running sums of (functions, n), from 0 on."""
         sums = np.empty((len(parts), parts.shape[1] + 1))
         sums[:, 0] = 0
         np.cumsum(parts, axis=1, out=sums[:, 1:])
         return sums
 
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """(functions, *centres.shape) means over two boxes, one after the other.
-
-        Parameters
-        ----------
-        centres, half_pixel, half_cell
-            of the boxes, as in :meth:`Steps.box_means`.
-        """
+        """Return the (functions, *centres.shape) means over two boxes in succession."""
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
         total = self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)
         total /= 2 * wide
@@ -292,14 +216,7 @@ class Antiderivative:
         return total
 
     def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
-        """The same of sampled functions without jumps, as fields of waves are: many points are interpolated between
-        cells.
-
-        Parameters
-        ----------
-        centres, half_pixel, half_cell
-            of the boxes, as in :meth:`Steps.box_means`.
-        """
+        """Return the means of sampled functions without jumps; many points are interpolated between cells."""
         step, low = self._step, float(centres.min())
         assert step is not None, "on equal cells"
         count = int((float(centres.max()) - low) / step) + 4
@@ -309,7 +226,6 @@ class Antiderivative:
         return _cubic(nodes, (centres - low) / step)
 
     def _ends(self, points: FloatArray, half: float) -> FloatArray:
-        """(functions, *points.shape) means of the first antiderivative over [points - half, points + half]."""
         if half == 0:
             return self._at(points, order=1)
         # Edge k opens interval k, so these are the edges inside.
@@ -327,7 +243,6 @@ class Antiderivative:
         return means
 
     def _index(self, points: FloatArray) -> npt.NDArray[np.intp]:
-        """The interval that holds each point."""
         if self._step is None:
             index = np.searchsorted(self._edges, points, side="right") - 1
         else:
@@ -335,7 +250,6 @@ class Antiderivative:
         return np.clip(index, 0, self._values.shape[1] - 1)
 
     def _at(self, points: FloatArray, order: int) -> FloatArray:
-        """The antiderivative of that order at points, for each function."""
         index = self._index(points)
         beyond = points - self._edges[index]
         result = np.empty((len(self._values), *points.shape))

@@ -1,17 +1,16 @@
-"""A mask that no few separable terms make up, and its light: the shadow of a point on a raster, at one depth, out.
+"""Shadow of masks without few separable terms, drawn on a raster of square cells.
 
-A turned mask, the light that waves leave behind a mask of many terms, and a picture of a point spread function have no
-short closed form; the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole
-number of which is a sensor pixel seen on the mask, as the correlation below needs them; a cell's value is
-its mean. A point at depth z and tan-angle tau then shades sensor point u by what the raster has at s = u (1 - d/z) + d
-tau, as every mask does.
+A turned mask, waves behind a mask of many terms, and a picture of a point spread function have no short closed form,
+and the geometric shadow of a mask of many terms has a long one. Each is drawn on square cells, a whole number of which
+is a sensor pixel as seen on the mask, because the correlation below needs that; the value of a cell is its mean. A
+point at depth z and tan-angle tau shades sensor point u by the raster's value at s = u (1 - d/z) + d tau.
 
-Means over cells smear an edge by their own box and by that of the raster, h^2 / 6 of variance; a twelfth of the second
-difference along each axis is taken off, which takes half of it back where the raster is read within cells alone.
+Means over cells blur an edge by the box of the cell and by that of the raster, which adds a variance of h^2 / 6. A
+twelfth of the second difference along each axis is subtracted, which corrects half of it.
 
-**Waves.** Behind a mask whose amplitude is a sum of K terms, the field of a point source is that sum of the products of
-1-D fields of :mod:`mitsim.optics.diffraction`; |U|^2 is averaged over points in each cell, and over the light's lines.
-Behind a turned mask there is the same light, turned.
+**Waves.** Behind a mask whose amplitude is a sum of K terms, the field of a point source is the sum of products of the
+1-D fields of :mod:`mitsim.optics.diffraction`. |U|^2 is averaged over points in each cell and over the lines of the
+light. Behind a turned mask, the same light is turned.
 """
 
 from __future__ import annotations
@@ -37,62 +36,57 @@ from mitsim.optics.edge_profile import Steps, blurred_step
 from mitsim.optics.shadow import Directions, Places, SeparableTerms, ShadowGeometry
 
 _CELLS_PER_PIXEL = 6
-"""Raster cells along a pixel: at 4 a raster leaves twice as much (tests/physics/test_raster.py), for which a plan at an
-accuracy of 1e-3 has no room. Features far below a pixel need no more: of a frame in pixels of 12 um random masks of 1
-and of 4 um leave 2e-4 and 1e-3 in waves at 6 (against 48), 2e-4 and 6e-5 turned."""
+"""Raster cells along a pixel: with 4 the error doubles (tests/physics/test_raster.py). In pixels of 12 um, random masks
+of 1 and 4 um features err by 2e-4 and 1e-3 in waves at 6.
+"""
 _FEW_CELLS = 2
-"""The same where frames are compared that are formed alike: they change by what they do at 6 but for a few
-thousandths, for a ninth of the work."""
+"""Cells along a pixel where frames are only compared with each other, for a ninth of the work."""
 _LEFT_BEYOND = 1e-3
-"""Bound of the part of the light that waves may carry beyond a raster's edge. A third of it is found there, as much as
-the points at which waves are squared leave (3.6e-4, a random mask of 31 features of 60 um)."""
+"""Bound of the part of the light that waves carry beyond the edge of a raster."""
 _LARGEST = 8192
-"""Cells a side: a raster takes 512 MiB."""
+"""Cells per side: 512 MiB."""
 _POINTS, _LATTICE = 16, 7
-"""Points of a cell at which a turned mask is asked for its transmission, and columns from one to the next, of as
-many."""
+"""Points per cell at which a turned mask is sampled, and columns between successive points."""
 _POINTS_PER_FRESNEL_LENGTH = 80
-"""Points in sqrt(lambda D) at which waves are squared: at 80 uniform light behind separable masks of order 6 and 9 is
-3.2e-4 and 2.2e-4 off its closed form, at 60 5.8e-4 and 6.8e-4, evenly (tests/physics/test_raster.py)."""
+"""Points in sqrt(lambda D) at which waves are squared; the error is about 3e-4 (tests/physics/test_raster.py)."""
 _MOST_WAVE_POINTS = 1 << 16
-"""Points a side at most: 4e9 of them take a minute for each line, and some seconds more for each term."""
+"""Largest number of points per side: 4e9 points take a minute per line."""
 _MOST_WAVE_TERMS = 2.0**39
-"""Points times terms at most: 40 processor seconds for each line, at 8e-11 s each (mitsim.light.memory)."""
+"""Largest number of points times terms: 40 processor seconds per line, at 8e-11 s each (mitsim.light.memory)."""
 _LEAST_WAVE_POINTS = 2
-"""Points along a cell at least."""
+"""Least number of points along a cell."""
 _GRID_CELLS = 3
-"""Cells of the field's grid from point to point at least."""
+"""Least number of the field's grid cells between points."""
 _AROUND = 8
-"""Cells that a raster is wider than its turned one, for the splines' ends."""
+"""Cells by which a raster exceeds its turned one, for the ends of splines."""
 CORRELATION_PRODUCTS = 30.0
-"""Multiplications a pixel that each phase of a correlation with a raster takes as long as, for each pair of anchors and
-layer: 0.017 processor seconds of 512 x 512 pixels and 36 phases, where sums take 4.5e-11 to 7e-11 a multiplication
-(benchmarks/masks.py)."""
+"""Cost of each phase of a correlation in multiplications per pixel, for each pair of anchors and layer: 0.017 processor
+seconds for 512 x 512 pixels and 36 phases (benchmarks/masks.py).
+"""
 RASTERS_KEPT = 8
-"""The last rasters, and what was prepared of them: layers of a scene, with waves and without; some 100 MiB each at 512
-pixels."""
+"""Number of cached rasters, some 100 MiB each at 512 pixels."""
 _FIELDS_AT_ONCE = 8
-"""Fields that are worked out side by side."""
+"""Fields that are computed together."""
 _AT_ONCE = 2**20
-"""Points asked for at a time, 8 MiB of each of some ten arrays."""
+"""Points that are sampled at a time, 8 MiB of each of some ten arrays."""
 
 
 def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = None) -> Plate:
-    """The shadow of a point at one depth, as a plate of square cells about the mask's centre.
+    """Return the shadow of a point at one depth as a plate of square cells about the mask's centre.
 
     Parameters
     ----------
     geometry
-        the camera.
+        The camera.
     depth
-        of the point [mm].
+        Depth of the point [mm].
     spectrum
-        lines of its light; None: geometric.
+        Lines of its light; None for a geometric shadow.
 
     Raises
     ------
     MitsimError
-        for a raster of too many cells, or a mask whose waves are not worked out.
+        If the raster has too many cells, or waves behind the mask cannot be computed.
     """
     # However it was chosen to be drawn: a run then has its plan's.
     chosen = {"mask_fft": False, "mask_cells": cells_per_pixel(geometry)}
@@ -101,13 +95,7 @@ def raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None = N
 
 @lru_cache(maxsize=RASTERS_KEPT)
 def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | None) -> Plate:
-    """As :func:`raster`, for a camera whose cells are stated; the last ones are kept.
-
-    Parameters
-    ----------
-    geometry, depth, spectrum
-        as there.
-    """
+    """Draw the :func:`raster` of a camera that states its cells; the last rasters are cached."""
     mask, shadow = geometry.build_mask(), ShadowGeometry.of(geometry, depth)
     if not isinstance(mask, Plate):
         raise MitsimError(f"{geometry.mask_words}: its shadow has a closed form; take that")
@@ -134,24 +122,16 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
 
 
 def cells_a_side(geometry: CameraGeometry, spectrum: Spectrum | None) -> int:
-    """Raster cells a side of far points' shadow; of nearer ones it has some more.
-
-    Parameters
-    ----------
-    geometry
-        the camera, with a plate.
-    spectrum
-        lines of the light; None: geometric.
-    """
+    """Return the number of raster cells per side of the shadow of far points; nearer points have slightly more."""
     mask = geometry.build_mask()
     assert isinstance(mask, Plate)
     return _cells(geometry, mask, geometry.pixel_pitch / cells_per_pixel(geometry), spectrum)
 
 
 def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectrum | None) -> int:
-    """Cells of a ``step`` [mm] a side of what can be seen of a ``mask``, and of the light that waves carry beyond it.
+    """Return the cells per side for the visible part of a ``mask`` and the light that waves carry beyond.
 
-    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x of it; a mean opening has two along each axis.
+    An edge sends lambda D / (4 pi^2 x) of light, as a length, beyond x of it; a mean opening has two edges per axis.
     """
     half = mask.flaws.reach(mask.extent_mm) / 2
     if spectrum is not None and not mask.irradiance:
@@ -161,14 +141,7 @@ def _cells(geometry: CameraGeometry, mask: Plate, step: float, spectrum: Spectru
 
 
 def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
-    """MitsimError, before anything is drawn, for waves of a ``spectrum`` behind a mask of so many terms that drawing
-    them would take longer than a minute a line.
-
-    Parameters
-    ----------
-    geometry, spectrum
-        the camera, and lines of the light.
-    """
+    """Raise MitsimError if waves of a ``spectrum`` behind this mask would take longer than a minute per line."""
     mask = geometry.build_mask()
     if not isinstance(mask, Plate) or mask.irradiance or not geometry.is_drawn(waves=True):
         return
@@ -185,39 +158,32 @@ def check_waves(geometry: CameraGeometry, spectrum: Spectrum) -> None:
 
 
 def points_per_cell(wavelength_nm: float, distance_mm: float, step_mm: float) -> int:
-    """Points along a raster cell at which waves are squared.
+    """Return the number of points along a raster cell at which waves are squared.
 
     Parameters
     ----------
     wavelength_nm, distance_mm
-        of the waves, and how far behind the mask plane waves would have the same fringes.
+        Wavelength, and distance behind the mask plane at which waves have the same fringes.
     step_mm
-        the cell's side.
+        Side of the cell.
     """
     apart = (wavelength_nm * 1e-6 * distance_mm) ** 0.5 / _POINTS_PER_FRESNEL_LENGTH
     return max(int(np.ceil(step_mm / apart)), _LEAST_WAVE_POINTS)
 
 
 def cells_per_pixel(geometry: CameraGeometry) -> int:
-    """Raster cells along a pixel of ``geometry``: as many as were chosen, else the fewest."""
+    """Return the number of raster cells along a pixel: as chosen, else the fewest."""
     return geometry.mask_cells or _CELLS_PER_PIXEL
 
 
 def with_few_cells(geometry: CameraGeometry, spectrum: Spectrum | None) -> CameraGeometry:
-    """A camera whose frames are only compared with each other: of a third of the raster cells a pixel, where its mask
-    is drawn.
-
-    Parameters
-    ----------
-    geometry, spectrum
-        the camera, and lines of its light; None: geometric.
-    """
+    """Return a camera with a third of the raster cells per pixel, for frames that are only compared with each other."""
     drawn = geometry.is_correlated(spectrum is not None)
     return geometry.model_copy(update={"mask_cells": _FEW_CELLS}) if drawn else geometry
 
 
 def sharpen(values: FloatArray) -> FloatArray:
-    """(n, n) means over cells, whose blur by the cells is taken back to second order along both axes of ``values``."""
+    """Return (n, n) means over cells, corrected to second order for the blur by the cells."""
     for _ in ("rows", "columns"):
         padded = np.pad(values, ((1, 1), (0, 0)))
         values = (values - (padded[2:] - 2 * values + padded[:-2]) / 12).T
@@ -225,8 +191,6 @@ def sharpen(values: FloatArray) -> FloatArray:
 
 
 def _turned_means(mask: Plate, step: float, count: int) -> FloatArray:
-    """(count, count) mean transmissions of cells of a ``step`` [mm], at points of a lattice in each: no two of them lie
-    in one row or column, and an edge that is turned by little is told to a part in so many."""
     corners = (np.arange(count) - count / 2) * step
     down = (np.arange(_POINTS) + 0.5) / _POINTS * step
     across = (np.arange(_POINTS) * _LATTICE % _POINTS + 0.5) / _POINTS * step
@@ -241,7 +205,6 @@ def _turned_means(mask: Plate, step: float, count: int) -> FloatArray:
 
 
 def _resample(mask: Plate, step: float, count: int) -> FloatArray:
-    """(count, count) mean values of a mask that is not turned over cells of a ``step`` [mm]."""
     start = -count * step / 2
     along = np.stack(
         [Steps(mask.lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))],
@@ -251,7 +214,6 @@ def _resample(mask: Plate, step: float, count: int) -> FloatArray:
 
 
 def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) -> FloatArray:
-    """(count, count) mean |U|^2 of cells behind the amplitude that the ``shadow``'s mask is."""
     mask = cast("Plate", shadow.mask)
     if mask.blur_mm:
         raise MitsimError(
@@ -270,7 +232,6 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
 
 
 def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
-    """(count, count) cells of light (n, n) that is turned about its centre, between its cells by cubic splines."""
     middles = np.asarray(np.arange(count) + 0.5 - count / 2)
     row, column = flaws.turned_back(middles[:, None], middles)
     places = np.stack([row, column]) + (len(values) - 1) / 2
@@ -280,8 +241,6 @@ def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
 def _fields(
     shadow: ShadowGeometry, wavelength_nm: float, step: float, count: int
 ) -> tuple[npt.NDArray[np.complex64], npt.NDArray[np.complex64], int]:
-    """(points, K) and (K, points) fields of the mask's terms along rows and columns, weights in the first; and points a
-    cell."""
     distance = shadow.distance_mm * shadow.shrink
     points = points_per_cell(wavelength_nm, distance, step)
     if count * points > _MOST_WAVE_POINTS:
@@ -307,10 +266,10 @@ def _fields(
 
 
 def _means_at_points(field: npt.NDArray[np.complex128], between: int) -> npt.NDArray[np.complex128]:
-    """(n,) of a ``field`` (n * between,): its means from point to point, their blur taken back to second order.
+    """Return the (n,) means of a ``field`` (n * between,), corrected to second order for their blur.
 
-    Fringes of far edges are finer than points are apart. Met at points, they add up wherever the code's lattice meets
-    that of the points; their means are none, and the light in them is given back evenly.
+    Fringes of far edges are finer than the points. Sampled values would add up where the code's lattice meets that of
+    the points, but means vanish, and their light is returned evenly.
     """
     means = field.reshape(-1, between).mean(axis=1)
     means[1:-1] -= np.diff(means, 2) / 24
@@ -325,9 +284,6 @@ def _intensity(
     mirrored: tuple[bool, bool] = (False, False),
     symmetric: bool = False,
 ) -> FloatArray:
-    """(cells, cells) mean |U|^2 of U = ``rows`` ``columns`` at ``points`` x ``points`` points of each cell; of an axis
-    along which the mask is ``mirrored``, half is worked out, and of a ``symmetric`` one what is not below the
-    diagonal."""
     whole = len(rows) // points, columns.shape[1] // points
     kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
     columns = columns[:, : kept[1] * points]
@@ -348,7 +304,6 @@ def _intensity(
 
 
 def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
-    """Means of ``values`` over squares of so many a ``side``, of few enough to be added up in single precision."""
     rows = values.reshape(-1, side, values.shape[1]).sum(axis=1)
     return np.asarray(sum(rows[:, place::side].astype(np.float64) for place in range(side)) / side**2)
 
@@ -365,23 +320,22 @@ def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
 # separable terms gives the same (tests/unit/optics/test_correlation.py), and takes a product for each of them.
 
 _APART = 8
-"""Pixels by which the first one that light is spread over moves: light in cells of other sizes then meets the raster's
-spectra as they are."""
+"""Step in pixels of the first lit pixel, so that light in cells of other sizes reuses the raster's spectra."""
 _WHOLE = 1e-6
-"""Part of a raster cell by which a pixel may miss a whole number of them: rounding, of a frame 4096 pixels wide too."""
+"""Part of a raster cell by which a pixel may differ from a whole number of cells: rounding."""
 
 
 class Correlation:
-    """A raster's shadow of one depth, prepared once; MitsimError for a raster of which a pixel is no whole number.
+    """Shadow of a raster at one depth, prepared once; raises MitsimError if a pixel is no whole number of cells.
 
     Parameters
     ----------
     shadow
-        of a camera whose mask is the raster.
+        Shadow geometry of a camera whose mask is the raster.
     rows, columns
-        directions of the cells.
+        Directions of the cells.
     fill_factor
-        active part of a pixel, which frames are scaled by.
+        Active part of a pixel, which scales frames.
     """
 
     def __init__(self, shadow: ShadowGeometry, rows: Directions, columns: Directions, fill_factor: float = 1.0) -> None:
@@ -394,15 +348,7 @@ class Correlation:
         self._spectra = _spectra(cast("Plate", shadow.mask), firsts, self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
-        """(m, m') irradiance.
-
-        Parameters
-        ----------
-        light
-            (r, c) of some cells.
-        rows, columns
-            (r,) and (c,) which cells of the directions these are.
-        """
+        """Return the (m, m') irradiance of ``light`` (r, c) in the cells ``rows`` (r,) x ``columns`` (c,)."""
         left, right = self._spread[0][:, np.asarray(rows)], self._spread[1][:, np.asarray(columns)]
         brightest = float(np.abs(light).max()) or 1.0
         cells = _by_phase(left @ (light / brightest).astype(np.float32) @ right.T, self._phases)
@@ -416,7 +362,6 @@ class Correlation:
 
 
 def _by_phase(cells: npt.NDArray[Any], phases: tuple[int, int]) -> npt.NDArray[Any]:
-    """(q, q', m, m') every q-th and q'-th of raster ``cells`` (q m, q' m')."""
     rows, columns = phases
     return cells.reshape(len(cells) // rows, rows, -1, columns).transpose(1, 3, 0, 2)
 
@@ -425,7 +370,6 @@ def _by_phase(cells: npt.NDArray[Any], phases: tuple[int, int]) -> npt.NDArray[A
 def _spectra(
     drawn: Plate, firsts: tuple[int, int], size: tuple[int, int], phases: tuple[int, int]
 ) -> npt.NDArray[np.complex64]:
-    """(q, q', *size) spectra of each phase of a raster from its cells ``firsts`` on."""
     along = [count * each for count, each in zip(size, phases, strict=True)]
     seen = _part(_part(drawn.values, firsts[0], along[0]).T, firsts[1], along[1]).T.astype(np.float32)
     return np.stack([scipy.fft.rfft2(np.ascontiguousarray(row)) for row in _by_phase(seen, phases)])
@@ -433,8 +377,7 @@ def _spectra(
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """One axis: its pixels, raster cells in each of them, the first cell that pixel 0 sees, and how it weighs them
-    (cells, c) for each direction."""
+    """One axis: pixels, raster cells per pixel, first cell of pixel 0, and weights (cells, c) per direction."""
 
     pixels: int
     phases: int
@@ -443,7 +386,6 @@ class _Side:
 
     @classmethod
     def both(cls, shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[_Side]:
-        """Those of rows and of columns."""
         return [cls.of(*shadow.from_mask(directions, axis)) for axis, directions in enumerate((rows, columns))]
 
     @classmethod
@@ -466,14 +408,12 @@ class _Side:
         return cls(pixels, phases, first, np.diff(below, axis=0))
 
     def spread(self, apart: int) -> tuple[int, npt.NDArray[np.float32]]:
-        """The weights, with nothing before and behind them, from a multiple of ``apart`` pixels on; and that cell."""
         every = apart * self.phases
         before = self.first % every
         behind = -(before + len(self.weights)) % every
         return self.first - before, np.pad(self.weights, ((before, behind), (0, 0))).astype(np.float32)
 
     def factor(self, profile: FloatArray, places: npt.NDArray[np.intp]) -> FloatArray:
-        """(places, c) means of a ``profile`` of the raster that some of the pixels see from each direction."""
         seen = _part(profile[:, None], self.first, self.phases * (self.pixels - 1) + len(self.weights))[:, 0]
         windows = np.lib.stride_tricks.sliding_window_view(seen, len(self.weights))
         return np.asarray(windows[self.phases * places] @ self.weights)
@@ -487,16 +427,9 @@ def terms_of_raster(
     places: Places | None,
     terms: Sequence[Term],
 ) -> SeparableTerms:
-    """Some separable terms of a raster's shadow, [(left (m, r), right (m', c)), ...].
+    """Return some separable ``terms`` of a raster's shadow, [(left (m, r), right (m', c)), ...].
 
-    Parameters
-    ----------
-    shadow, rows, columns, fill_factor
-        as for :class:`Correlation`.
-    places
-        rows and columns of a frame; None: all.
-    terms
-        of the raster.
+    ``places`` selects rows and columns of a frame; other parameters are those of :class:`Correlation`.
     """
     sides = _Side.both(shadow, rows, columns)
     at = [np.arange(side.pixels) if places is None else np.asarray(places[axis]) for axis, side in enumerate(sides)]
@@ -513,7 +446,6 @@ def _mask_values(shadow: ShadowGeometry) -> FloatArray:
 
 
 def _part(values: FloatArray, first: int, count: int) -> FloatArray:
-    """(count, m) rows of ``values`` from ``first`` on, 0 beyond them."""
     result = np.zeros((count, values.shape[1]))
     low, high = max(first, 0), min(first + count, len(values))
     result[low - first : max(high, low) - first] = values[low : max(high, low)]
@@ -527,7 +459,7 @@ def _part(values: FloatArray, first: int, count: int) -> FloatArray:
 # where t does not matter; profiles of thick masks and wave-optical ones fit as well.
 
 Sampler = Callable[[FloatArray, FloatArray], FloatArray]
-"""From places s and widths [mm], which broadcast, to means of a profile over [s - width/2, s + width/2]."""
+"""Function of places s and widths [mm] that returns means of a profile over [s - width/2, s + width/2]."""
 SampledTerm = tuple[float, Sampler, Sampler]
 """Weight, and samplers of rows and of columns."""
 
@@ -540,11 +472,11 @@ class ProfileSampler:
     profile
         (N,) transmission of each feature.
     feature_mm
-        their size.
+        Feature size.
     start_mm
-        where the first begins; None: centred on ``centre_mm``.
+        Start of the first feature, relative to the centre; None for a centred profile.
     centre_mm
-        of the mask, which ``start_mm`` is counted from.
+        Centre of the mask.
     """
 
     def __init__(
@@ -557,7 +489,7 @@ class ProfileSampler:
         self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
-        """Mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value itself."""
+        """Return the mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value."""
         centre, half = s / self._feature - self._start, np.abs(width) / self._feature / 2
         low, high = centre - half, centre + half
         first, last = self._index(low), self._index(high)
@@ -567,22 +499,13 @@ class ProfileSampler:
         return np.asarray(np.where(first == last, self._values[first], parts / np.where(half > 0, 2 * half, 1)))
 
     def _index(self, x: FloatArray) -> npt.NDArray[np.intp]:
-        """Place in the padded values of what lies at x (features from the first edge); feature k is number k + 1."""
         return np.clip(np.floor(x), -1, self._count).astype(np.intp) + 1
 
 
 def wave_samplers(
     geometry: CameraGeometry, spectrum: Spectrum, depth: float, tau: tuple[float, float]
 ) -> list[SampledTerm]:
-    """A mask's wave-optical shadow of a (virtual) source, as samplers.
-
-    Parameters
-    ----------
-    geometry, spectrum
-        the camera and the light.
-    depth, tau
-        of the source [mm], and its tan-angles along rows and columns.
-    """
+    """Return the wave-optical shadow of a (virtual) source at ``depth`` [mm] and tan-angles ``tau`` as samplers."""
     if geometry.is_drawn(spectrum is not None):
         return _of_plate(raster(geometry, depth, spectrum), geometry.mask_offset)
     shadow = ShadowGeometry.of(geometry, depth)
@@ -603,15 +526,13 @@ def wave_samplers(
 
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
-    """The geometric shadow of the mask of ``geometry``, as samplers."""
+    """Return the geometric shadow of the mask of ``geometry`` as samplers."""
     if geometry.is_drawn(waves=False):
         return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
     return _of_plate(geometry.build_mask(), geometry.mask_offset)
 
 
 def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SampledTerm]:
-    """The samplers of a ``mask`` with its ``centre`` off the axis [mm]."""
-
     def sampler(profile: FloatArray, at: float) -> Sampler:
         if mask.even:
             return ProfileSampler(profile, mask.feature_mm, centre_mm=at)

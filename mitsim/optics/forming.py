@@ -1,9 +1,8 @@
-"""Forming frames: estimates of light and the optics that it passes in; frames of mixtures of its rows out.
+"""Frames of mixtures of light, formed by the closed form of :mod:`mitsim.optics.image_formation`.
 
-A *basis* is a matrix (b, rows) of mixtures. Its frames are formed by the closed form of
-:mod:`mitsim.optics.image_formation`; shots that are sums of few frames of a basis are then added up
-(:class:`Mixture`). Beside each frame its *replicates*, those of single groups of the light, are seen by probing
-vectors alone.
+A *basis* is a matrix (b, rows) of mixtures of rows of light. Shots that are sums of few frames of a basis are added up
+afterwards (:class:`Mixture`). The *replicates* of a frame, formed from single groups of the light, are only multiplied
+by probing vectors and never formed as a whole.
 """
 
 from __future__ import annotations
@@ -23,25 +22,23 @@ from mitsim.core.seeds import stream
 from mitsim.optics.image_formation import Entries, FrameOptics
 
 _FEW = 2
-"""Classes a shot, beside what all shots light alike, up to which adding up their frames takes less than a product of
-matrices: a twentieth for dots whose black pixels leak."""
+"""Classes per shot, beside those that all shots share, up to which adding frames is faster than a matrix product."""
 _COLUMNS = 2**14
-"""Columns of a product at a time: how a product is cut shows in its last bits, so not by the number of threads."""
+"""Columns per product. The size is fixed because it affects the last bits, which must not depend on the threads."""
 _MOST_COLUMNS = 2**22
-"""Places of light from which a product is worked out on those that are lit: SciPy takes 16 bytes for each of all, and
-20 to add two unsorted matrices."""
+"""Places of light above which a product is computed on lit places only, because SciPy takes 36 bytes per place."""
 
 
 @dataclass(frozen=True, eq=False)
 class AccumulatedLight:
-    """Light and the optics that forms it.
+    """Light and the optics that forms its frames.
 
     Attributes
     ----------
     optics
-        fits the cells that the light is accumulated in.
+        Optics for the cells in which the light is accumulated.
     groups
-        independent estimates of the light, (rows, cells) each; their mean is used.
+        Independent estimates of the light, (rows, cells) each; their mean is used.
     """
 
     optics: FrameOptics
@@ -51,20 +48,21 @@ class AccumulatedLight:
 def form_frames(
     lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames of mixtures of light, and its replicates times probes.
+    """Form frames of mixtures of light, and its replicates times probes.
 
     Parameters
     ----------
     lights
-        of the same rows; their frames add up.
+        Lights of the same rows, whose frames add up.
     basis
         (b, rows) mixtures.
     probes
-        (m', probes) of :func:`probe_vectors`; None: no replicates.
+        (m', probes) from :func:`probe_vectors`; None for no replicates.
 
     Returns
     -------
-    (b, m, m') frames, and (b, m * groups * probes) of single groups.
+    tuple
+        (b, m, m') frames, and (b, m * groups * probes) products of single groups.
     """
     shape, groups = lights[0].optics.frame_shape, len(lights[0].groups)
     mixed, count = _mix_lights(lights, basis), basis.shape[0]
@@ -87,16 +85,12 @@ def form_frames(
 def probe_frames(
     lights: Sequence[AccumulatedLight], basis: sparse.csr_array, probes: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Replicates of mixtures of light, without the frames themselves.
-
-    Parameters
-    ----------
-    lights, basis, probes
-        as for :func:`form_frames`.
+    """Return the replicates of mixtures of light without forming the frames.
 
     Returns
     -------
-    (b, m * groups * probes) of single groups, and (b, lights, groups, groups) inner products of their differences.
+    tuple
+        (b, m * groups * probes) of single groups, and (b, lights, groups, groups) inner products of their differences.
     """
     rows, groups = lights[0].optics.frame_shape[0], len(lights[0].groups)
     mixed, count = _mix_lights(lights, basis), basis.shape[0]
@@ -118,7 +112,6 @@ def probe_frames(
 def _mix_lights(
     lights: Sequence[AccumulatedLight], basis: sparse.csr_array
 ) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
-    """Mixtures ``basis`` (b, rows) of each group of each light, with the light's optics."""
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
     for _, parts in mixed:
         for part in parts:
@@ -127,7 +120,6 @@ def _mix_lights(
 
 
 def _product(basis: sparse.csr_array, light: sparse.csr_array) -> sparse.csr_array:
-    """``basis @ light``; ``light`` itself where each row stays what it is."""
     if basis.nnz == len(basis.indices) == basis.shape[1] and not (basis - sparse.eye_array(*basis.shape)).nnz:
         return light
     if light.shape[1] <= _MOST_COLUMNS:
@@ -151,16 +143,16 @@ def _row(matrix: sparse.csr_array, row: int) -> Entries:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Shots as sums of frames that are held.
+    """Shots as sums of frames in memory.
 
     Attributes
     ----------
     weights
-        (shots, b) of each held frame in each shot.
+        (shots, b) weight of each frame in each shot.
     least
-        (b,) parts of them that all shots have and are added once.
+        (b,) part of the weights that all shots share and that is added once.
     own
-        the weights less these.
+        The weights without the shared part.
     """
 
     weights: FloatArray
@@ -169,19 +161,18 @@ class Mixture:
 
     @property
     def sparse(self) -> bool:
-        """Whether shots have few frames of their own: adding them up then takes less than a product of matrices."""
+        """Return True if shots have so few frames of their own that adding is faster than a matrix product."""
         return bool(self.own.nnz <= _FEW * len(self.weights))
 
     @cached_property
     def one_each(self) -> bool:
-        """Whether every shot has one held frame, and every held frame one shot."""
+        """Return True if every shot is one frame, and every frame belongs to one shot."""
         shots, held = self.own.shape
         alone = np.array_equal(np.diff(self.own.indptr), np.ones(shots))
         return shots == held and alone and np.array_equal(np.sort(self.own.indices), np.arange(held))
 
     def in_place(self, basis: FloatArray) -> Sequence[FloatArray]:
-        """All shots of which :attr:`one_each` holds, bit for bit as :meth:`shots` has them, where the frames of the
-        ``basis`` (b, ...) lay: those are overwritten, for no memory is as dear as new memory."""
+        """Return all shots in the memory of ``basis`` (b, ...) if :attr:`one_each` holds."""
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
 
         def weigh_in_place(shot: int) -> FloatArray:
@@ -196,15 +187,7 @@ class Mixture:
         return in_threads(weigh_in_place, range(len(self.weights)))
 
     def shots(self, basis: FloatArray, start: int, stop: int) -> Sequence[FloatArray]:
-        """Shots of the frames that are held; some may be of these themselves.
-
-        Parameters
-        ----------
-        basis
-            (b, ...) frames that are held.
-        start, stop
-            numbers of shots.
-        """
+        """Return the shots ``start`` to ``stop`` from the frames ``basis`` (b, ...)."""
         if not self.sparse:
             return list(mix_frames(self.weights[start:stop], basis))
         common = mix_frames(self.least[None], basis)[0] if self.least.any() else None
@@ -225,12 +208,11 @@ class Mixture:
 
 
 def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
-    """Pairs of complementary shots: those to form, and how all shots follow from them. A shot equals a formed one, or
-    is the light of all pixels less a formed one.
+    """Find pairs of complementary shots, so that only half of the shots need a matrix product.
 
     Patterns of +1 and -1 are shown as two shots that add up to the light of all pixels (of Hadamard patterns the first
-    is that light), so half of the shots need no product of matrices. None where ``weights`` (shots, classes) have
-    other values than two, or more pairs of shots than classes.
+    is that light). Returns None where ``weights`` (shots, classes) have other than two values, or more pairs than
+    classes.
     """
     low, high = float(weights.min()), float(weights.max())
     lit = weights == high
@@ -257,17 +239,7 @@ def pair_shots(weights: FloatArray) -> tuple[FloatArray, Mixture] | None:
 
 
 def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """(shots, ...) sums of a basis by weights.
-
-    Parameters
-    ----------
-    weights
-        (shots, b).
-    basis
-        (b, ...) arrays.
-    out
-        (shots, ...) for the result, which may be the first of the basis itself; a new array if not given.
-    """
+    """Return (shots, ...) sums of ``basis`` (b, ...) by ``weights`` (shots, b), in ``out`` if given."""
     flat = basis.reshape(len(basis), -1)
     mixed = np.empty((len(weights), flat.shape[1])) if out is None else out.reshape(len(weights), -1)
 
@@ -287,24 +259,20 @@ def mix_frames(weights: FloatArray, basis: FloatArray, out: FloatArray | None = 
 # many frames as there are groups would cost more than the frames themselves.
 
 PROBES = 8
-"""Random signs beside the constant vector; chosen so that probing costs less than a frame (:func:`probe_vectors`)."""
+"""Random signs beside the constant vector; probing then costs less than a frame."""
 _STUDENT = 12.706205, 4.302653, 3.182446
-"""97.5 % quantiles of Student's t with 1, 2 and 3 degrees of freedom, and with more the last, which is larger."""
+"""97.5 % quantiles of Student's t with 1, 2, 3 and more degrees of freedom."""
 _OF_ONE_KIND = 0.625
-"""Power of the part of one kind of noise with which the squared bound grows. The bound of four groups then holds in 95
-to 99 % of draws with 1 to 500 equal kinds, and in 93 to 95 % where one kind has a tenth to nine tenths of the noise
-beside many small ones. A power of 0.75 gives 91 % there, and 1 gives 89 %."""
+"""Power of the share of one kind of noise with which the squared bound grows. The bound of four groups then holds in 95
+to 99 % of draws with 1 to 500 equal kinds, and in 93 to 95 % where one kind has a tenth to nine tenths of the noise. A
+power of 0.75 gives 91 % there."""
 
 
 def probe_vectors(pixels: int, seed: int) -> FloatArray:
-    """(pixels, 1 + 8) vectors v with E sum |A v|^2 = ||A||^2: the constant one exactly, the rest by random signs.
+    """Return (pixels, 1 + 8) vectors v with E sum |A v|^2 = ||A||^2: a constant one, and random signs.
 
-    Most of a frame's error is common to its columns, and a few signs alone would see that part with 12 % scatter.
-
-    Parameters
-    ----------
-    pixels, seed
-        columns of a frame, and of the signs.
+    The constant vector is exact because most of a frame's error is common to its columns, where few signs scatter by 12
+    %.
     """
     constant = np.full((pixels, 1), pixels**-0.5)
     signs = stream(seed, "probe").choice((-1.0, 1.0), size=(pixels, PROBES)) / PROBES**0.5
@@ -314,14 +282,14 @@ def probe_vectors(pixels: int, seed: int) -> FloatArray:
 def noise_of_groups(probed: FloatArray, rows: int, groups: int) -> FloatArray:
     """Return the (groups, groups) inner products of the differences of groups' frames from their mean.
 
-    Not products of matrices, because BLAS adds up in an order that depends on its threads.
+    No matrix product is used because the order in which BLAS adds depends on its threads.
 
     Parameters
     ----------
     probed
-        (rows * groups * probes,) the groups' frames times :func:`probe_vectors`.
+        (rows * groups * probes,) frames of the groups times :func:`probe_vectors`.
     rows, groups
-        of a frame, and of the light.
+        Rows of a frame, and groups of the light.
     """
     by_group = probed.reshape(rows, groups, -1)
     off = by_group - by_group.mean(axis=1, keepdims=True)
@@ -331,19 +299,18 @@ def noise_of_groups(probed: FloatArray, rows: int, groups: int) -> FloatArray:
 def bound_of(products: FloatArray, energy: float) -> float:
     """Return the 95 % bound of a relative Monte Carlo error.
 
-    The error that was made is one draw, and its estimate another. How far the bound lies above the estimate depends on
-    how many kinds of noise there are. All groups differ alike where there are many: then the inner products of their
-    differences have G - 1 equal eigenvalues. Of a single kind, all differences are multiples of one frame, and the
-    bound is that of Student's t with G - 1 degrees of freedom. In between, the squared bound grows with the squared
-    norm of the products, and faster at first, because three differences do not always show a kind that has most of the
-    noise.
+    The actual error is one draw, and its estimate another. The ratio of bound to estimate depends on the number of
+    kinds of noise. With many kinds, all groups differ alike, and the inner products of their differences have G - 1
+    equal eigenvalues. With a single kind, all differences are multiples of one frame, and the bound is that of
+    Student's t with G - 1 degrees of freedom. In between, the squared bound grows with the squared norm of the
+    products, faster at first, because three differences do not always show a kind that has most of the noise.
 
     Parameters
     ----------
     products
-        (G, G) inner products of what the G groups bring to the error; their trace is its square, not yet relative.
+        (G, G) inner products of the groups' contributions to the error; their trace is its square, not yet relative.
     energy
-        squared norm of the frames.
+        Squared norm of the frames.
     """
     variance, freedom = float(np.trace(products)), len(products) - 1
     if not energy or not variance or not freedom:

@@ -1,6 +1,6 @@
-"""Frames of a family: from light of its classes to the expected irradiance of every shot, and its Monte Carlo error.
+"""Expected irradiance of every shot of a pattern family, with its Monte Carlo error.
 
-Frames are formed, and their error told, by :mod:`mitsim.optics.forming`.
+Frames are formed by :mod:`mitsim.optics.forming`.
 """
 
 from __future__ import annotations
@@ -31,35 +31,32 @@ from mitsim.optics.forming import (
 from mitsim.optics.image_formation import IntArray
 
 _AT_ONCE, _BYTES_AT_ONCE = 32, 2**27
-"""Frames formed at a time: enough to keep all processors busy; and their bytes, where fewer have as many: 4 frames of a
-sensor of 2048 pixels."""
+"""Frames formed at a time, and their bytes: enough to occupy all processors."""
 _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
-"""Classes whose frames are held to be mixed, 512 MiB of a sensor of 512 pixels; and their bytes, of which a process of
-4 GiB has room for: 56 frames of a sensor of 2048 pixels. Beyond them frames are formed twice."""
+"""Largest number of class frames in memory, and their bytes. Beyond, frames are formed twice."""
 _FLOAT = 8
-"""Bytes of a pixel of a frame."""
+"""Bytes per pixel."""
 _ALL = sparse.csr_array(np.ones((1, 1)))
-"""The one mixture of ambient light: all of it."""
+"""Mixture of ambient light: all of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What one shot casts on the sensor.
+    """Expected frame of one shot.
 
     Attributes
     ----------
     irradiance
-        (m, m') expected [W m^-2].
+        (m, m') expected irradiance [W m^-2].
     variance
-        its Monte Carlo variance, mean over pixels.
+        Monte Carlo variance, mean over pixels.
     removed
-        Interpolation between anchors can leave specks below zero where a pixel sees almost no light; they are set to
-        zero, and this is their sum over the sum of the frame, so that nothing is hidden.
+        Light that was set to zero, relative to the frame's sum. Interpolation between anchors can leave values slightly
+        below zero where a pixel sees almost no light.
     heaviest
-        largest part of the variance that one group of the light brings: with one heavy path among G groups,
-        (G - 1) / G.
+        Largest part of the variance from one group of the light: (G - 1) / G if one path dominates.
     by_group
-        (G, G) inner products of what each group of the light brings to the variance, which is their trace.
+        (G, G) inner products of the groups' contributions; the variance is their trace.
     """
 
     irradiance: FloatArray
@@ -76,9 +73,9 @@ class ClassFrames:
     Attributes
     ----------
     classes
-        (c,) increasing class numbers; every other class's frame is zero.
+        (c,) increasing class numbers; the frames of all other classes are zero.
     irradiance
-        (c, m, m') [W m^-2].
+        (c, m, m') irradiance [W m^-2].
     """
 
     classes: IntArray
@@ -89,40 +86,22 @@ class ClassFrames:
 
 
 def at_once(pixels: float) -> int:
-    """Frames of ``pixels`` a side, or as many in all, that are formed at a time."""
+    """Return the number of frames of ``pixels`` per side that are formed at a time."""
     return max(1, min(_AT_ONCE, int(_BYTES_AT_ONCE // (_FLOAT * pixels**2))))
 
 
 def frames_in_memory(classes: int, shots: int, pixels: float) -> int:
-    """Frames that :class:`ExpectedFrames` holds at once: two lots that are in use, and one that is formed.
-
-    Parameters
-    ----------
-    classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
-    """
+    """Return the number of frames that :class:`ExpectedFrames` holds at once."""
     return (classes if mixes(classes, shots, pixels) else 0) + 3 * at_once(pixels)
 
 
 def formed_frames(classes: int, shots: int, pixels: float) -> int:
-    """Frames that are formed for a run, whose frames are asked for twice.
-
-    Parameters
-    ----------
-    classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
-    """
+    """Return the number of frames that are formed for a run, which asks for its frames twice."""
     return classes if mixes(classes, shots, pixels) else 2 * shots
 
 
 def mixes(classes: int, shots: int, pixels: float) -> bool:
-    """Whether shots are mixed from frames of classes, which are held, and not formed one by one.
-
-    Parameters
-    ----------
-    classes, shots, pixels
-        of the family, and a side of the sensor (:func:`mitsim.devices.camera.side_of`).
-    """
+    """Return True if shots are mixed from class frames in memory rather than formed one by one."""
     return classes <= min(_LARGEST_BASIS, shots, _BASIS_BYTES // (_FLOAT * pixels**2))
 
 
@@ -132,31 +111,29 @@ def mixes(classes: int, shots: int, pixels: float) -> bool:
 class ExpectedFrames:
     """Frames of every shot of a family, each with the Monte Carlo variance of its mean; iterate as often as needed.
 
-    Light is linear, so the frames are formed once for a *basis* of light distributions and mixed: the classes of
-    projector pixels that a family always lights together. A family with too many classes is formed shot by shot
-    and never held in memory as a whole; what black pixels leak in all of its shots is formed once.
+    Because light is linear, frames are formed once for a *basis* of light distributions and mixed: the classes of
+    projector pixels that a family always lights together. A family with too many classes is formed shot by shot.
 
-    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; with one group there is
-    none to tell, and it is 0. Squared norms are estimated without bias from products with random signs (Hutchinson's
-    estimator), because forming G times as many frames would cost more than the frames themselves.
+    The variance is that of the mean of G groups, ``sum ||F(T_g) - F(T)||^2 / (G (G - 1))``; it is 0 for one group.
+    Squared norms are estimated without bias from products with random signs (Hutchinson's estimator), because forming G
+    times as many frames would cost more than the frames themselves.
 
     Parameters
     ----------
     lights
-        light of the same rows (projector pixels, or classes of them), accumulated in one kind of cells or more; their
-        groups are paired.
+        Light of the same rows (projector pixels or classes), in one or several kinds of cells; their groups are paired.
     lighting
-        class of each row, and the fraction of full power that each class emits in each shot.
+        Class of each row, and the fraction of full power that each class emits in each shot.
     seed
-        of the random signs.
+        Seed of the random signs.
     ambient
-        light (1, cells) of every shot, its groups paired with those of ``lights``.
+        Light (1, cells) of every shot, with groups paired to those of ``lights``.
     specular
-        frames to be added to those of some classes.
+        Frames that are added to those of some classes.
     probed
         :attr:`probed` of other shots of the same lights, classes and seed.
     restated
-        factor of the Monte Carlo error over that by the groups' differences.
+        Factor of the Monte Carlo error relative to the estimate from the groups' differences.
     """
 
     def __init__(
@@ -193,18 +170,18 @@ class ExpectedFrames:
 
     @property
     def has_ambient(self) -> bool:
-        """Whether there is light of other emitters than the projector in every frame."""
+        """Return True if emitters other than the projector light every frame."""
         return bool(self._ambient)
 
     @property
     def projector_off(self) -> Frame:
-        """The frame of ambient light alone, dark where there is none; its Monte Carlo error is that of all frames."""
+        """Return the frame of ambient light alone, with the Monte Carlo error of all frames."""
         light = np.zeros(self._shape) if self._ambient_light is None else self._ambient_light[0][0]
         return Frame(np.maximum(light, 0.0), 0.0, 0.0, 0.0)
 
     @property
     def of_projector(self) -> ExpectedFrames:
-        """The same shots in a dark room."""
+        """Return the same shots without ambient light."""
         dark = copy(self)
         dark._ambient = ()
         for with_ambient in ("_ambient_light", "_frames_of_classes", "_energies"):
@@ -228,25 +205,24 @@ class ExpectedFrames:
     # ---- Monte Carlo error, from random signs alone ----
 
     def sampling_error(self) -> tuple[float, float]:
-        """Relative Monte Carlo error of all frames, and what it is below at 95 %, without forming any.
+        """Return the relative Monte Carlo error of all frames and its 95 % bound without forming frames.
 
-        The frames' energy is told by the random signs as well: as :func:`monte_carlo_error` and
-        :func:`monte_carlo_bound` to a few percent, in a fraction of the time.
+        Random signs estimate the frames' energy too, to a few percent.
         """
         parts, energy, _ = self._energies
         return (float(np.sqrt(np.trace(parts) / energy)), bound_of(parts, energy)) if energy else (0.0, 0.0)
 
     @property
     def noise(self) -> tuple[FloatArray, FloatArray]:
-        """(lights, G, G) and (ambient, G, G) parts of the Monte Carlo variance of all frames, up to one factor, as
-        :meth:`sampling_error` tells that of all; 0 of what was probed before."""
+        """Return (lights, G, G) and (ambient, G, G) parts of the Monte Carlo variance of all frames, up to one factor.
+
+        Parts that were probed before are 0.
+        """
         of_lights = self._energies[2]
         return of_lights[: len(self._lights)], of_lights[len(self._lights) :]
 
     @cached_property
     def _energies(self) -> tuple[FloatArray, float, FloatArray]:
-        """(G, G) parts of the frames' variance, the frames' energy, and (lights + ambient, G, G) inner products of
-        noise, not to scale."""
         count, energy = self._groups, 0.0
         parts, noise = np.zeros((count, count)), np.zeros((len(self._lights) + len(self._ambient), count, count))
         if count < 2:
@@ -261,17 +237,15 @@ class ExpectedFrames:
 
     @property
     def probed(self) -> FloatArray | None:
-        """(classes, m * groups * probes) frames of classes by single groups, as random signs see them.
+        """Return (classes, m * groups * probes) products of class frames of single groups with random signs.
 
-        None where shots are formed one by one.
+        The value is None if shots are formed one by one.
         """
         if self._mixed and self._probed is None:
             self._probed, self._noise = probe_frames(self._lights, self._basis, self._probes)
         return self._probed
 
     def _shots_probed(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(shots, m * groups * probes) frames of single groups times the probes, and (lights + ambient, G, G) inner
-        products of their noise."""
         classes, weights = self.probed, self._weights[start:stop]
         if classes is not None:
             probed = np.stack(self._of_classes.shots(classes, start, stop))
@@ -304,14 +278,12 @@ class ExpectedFrames:
 
     @cached_property
     def _frames_of_classes(self) -> Sequence[Frame]:
-        """All shots, where each is one class: they lie where the classes' frames lay."""
         irradiance, probed = self._form(0, len(self))
         shots = self._of_classes.in_place(irradiance)
         return self._frames(shots, self._of_classes.shots(probed, 0, len(self)), owned=True)
 
     @cached_property
     def _mixed_basis(self) -> tuple[FloatArray, FloatArray]:
-        """Frames that shots are mixed from: of classes, or the first shots of pairs, in the classes' place."""
         irradiance, probed = self._form(0, self._basis.shape[0])
         if self._pairs is None:
             return irradiance, probed
@@ -319,11 +291,6 @@ class ExpectedFrames:
         return mix_frames(chosen, irradiance, irradiance[: len(chosen)]), mix_frames(chosen, probed)
 
     def _form(self, start: int, stop: int) -> tuple[FloatArray, FloatArray]:
-        """(b, m, m') frames of basis lights, (b, m * groups * probes) those of groups as signs see them.
-
-        Light of specular chains is exact: it is in the frames alone, as no difference between groups has any. Classes
-        that were probed before are not probed again.
-        """
         basis = self._basis[start:stop]
         if self._probed is None:
             frames, probed = self._form_with_probes(self._lights, basis)
@@ -342,7 +309,6 @@ class ExpectedFrames:
     def _form_with_probes(
         self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array
     ) -> tuple[FloatArray, FloatArray]:
-        """As :func:`form_frames`; a single group's frames differ from no others."""
         return form_frames(lights, basis, self._probes if self._groups > 1 else None)
 
     @cached_property
@@ -360,10 +326,6 @@ class ExpectedFrames:
     def _frames(
         self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False
     ) -> list[Frame]:
-        """Frames (m, m') of light with what is in all of them, and their variance by ``probes``.
-
-        Light that is ``owned`` by nobody else is changed in place.
-        """
         ambient = self._ambient_light
         count = self._groups
         pairs = count * (count - 1)
@@ -394,7 +356,7 @@ class ExpectedFrames:
 
 
 def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """Monte Carlo part of ||a - b|| / ||b|| over all pixels of all ``frames``."""
+    """Return the Monte Carlo part of ||a - b|| / ||b|| over all pixels of all ``frames``."""
     variance = energy = 0.0
     for frame in frames:
         variance += frame.variance * frame.irradiance.size
@@ -403,7 +365,7 @@ def monte_carlo_error(frames: Sequence[Frame] | ExpectedFrames) -> float:
 
 
 def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
-    """What the Monte Carlo error of all ``frames`` is below, at 95 %; see :func:`bound_of`."""
+    """Return the 95 % bound of the Monte Carlo error of all ``frames``; see :func:`bound_of`."""
     parts, energy = np.zeros((1, 1)), 0.0
     for frame in frames:
         parts = parts + frame.by_group * frame.irradiance.size

@@ -1,10 +1,10 @@
-"""The closed form: light per (layer, anchor, tan-angle cell) in, irradiance on every sensor pixel out.
+"""Closed form of image formation: irradiance on every sensor pixel from light per (layer, anchor, tan-angle cell).
 
-A cell's shadow on the sensor is separable, so is the interpolation between anchors, and the frame of one light
-distribution T is ``sum over layers and mask terms of L T R^T`` with T's rows running over (anchor row, cell row) and
+The shadow of a cell on the sensor is separable, and so is the interpolation between anchors. The frame of one light
+distribution T is ``sum over layers and mask terms of L T R^T``, where the rows of T run over (anchor row, cell row) and
 its columns over (anchor column, cell column); each wavelength has mask terms of its own. Only rows and columns that
-hold light enter the product: for k x k shifting dots that is one in k of each. Behind a mask that is drawn on a raster
-(:mod:`mitsim.optics.fft_shadow`) the frame of each pair of anchors is a correlation instead.
+hold light enter the product: one in k of each for k x k shifting dots. Behind a mask that is drawn on a raster
+(:mod:`mitsim.optics.fft_shadow`), the frame of each pair of anchors is a correlation.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ IntArray = npt.NDArray[np.integer]
 Entries = tuple[IntArray, FloatArray]
 """Increasing indices into (layers, rows, columns), and the light [W m^-2] at each."""
 _FILLED = 1 / 8
-"""Part of all places from which light is laid out whole: of places at random, an eighth lights every row and column."""
+"""Part of all places above which light is laid out whole, because it then occupies every row and column."""
 _keep_shadow = lru_cache(maxsize=24)(shadow_terms)
-"""The last shadows, a few MiB each: a plan asks for some ten of them again and again."""
+"""Cache of shadows, a few MiB each, because a plan asks for the same ones repeatedly."""
 SUMMED_BYTES = 2**28
-"""Memory that the terms of a raster may take, and those of the rows and columns that are lit."""
+"""Memory limits of a raster's terms, and of the terms of the lit rows and columns."""
 
 _JUDGED = 64
-"""Pixels a side on which a raster is judged: one of half the cells is drawn in a second."""
+"""Pixels per side on which a raster is judged."""
 _FINER = 2
-"""Times as many cells a side of the raster that judges."""
+"""Factor of cells per side of the raster that judges."""
 
 
 # -------- One layer behind a mask, as terms or on a raster
@@ -57,39 +57,23 @@ _FINER = 2
 
 @dataclass(frozen=True, eq=False)
 class _Lit:
-    """Light of one layer in the rows and columns that any of several estimates lights.
-
-    Attributes
-    ----------
-    rows, columns
-        (r,) and (c,) places in (anchor, cell).
-    lights
-        (estimates, r, c) light of each.
-    """
-
     rows: IntArray
     columns: IntArray
     lights: FloatArray
 
     @property
     def mean(self) -> FloatArray:
-        """(r, c) of the estimates."""
         return np.asarray(self.lights[0] if len(self.lights) == 1 else self.lights.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """One layer behind a mask of separable terms: the shadow's factors (m, cells) and (m', cells) by term, and the
-    anchors' weights (m, anchors) and (m', anchors)."""
+    """One layer behind a mask of separable terms: factors (m, cells) and (m', cells), and anchors' weights."""
 
     terms: SeparableTerms
     weights: tuple[FloatArray, FloatArray]
 
     def frame(self, lit: _Lit, out: FloatArray | None = None) -> FloatArray:
-        """(m, m') irradiance of the estimates' mean, in ``out`` where that is given.
-
-        One product over the rows, or columns, of all terms: those of single terms would go over the frame once each.
-        """
         lefts, rights = zip(*self._factors(lit), strict=True)
         # The cheaper order of the two products: fewer lit rows or fewer lit columns next to the sensor's side.
         if len(lefts[0]) < len(rights[0]):
@@ -97,8 +81,6 @@ class _Terms:
         return np.matmul(_stack([lit.mean.T @ left for left in lefts]).T, _stack(rights), out=out)
 
     def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
-        """(m, estimates * probes) products of each estimate's frame with ``vectors`` (m', probes); without them the
-        frames themselves, side by side."""
         count, rows, columns = lit.lights.shape
         flat, total = lit.lights.reshape(count * rows, columns), np.zeros(())
         for left, right in self._factors(lit):
@@ -107,11 +89,9 @@ class _Terms:
         return total
 
     def _factors(self, lit: _Lit) -> list[tuple[FloatArray, FloatArray]]:
-        """By term (r, m) and (c, m'): the factors of the lit rows and columns, each by its anchor's weights."""
         return list(zip(self._side(0, lit.rows), self._side(1, lit.columns), strict=True))
 
     def _side(self, axis: int, places: IntArray) -> list[FloatArray]:
-        """The same of one ``axis``; of all places they are kept, as a stripe lights all of its columns, or rows."""
         every = self.weights[axis].shape[1] * self.terms[0][axis].shape[1]
         if len(places) < every:
             return self._pick(axis, places)
@@ -121,7 +101,6 @@ class _Terms:
 
     @cached_property
     def _whole(self) -> dict[int, list[FloatArray]]:
-        """Factors of all places, by axis, as far as they were asked for."""
         return {}
 
     def _pick(self, axis: int, places: IntArray) -> list[FloatArray]:
@@ -132,19 +111,18 @@ class _Terms:
 
 @dataclass(frozen=True, eq=False)
 class _Raster:
-    """One layer behind a mask on a raster: as a sum of the raster's largest terms, or as a correlation, whichever takes
-    less of a light.
+    """One layer behind a mask on a raster, as a sum of the largest terms or as a correlation, whichever is faster.
 
     Attributes
     ----------
     shadow
-        camera, directions of rows and of columns, depth, and lines of the light.
+        Camera, directions of rows and of columns, depth, and lines of the light.
     weights
-        the anchors' (m, anchors) and (m', anchors).
+        Weights (m, anchors) and (m', anchors) of the anchors.
     places
-        rows and columns of a frame, None for all.
+        Rows and columns of a frame; None for all.
     summed
-        the terms; None where they are too many.
+        The terms; None if there are too many.
     """
 
     shadow: tuple[CameraGeometry, Directions, Directions, float, Spectrum | None]
@@ -154,24 +132,20 @@ class _Raster:
 
     @cached_property
     def correlation(self) -> Correlation:
-        """Prepared when it is first asked for: the few pixels that a plan looks at are sums."""
         return _correlation(*self.shadow)
 
     def frame(self, lit: _Lit, out: FloatArray | None = None) -> FloatArray:
-        """As :meth:`_Terms.frame`."""
         if self.summed and self._sums_take_less(self.summed, lit):
             return self.summed.frame(lit, out)
         return np.positive(self._image(lit, lit.mean), out=out)
 
     def probe(self, lit: _Lit, vectors: FloatArray | None) -> FloatArray:
-        """As :meth:`_Terms.probe`."""
         if self.summed and self._sums_take_less(self.summed, lit, vectors):
             return self.summed.probe(lit, vectors)
         seen = in_threads(partial(self._image, lit), lit.lights)
         return np.concatenate([frame if vectors is None else frame @ vectors for frame in seen], axis=1)
 
     def _sums_take_less(self, summed: _Terms, lit: _Lit, vectors: FloatArray | None = None) -> bool:
-        """Whether a frame of a light, or its products with ``vectors``, takes less as a sum of terms."""
         geometry, *both, _, _ = self.shadow
         (near, far), (rows, columns) = sorted((len(lit.rows), len(lit.columns))), map(len, self.weights)
         across = columns if vectors is None else vectors.shape[1]
@@ -184,7 +158,6 @@ class _Raster:
         return 0 < held <= SUMMED_BYTES and len(summed.terms) * near * (far + rows) * across < correlation
 
     def _image(self, lit: _Lit, light: FloatArray) -> FloatArray:
-        """(m, m') irradiance of a ``light`` (r, c)."""
         (row_anchor, row), (column_anchor, column) = (
             np.divmod(places, len(each.centres))
             for places, each in zip((lit.rows, lit.columns), self.shadow[1:3], strict=True)
@@ -210,17 +183,17 @@ class FrameOptics:
     Parameters
     ----------
     geometry
-        the camera.
+        The camera.
     rows, columns
-        directions of the cells along the two axes.
+        Directions of the cells along the two axes.
     depths
-        [mm], one a layer.
+        Depth of each layer [mm].
     anchors
-        points a side of the sensor from which light is seen.
+        Points per side of the sensor from which light is seen.
     spectrum
-        lines of a wave-optical shadow; None: geometric.
+        Lines of a wave-optical shadow; None for a geometric shadow.
     places
-        rows and columns of a frame, increasing, of which it then consists; None: all.
+        Increasing rows and columns of a frame; None for all.
     """
 
     def __init__(
@@ -250,15 +223,7 @@ class FrameOptics:
 
     @classmethod
     def of_terms(cls, layers: Sequence[SeparableTerms], weights: tuple[FloatArray, FloatArray]) -> FrameOptics:
-        """Optics whose shadow is known: what :attr:`terms` and :attr:`weights` of others were.
-
-        Parameters
-        ----------
-        layers
-            terms of each layer.
-        weights
-            of the anchors, (m, anchors) along rows and (m', anchors) along columns.
-        """
+        """Return optics from known ``layers`` of terms and ``weights`` (m, anchors), (m', anchors) of the anchors."""
         found = cls.__new__(cls)
         cells = layers[0][0][0].shape[1], layers[0][0][1].shape[1]
         found._prepare([_Terms(terms, weights) for terms in layers], cells)
@@ -273,18 +238,18 @@ class FrameOptics:
 
     @property
     def terms(self) -> list[SeparableTerms] | None:
-        """The shadow of each layer as separable terms; None where one is drawn on a raster."""
+        """Return the shadow of each layer as separable terms; None if one is drawn on a raster."""
         found = [layer.terms for layer in self._layers if isinstance(layer, _Terms)]
         return found if len(found) == len(self._layers) else None
 
     def frame(self, flat: IntArray, light: FloatArray) -> FloatArray:
-        """(m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
+        """Return the (m, m') irradiance of ``light`` [W m^-2] at increasing indices ``flat`` into (layers, *shape)."""
         return self.frame_and_products([(flat, light)], None)[0]
 
     def probe(self, estimates: Sequence[Entries], vectors: FloatArray | None = None) -> FloatArray:
-        """Frames of several ``estimates`` times ``vectors`` (m', probes): (m, estimates * probes).
+        """Return the (m, estimates * probes) products of frames of several ``estimates`` with ``vectors`` (m', probes).
 
-        The frames, which would cost far more, are never formed; but without ``vectors`` they are, side by side.
+        The frames are not formed because that would cost far more; without ``vectors`` they are returned side by side.
         """
         rows, columns = self.frame_shape
         total = np.zeros((rows, len(estimates) * (columns if vectors is None else vectors.shape[1])))
@@ -295,20 +260,21 @@ class FrameOptics:
     def frame_and_products(
         self, estimates: Sequence[Entries], vectors: FloatArray | None, out: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """The frame of the mean of several estimates, and the product of each one's frame with some vectors.
+        """Return the frame of the mean of several estimates, and the product of each one's frame with some vectors.
 
         Parameters
         ----------
         estimates
-            of one light.
+            Estimates of one light.
         vectors
             (m', probes), or None for no products.
         out
-            (m, m') zeros, in which the frame is returned; a new array where not given.
+            (m, m') zeros in which the frame is returned; None for a new array.
 
         Returns
         -------
-        (m, m') and (m, estimates * probes).
+        tuple
+            (m, m') and (m, estimates * probes).
         """
         probes = 0 if vectors is None else vectors.shape[1]
         frame, probed = None, np.zeros((self.frame_shape[0], len(estimates) * probes))
@@ -323,7 +289,6 @@ class FrameOptics:
     def _lit_layers(
         self, estimates: Sequence[Entries], together: bool = False
     ) -> Iterator[tuple[_Raster | _Terms, _Lit]]:
-        """The light of each layer that holds any, of each estimate or of their mean ``together``."""
         split = [self._split_layers(*entries) for entries in estimates]
         for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
             parts = list(of_layer)
@@ -345,7 +310,6 @@ class FrameOptics:
             yield of_depth, _Lit(rows, columns, lights.reshape(-1, len(rows), len(columns)))
 
     def _restrict_to_lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
-        """Rows and columns that any of some ``parts`` lights, and the parts by places among these alone."""
         places = [np.divmod(place, self.shape[1]) for place, _ in parts]
         lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
         for row, column in places:
@@ -362,7 +326,6 @@ class FrameOptics:
         )
 
     def _split_layers(self, flat: IntArray, light: FloatArray) -> list[Entries]:
-        """What lies in each layer: places in (rows, columns), and light."""
         if len(self._layers) == 1:
             return [(flat, light)]
         starts = np.arange(len(self._layers) + 1, dtype=flat.dtype) * flat.dtype.type(self.shape[0] * self.shape[1])
@@ -371,7 +334,6 @@ class FrameOptics:
 
 
 def _shadow(geometry: CameraGeometry, *directions: Any) -> SeparableTerms:
-    """The shadow of ``geometry`` toward ``directions``; of masks of many terms, 100 MiB each, none is kept."""
     many = geometry.mask_terms > FEW or geometry.mask_motion is not None
     return (shadow_terms if many else _keep_shadow)(geometry, *directions)
 
@@ -384,17 +346,10 @@ def raster_error(
     spectrum: Spectrum | None,
     light: FloatArray,
 ) -> tuple[float, bool]:
-    """What a shadow on a raster leaves of the frame of a ``light``, relative rms, on a few pixels about the axis; and
-    whether it is told from the sum of the mask's terms, else from a raster of half the cells.
+    """Return the relative rms error of a raster's frame of a ``light`` (r, c) on a few pixels about the axis.
 
-    Parameters
-    ----------
-    geometry, depth, spectrum
-        the camera, and depth and lines of the light.
-    rows, columns
-        r and c directions.
-    light
-        (r, c).
+    The second value is True if the reference is the sum of the mask's terms, and False if it is a raster of half the
+    cells.
     """
     side = min(*geometry.shape, _JUDGED)
     few = geometry.model_copy(update={"pixels": side, "rows": None, "columns": None, "roi": None})
@@ -420,7 +375,7 @@ def raster_error(
 
 
 def number_of_terms(drawn: Plate) -> float:
-    """Terms that hold the shadow that is ``drawn`` on a raster; infinite where too many were looked for."""
+    """Return the number of terms of a shadow that is ``drawn`` on a raster; infinite if they are too many."""
     return drawn.largest.count if drawn.largest.left_out <= RASTER_LEFT_OUT else math.inf
 
 
@@ -432,13 +387,9 @@ def largest_terms(
     spectrum: Spectrum | None = None,
     places: Places | None = None,
 ) -> SeparableTerms | None:
-    """The shadow of a mask that is drawn on a raster, but for 1e-4 of it, as separable terms; None where these would
-    take too much memory.
+    """Return the separable terms of a raster's shadow up to 1e-4 of it; None if they exceed the memory limit.
 
-    Parameters
-    ----------
-    geometry, rows, columns, depth, spectrum, places
-        as for :func:`mitsim.optics.terms.shadow_terms`.
+    The parameters are those of :func:`mitsim.optics.terms.shadow_terms`.
     """
     drawn = raster(geometry, depth, spectrum)
     shape = geometry.frame_shape if places is None else map(len, places)
@@ -453,13 +404,11 @@ def largest_terms(
 def _correlation(
     geometry: CameraGeometry, rows: Directions, columns: Directions, depth: float, spectrum: Spectrum | None
 ) -> Correlation:
-    """The shadow of a mask that is drawn on a raster, prepared once."""
     shadow = replace(ShadowGeometry.of(geometry, depth), mask=raster(geometry, depth, spectrum))
     return Correlation(shadow, rows, columns, geometry.pixel_fill_factor)
 
 
 def _stack(parts: Sequence[FloatArray]) -> FloatArray:
-    """Matrices one above the other; one alone is not copied."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
@@ -467,9 +416,9 @@ def _stack(parts: Sequence[FloatArray]) -> FloatArray:
 
 
 def anchor_positions(count: int, half_width: float) -> FloatArray:
-    """(``count``,) coordinates of anchors on a sensor of ``half_width``, in its unit.
+    """Return the (``count``,) coordinates of anchors on a sensor of ``half_width``: Chebyshev nodes.
 
-    Chebyshev nodes, the near-best points for interpolation. MitsimError for less than one.
+    Raises MitsimError for a count below one.
     """
     if count < 1:
         raise MitsimError(f"number of anchors a side is {count}; give at least 1")
@@ -478,5 +427,5 @@ def anchor_positions(count: int, half_width: float) -> FloatArray:
 
 
 def anchor_weights(anchors: Sequence[float] | FloatArray, at: FloatArray) -> FloatArray:
-    """(len(at), len(anchors)) Lagrange weights that interpolate values known at ``anchors`` to the points ``at``."""
+    """Return (len(at), len(anchors)) Lagrange weights that interpolate from ``anchors`` to the points ``at``."""
     return np.stack(lagrange_weights(at, np.asarray(anchors, dtype=np.float64)), axis=1)

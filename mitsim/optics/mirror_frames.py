@@ -1,13 +1,13 @@
-"""Light that mirrors carry to the sensor: from beams that cross the sensor plane to irradiance on every sensor pixel.
+"""Irradiance on every sensor pixel from beams that mirrors carry to the sensor.
 
-A beam is a thin bundle of rays from a pinhole projector, a quadrilateral of one projector pixel's window. Its flux is
-known, its four corner rays say where it lands, and between them all is bilinear; so a beam is cut into small boxes of
-at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times the mask's mean
-over the part. Boxes tile what the beam lights, and flux is conserved whatever their shape.
+A beam is a thin bundle of rays from a pinhole projector: a quadrilateral of one projector pixel's window. Its flux is
+known, its four corner rays give the place where it lands, and all quantities between them are bilinear. A beam is cut
+into boxes of at most half a sensor pixel, and each box gives every pixel that it overlaps its part of the flux times
+the mask's mean over the part. Because boxes tile the beam, flux is conserved for any shape.
 
-The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical one needs the distance
-of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are index coordinates (s_row = -y, s_col = -x),
-centred, in mm.
+The mask enters as separable terms of samplers (:mod:`mitsim.optics.fft_shadow`); a wave-optical mask needs the
+distance of the virtual source, :attr:`Beams.inverse_depth`. Coordinates are centred index coordinates (s_row = -y,
+s_col = -x) in mm.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from mitsim.optics.frames import ClassFrames
 from mitsim.optics.image_formation import IntArray
 
 _BOXES_AT_ONCE = 2**18
-"""Boxes held at a time, some tens of MiB."""
+"""Boxes in memory at a time: some tens of MiB."""
 _POINT = 1e-9
-"""Part of a length that counts as none; chosen far above rounding, 1e-16, and far below what a pixel shows."""
+"""Relative length below which a beam counts as a point."""
 _ASKEW_BOXES = 2
-"""Further boxes a side, in those of an even beam, that an askew one gets; without them a moire of 1 % (measured)."""
+"""Factor of boxes per side for an askew beam, which otherwise shows a moire of 1 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Bundles of rays that reach the sensor plane, the last index of each pair being (row, column).
+    """Bundles of rays that reach the sensor plane; the last index of each pair is (row, column).
 
     Attributes
     ----------
@@ -48,16 +48,15 @@ class Beams:
     flux
         (q,) flux that the projector puts into each beam at full power [W m^-2 mm^2].
     sensor
-        (q, 2, 2, 2) where the corner rays cross the sensor plane [mm].
+        (q, 2, 2, 2) points where the corner rays cross the sensor plane [mm].
     tangent
-        (q, 2, 2, 2) their tan-angles (x/z, y/z, in index coordinates) seen from there.
+        (q, 2, 2, 2) tan-angles (x/z, y/z, in index coordinates) seen from these points.
     throughput
-        (q, 2, 2) part of the light left at each corner.
+        (q, 2, 2) part of the light that remains at each corner.
     unresolved
-        flux on the sensor that is in no beam, because where it lands was not found out.
+        Flux on the sensor that is in no beam, because the place where it lands was not found.
     error
-        standard error of the flux on the sensor, from beams that an edge cuts and that were not divided further: these
-        are points.
+        Standard error of the flux on the sensor from beams that an edge cuts and that were not divided further.
     """
 
     pixel: IntArray
@@ -73,17 +72,17 @@ class Beams:
 
     @property
     def delivered(self) -> FloatArray:
-        """(q,) flux that arrives at the sensor plane, on the sensor or beside it [W m^-2 mm^2]."""
+        """Return the (q,) flux that arrives at the sensor plane, on the sensor or beside it [W m^-2 mm^2]."""
         return np.asarray(self.flux * self.throughput.mean(axis=(1, 2)))
 
     @property
     def wide(self) -> npt.NDArray[np.bool_]:
-        """(q,) whether beams are more than points."""
+        """Return (q,) True for beams that are larger than points."""
         return np.asarray((np.ptp(self.sensor.reshape(len(self), 4, 2), axis=1) > 0).any(axis=1))
 
     @property
     def inverse_depth(self) -> FloatArray:
-        """(q, 2) 1/z [1/mm] of the virtual source along rows and columns, from dt/du = -1/z at each beam's centre."""
+        """Return (q, 2) 1/z [1/mm] of the virtual source along both axes, from dt/du = -1/z at the beam's centre."""
         return -_slope(self.sensor, self.tangent)
 
 
@@ -94,11 +93,11 @@ class SpecularFrames(ClassFrames):
     Attributes
     ----------
     lit_pixels
-        (p,) projector pixels whose light meets the sensor, behind the mask or not.
+        (p,) projector pixels whose light meets the sensor plane within the sensor, behind the mask or not.
     flux
-        flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
+        Flux on the sensor without the mask, all classes at full power [W m^-2 mm^2].
     unresolved, error
-        flux that is left out, and the standard error of what is not, from what edges cut; same unit.
+        Flux that is left out, and standard error of the rest from beams that edges cut; same unit.
     """
 
     lit_pixels: IntArray
@@ -110,26 +109,26 @@ class SpecularFrames(ClassFrames):
 def specular_frames(
     beams: Beams, geometry: CameraGeometry, terms: Sequence[SampledTerm], labels: IntArray, boxes_per_pixel: int = 2
 ) -> SpecularFrames:
-    """Frames of the classes that mirrors bring to the sensor; memory is one frame for each of them.
+    """Form the frames of the classes that mirrors bring to the sensor; memory is one frame per class.
 
     Parameters
     ----------
     beams
-        from ``mitsim.transport.specular.trace_specular_chains``.
+        Result of ``mitsim.transport.specular.trace_specular_chains``.
     geometry
-        the camera; irradiance is the mean over a pixel's active square, times the fill factor and the response.
+        The camera; irradiance is the mean over a pixel's active square, times fill factor and response.
     terms
-        the mask, see the module; ``[]`` gives no light.
+        Samplers of the mask; ``[]`` gives no light.
     labels
         (n * n,) class of each projector pixel.
     boxes_per_pixel
-        boxes a sensor pixel's side, at least 2: a box turned by 45 degrees must not reach into a third
-        pixel. Any number is exact where beams are aligned with the pixels' rows and columns.
+        Boxes along a sensor pixel, at least 2, because a box turned by 45 degrees must not reach a third pixel. Any
+        number is exact where beams are aligned with the pixels' rows and columns.
 
     Raises
     ------
     MitsimError
-        for ``labels`` that do not cover the beams' projector pixels, or fewer than two boxes.
+        If ``labels`` do not cover the beams' projector pixels, or for fewer than two boxes.
     """
     labels = np.asarray(labels)
     _check(beams, labels, boxes_per_pixel)
@@ -152,8 +151,6 @@ def specular_frames(
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """Beams cut alike: centres a, b (0..1) of some boxes along the two sides, and the sizes of a box in a and b."""
-
     beams: IntArray
     a: FloatArray
     b: FloatArray
@@ -162,8 +159,7 @@ class _Cut:
 
 @dataclass(frozen=True, eq=False)
 class _Boxes:
-    """Boxes on the sensor: the beam (k,) and flux (k,) of each; place and extent on the sensor, tan-angle, and the
-    magnification ds/du of the mask's shadow, all (k, 2) for (row, column)."""
+    """Boxes on the sensor: beam (k,) and flux (k,); position, extent, tan-angle and magnification ds/du, all (k, 2)."""
 
     beam: IntArray
     flux: FloatArray
@@ -184,17 +180,16 @@ def _check(beams: Beams, labels: IntArray, boxes_per_pixel: int) -> None:
 
 
 def _on_sensor(beams: Beams, geometry: CameraGeometry) -> IntArray:
-    """Beams whose bounding box meets the sensor."""
     corners = beams.sensor.reshape(len(beams), 4, 2)
     low, high = corners.min(axis=1), corners.max(axis=1)
     return np.flatnonzero(((high > -geometry.half_width) & (low < geometry.half_width)).all(axis=1))
 
 
 def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
-    """All boxes of the beams ``reached``, no side longer than ``box`` [mm], in portions that memory holds.
+    """Yield all boxes of the beams ``reached``, no side longer than ``box`` [mm], in portions that fit into memory.
 
-    Numbers of boxes a side are rounded up to three leading bits, so that many beams share one. Askew beams get up to
-    three times as many: boxes then overlap and leave gaps, which shows as a moire with the pixels (1 % at two a pixel).
+    Numbers of boxes per side are rounded up to three leading bits, so that many beams share one. Askew beams get up to
+    three times as many, because boxes then overlap and leave gaps.
     """
     corners = beams.sensor[reached]
     sides = [np.diff(corners, axis=axis).reshape(len(reached), 2, 2) for axis in (1, 2)]
@@ -217,7 +212,6 @@ def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
 
 
 def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
-    """The boxes of one cut that lie on the sensor and inside the field stop."""
     corners = beams.sensor[cut.beams]
     place, tangent = _bilinear(corners, cut.a, cut.b), _bilinear(beams.tangent[cut.beams], cut.a, cut.b)
     along, across = _gradients(corners, cut.a, cut.b)
@@ -244,10 +238,6 @@ def _accumulate(
     terms: Sequence[SampledTerm],
     active_part: float,
 ) -> float:
-    """Add the boxes' flux behind the mask to ``frames`` [.. mm^2]; the sum of their flux on the sensor without it.
-
-    A box is at most one pixel wide, so it meets two pixels of each axis at most.
-    """
     count, total = geometry.frame_shape, 0.0
     rows, columns = ([_pieces(boxes, axis, step, geometry, active_part) for step in (0, 1)] for axis in (0, 1))
     shadows = [
@@ -273,11 +263,6 @@ def _accumulate(
 def _pieces(
     boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_part: float
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """The part of each box in its first (step 0) or second pixel along an axis.
-
-    Pixel index, share of the box (0 outside the sensor), then what a sampler takes: centre and width of the part's
-    shadow in the mask plane [mm].
-    """
     pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
     place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
     extent = boxes.extent[:, axis] / pitch
@@ -294,13 +279,11 @@ def _pieces(
 
 
 def _bilinear(corners: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """(q, A, B, 2) values between corners (q, 2, 2, 2) at all pairs of a (A,) and b (B,)."""
     sides = corners[:, None, 0] + (corners[:, None, 1] - corners[:, None, 0]) * a[:, None, None]
     return np.asarray(sides[:, :, None, 0] + (sides[:, :, None, 1] - sides[:, :, None, 0]) * b[:, None])
 
 
 def _gradients(corners: FloatArray, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of :func:`_bilinear` by a (q, 1, B, 2) and by b (q, A, 1, 2)."""
     along = (corners[:, 1] - corners[:, 0])[:, None]
     across = (corners[:, :, 1] - corners[:, :, 0])[:, :, None]
     return (
@@ -310,9 +293,9 @@ def _gradients(corners: FloatArray, a: FloatArray, b: FloatArray) -> tuple[Float
 
 
 def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
-    """(q, 2) dt/du along rows and along columns at the beams' centres; 0 where a beam is folded to a line.
+    """Return (q, 2) dt/du along rows and columns at the beams' centres; 0 where a beam is folded to a line.
 
-    What a curved mirror adds across (dt_row/du_column) is left out: it matters only over less than a box.
+    The cross term dt_row/du_column of a curved mirror is neglected because it matters only over less than a box.
     """
     middle = np.array([0.5])
     (ua, ub), (ta, tb) = ([g[:, 0, 0] for g in _gradients(c, middle, middle)] for c in (sensor, tangent))
@@ -327,18 +310,13 @@ def _slope(sensor: FloatArray, tangent: FloatArray) -> FloatArray:
 # -------- Frames of a projector's beams
 
 _KEPT = 4
-"""Frames of so many lightings and cameras: what the pilot switches between."""
+"""Number of lightings and cameras whose frames are cached."""
 
 
 class SpecularLight:
-    """Frames made from ``beams``; the last few are kept, because forming them takes as long as tracing does.
+    """Frames from ``beams``, of which the last few are cached because forming them takes as long as tracing.
 
-    Attributes
-    ----------
-    beams
-        of the scene.
-    seconds
-        that forming frames of all of them took last; 0 before.
+    ``seconds`` is the time that forming all frames took last; 0 before.
     """
 
     def __init__(self, beams: Beams) -> None:
@@ -346,29 +324,23 @@ class SpecularLight:
         self._kept = lru_cache(_KEPT)(self._form)
 
     def frames(self, labels: Labels, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames | None:
-        """Frames by class of projector pixels; None where no beam reaches the sensor.
+        """Return the frames by class of projector pixels; None if no beam reaches the sensor.
 
         Parameters
         ----------
         labels
             (n^2,) class of each pixel.
         geometry
-            the camera.
+            The camera.
         spectrum
-            light whose diffraction is simulated; None: the mask's shadow is geometric.
+            Light whose diffraction is simulated; None for a geometric shadow.
         """
         if not len(self.beams):
             return None
         return self._kept(np.asarray(labels, np.int64).tobytes(), geometry, spectrum)
 
     def irradiance(self, geometry: CameraGeometry) -> tuple[float, float]:
-        """Mean irradiance on the sensor without its mask, and what of it lacks or may be off in each pixel [W m^-2].
-
-        Parameters
-        ----------
-        geometry
-            the camera.
-        """
+        """Return the mean irradiance without the mask, and its missing or uncertain part in each pixel [W m^-2]."""
         beams = self.beams
         area, pixels = math.prod(geometry.pitches), math.prod(geometry.frame_shape)
         met = (np.abs(beams.sensor.mean(axis=(1, 2))) < geometry.half_width).all(axis=1)
@@ -383,7 +355,6 @@ class SpecularLight:
         return found
 
     def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SampledTerm]:
-        """The mask for a virtual source at the beams' mean depth and direction."""
         if spectrum is None:
             return geometric_samplers(geometry)
         wide = self.beams.wide

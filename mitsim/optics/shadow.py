@@ -1,27 +1,26 @@
-"""Geometric shadow of a mask: from sensor pixels and directions to mean transmissions, as separable terms.
+"""Geometric shadow of a mask: mean transmissions from sensor pixels and directions, as separable terms.
 
-The ray from sensor coordinate u toward the direction tau = x/z, meeting the scene at depth z, crosses the
-mask plane (distance d) at s = u (1 - d/z) + d tau. The mean over a sensor pixel and a cell is the profile
-weighted by the density of s, the convolution of two boxes: a trapezoid. Its integral over each feature is a
-difference of a piecewise-quadratic distribution function, so the mean is exact. (Four corner values of the
-profile's second cumulative sum give the same number in exact arithmetic, but they cancel in float64: the
-sums reach N**2/2 features while the second difference is a hundredth of one.) Point directions leave the pixel's box.
-Profiles whose features are not even, or blurred, are those of :mod:`mitsim.optics.edge_profile`.
+The ray from sensor coordinate u toward the direction tau = x/z, which meets the scene at depth z, crosses the mask
+plane (distance d) at s = u (1 - d/z) + d tau. The mean over a sensor pixel and a cell is the profile weighted by the
+density of s, which is the convolution of two boxes: a trapezoid. Its integral over each feature is a difference of a
+piecewise quadratic distribution function, so that the mean is exact. (A second cumulative sum of the profile gives the
+same in exact arithmetic but cancels in float64.) Point directions leave the box of the pixel. Profiles with uneven or
+blurred features are handled by :mod:`mitsim.optics.edge_profile`.
 
-A thick mask has two faces, the entrance ``thickness`` further from the sensor than the exit. A ray of slope t (x/z seen
-from its sensor point) that leaves through s entered at s' = s + thickness t, and for a point source at (tau z, z) that
-is a function of s alone, whatever the sensor point::
+A thick mask has two faces; the entrance is ``thickness`` further from the sensor than the exit. A ray of slope t (x/z
+seen from its sensor point) that leaves through s entered at s' = s + thickness t. For a point source at (tau z, z)
+this is a function of s alone::
 
     s' = s (1 - thickness / (z - d)) + thickness tau / (1 - d/z)
 
-So each direction has its own clear profile M(s) M(s') on the exit face, and that profile's shadow is the thin mask's.
-A cell takes the clear profile of its centre.
+Therefore each direction has its own clear profile M(s) M(s') on the exit face, whose shadow is that of a thin mask. A
+cell takes the clear profile of its centre.
 
-A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. One that is
-tilted along the axis, its distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
+A mask whose centre is off the axis by o is a centred one seen from its own axis: u - o, and tau - o/z. A mask that is
+tilted along the axis, at distance d + a s + b, is met by a ray of slope t = tau - u/z at s + t (a s + b) / (1 - a t),
 times sqrt(1 + a^2) along it (:mod:`mitsim.optics.terms`).
 
-All coordinates are index coordinates, centred, in mm; tau is a pure number.
+All coordinates are centred index coordinates in mm; tau is a pure number.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ from mitsim.optics.edge_profile import Steps
 
 SeparableTerms = list[SeparableTerm]
 EVEN = ((0.0, 0.0), (0.0, 0.0))
-"""The tilt of a mask that has none."""
+"""The tilt of an even mask."""
 Places = tuple[tuple[int, ...], tuple[int, ...]]
-"""Rows and columns of a frame, increasing."""
+"""Increasing rows and columns of a frame."""
 _WIDE = 32
-"""Features in half a trapezoid from which antiderivatives serve: they cost the same for any, and cancel to 1e-11."""
+"""Features in half a trapezoid from which antiderivatives are used, because their cost does not grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class Directions(ByValue):
     centres
         (c,) increasing tan-angles x/z (index coordinates), read-only.
     width
-        width of each cell in tan-angle; 0 for point directions.
+        Width of each cell in tan-angle; 0 for points.
     """
 
     centres: FloatArray
@@ -73,7 +72,7 @@ class Directions(ByValue):
 
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
-        """The equal cells between ``edges`` (c + 1,); raises MitsimError for unequal ones."""
+        """Return the equal cells between ``edges`` (c + 1,); raise MitsimError for unequal ones."""
         array = _check_edges("cell edges", edges)
         widths = np.diff(array)
         width = float(array[-1] - array[0]) / len(widths)
@@ -84,27 +83,26 @@ class Directions(ByValue):
 
 @dataclass(frozen=True, eq=False)
 class ShadowGeometry:
-    """Sensor, mask and depth of one shadow; MitsimError for a depth that is not beyond the mask.
+    """Sensor, mask and depth of one shadow; raises MitsimError for a depth that is not beyond the mask.
 
     Attributes
     ----------
     mask
-        the mask; both faces of a thick one carry it.
+        The mask; both faces of a thick one carry it.
     pixel_centres_mm
         (m,) sensor coordinates.
     active_mm
-        length of a pixel's active part [mm]; the shadow is averaged over it.
+        Length of the active part of a pixel [mm], over which the shadow is averaged.
     distance_mm, thickness_mm
-        sensor to the mask's exit face, d, and the mask's thickness [mm].
+        Distance from the sensor to the exit face, d, and thickness of the mask [mm].
     depth_mm
-        sensor to scene, z [mm], beyond the mask; ``inf`` is allowed.
+        Distance from the sensor to the scene, z [mm]; ``inf`` is allowed.
     offset_mm
         (row, column) of the mask's centre.
     tilt
-        along rows, and along columns, how its distance grows with the coordinate, and by how much it is greater at the
-        mask's centre [mm].
+        For rows and columns: growth of the mask's distance with the coordinate, and its excess at the centre [mm].
     columns_mm
-        the first two of columns, where they are not those of rows.
+        Pixel coordinates of columns if they differ from those of rows.
     """
 
     mask: Mask | Plate
@@ -119,15 +117,7 @@ class ShadowGeometry:
 
     @classmethod
     def of(cls, camera: CameraGeometry, depth_mm: float, places: Places | None = None) -> ShadowGeometry:
-        """That of a camera toward points at one depth.
-
-        Parameters
-        ----------
-        camera, depth_mm
-            whose mask and frames, and how far off.
-        places
-            rows and columns that frames then consist of; None: all.
-        """
+        """Return the shadow geometry of a camera for points at ``depth_mm``; ``places`` selects rows and columns."""
         rows, columns = (camera.centres(axis) for axis in (0, 1))
         if places is not None:
             rows, columns = rows[np.asarray(places[0])], columns[np.asarray(places[1])]
@@ -141,20 +131,20 @@ class ShadowGeometry:
 
     @property
     def shrink(self) -> float:
-        """d s / d u = 1 - d/z."""
+        """Return ds/du = 1 - d/z."""
         return _shrink(self.distance_mm, self.depth_mm)
 
     @property
     def half_pixel(self) -> float:
-        """Half an active side seen on the mask [mm]."""
+        """Return half an active side as seen on the mask [mm]."""
         return self.active_mm * self.shrink / 2
 
     def half_cell(self, directions: Directions) -> float:
-        """Half a cell of ``directions`` seen on the mask [mm]."""
+        """Return half a cell of ``directions`` as seen on the mask [mm]."""
         return self.distance_mm * directions.width / 2
 
     def along(self, axis: int) -> ShadowGeometry:
-        """The same with the pixels of one ``axis``, 0 rows or 1 columns, for both."""
+        """Return a copy that has the pixels of one ``axis`` (0 rows, 1 columns) on both axes."""
         if self.columns_mm is None:
             return self
         if not axis:
@@ -162,10 +152,7 @@ class ShadowGeometry:
         return replace(self, pixel_centres_mm=self.columns_mm[0], active_mm=self.columns_mm[1], columns_mm=None)
 
     def from_mask(self, directions: Directions, axis: int) -> tuple[ShadowGeometry, Directions]:
-        """The same along one ``axis`` (0 rows, 1 columns), and its ``directions``, in coordinates of the mask's centre.
-
-        In them the sensor is off the axis by as much the other way.
-        """
+        """Return shadow and directions along one ``axis`` (0 rows, 1 columns) in coordinates of the mask's centre."""
         offset, tilt, own = self.offset_mm[axis], (self.tilt[axis],) * 2, self.along(axis)
         if not offset:
             return (own if tilt == own.tilt else replace(own, tilt=tilt)), directions
@@ -173,11 +160,11 @@ class ShadowGeometry:
         return moved, Directions(directions.centres - offset / self.depth_mm, directions.width)
 
     def crossings(self, directions: Directions) -> FloatArray:
-        """(m, c) mask coordinates [mm] of rays from pixel centres toward ``directions``, of an even mask."""
+        """Return the (m, c) points [mm] at which rays from pixel centres toward ``directions`` cross an even mask."""
         return self.shrink * self.pixel_centres_mm[:, None] + self.distance_mm * directions.centres[None, :]
 
     def on_tilted_mask(self, directions: Directions) -> FloatArray:
-        """The same on the tilted mask, for ``directions`` along an axis of :meth:`from_mask`."""
+        """Return the crossings on the tilted mask, for ``directions`` along an axis of :meth:`from_mask`."""
         (growth, beyond), even = self.tilt[0], self.crossings(directions)
         if not (growth or beyond):
             return even
@@ -185,12 +172,12 @@ class ShadowGeometry:
         return np.asarray((even + slope * (growth * even + beyond) / (1 - growth * slope)) * np.hypot(1, growth))
 
     def weights(self) -> list[float]:
-        """Weight of each term of the clear aperture: the mask's own, or for a thick mask products of two of them."""
+        """Return the weight of each term of the clear aperture: for a thick mask, products of two weights."""
         weights = [weight for weight, _, _ in self.mask.terms]
         return [a * b for a in weights for b in weights] if self.thickness_mm else weights
 
     def clear(self, profiles: Sequence[FloatArray], tau: float) -> list[Steps]:
-        """What ``profiles`` (N,) of both faces leave clear toward ``tau``, in the order of :meth:`weights`."""
+        """Return the part of ``profiles`` that both faces leave clear toward ``tau``, ordered as :meth:`weights`."""
         faces = [Steps.between(profile, self.mask.lines, self.mask.blur_mm) for profile in profiles]
         if not self.thickness_mm:
             return faces
@@ -205,14 +192,9 @@ def both_axes(
     columns: Directions,
     axis: Callable[[ShadowGeometry, list[FloatArray], Directions], FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """A shadow along rows and along columns; equal axes share one computation.
+    """Compute a shadow along rows and along columns, once if both axes are equal.
 
-    Parameters
-    ----------
-    shadow, rows, columns
-        the mask, and directions along the two axes.
-    axis
-        gives the shadow of profiles of a mask on the axis toward directions.
+    ``axis`` returns the shadow of profiles of a centred mask toward directions.
     """
     terms = shadow.mask.terms
     row_profiles, column_profiles = [row for _, row, _ in terms], [column for _, _, column in terms]
@@ -227,22 +209,13 @@ def both_axes(
 
 
 def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> SeparableTerms:
-    """Geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left.
-
-    Parameters
-    ----------
-    shadow
-        sensor, mask and depth.
-    rows, columns
-        r and c directions.
-    """
+    """Return the geometric shadow as separable terms [(left (m, r), right (m, c)), ...], weights folded into left."""
     means = _thick_means if shadow.thickness_mm else _thin_means
     left, right = both_axes(shadow, rows, columns, means)
     return [(weight * a, b) for weight, a, b in zip(shadow.weights(), left, right, strict=True)]
 
 
 def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
-    """(terms, m, c) mean transmissions."""
     feature, even = shadow.mask.feature_mm, shadow.mask.even
     if not even or shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
         boxes = shadow.on_tilted_mask(directions), shadow.half_pixel, shadow.half_cell(directions)
@@ -253,7 +226,6 @@ def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: 
 
 
 def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
-    """(terms, m, c) mean transmissions through both faces."""
     crossings, half_cell = shadow.crossings(directions), shadow.half_cell(directions)
     means = np.empty((len(shadow.weights()), *crossings.shape))
     for j, tau in enumerate(directions.centres):
@@ -270,31 +242,32 @@ def shadow_factor(
     mask_distance_mm: float,
     depth_mm: float,
 ) -> FloatArray:
-    """Mean of a mask profile over sensor pixel i and tan-angle cell j, for points at one depth.
+    """Return the mean of a mask profile over sensor pixel i and tan-angle cell j, for points at one depth.
 
     Parameters
     ----------
     profile
         (N,) transmission of each feature, any real numbers; centred on the axis, zero outside.
     feature_mm
-        feature size [mm].
+        Feature size [mm].
     pixel_edges_mm
         (m + 1,) increasing edges of the sensor pixels [mm].
     cell_edges_tan
         (c + 1,) increasing edges of the cells in tau = x/z.
     mask_distance_mm
-        sensor to mask, d [mm].
+        Sensor to mask, d [mm].
     depth_mm
-        sensor to scene, z [mm], above d; ``inf`` is allowed.
+        Sensor to scene, z [mm], above d; ``inf`` is allowed.
 
     Returns
     -------
-    (m, c) float64.
+    array
+        (m, c) float64.
 
     Raises
     ------
     MitsimError
-        for edges that do not increase, or a depth that is not beyond the mask.
+        If edges do not increase, or the depth is not beyond the mask.
     """
     values = np.asarray(profile, dtype=np.float64)
     if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
@@ -316,22 +289,14 @@ def scene_factor(
     mask_distance_mm: float,
     depth_mm: float,
 ) -> FloatArray:
-    """:func:`shadow_factor` for scene pixels.
-
-    Parameters
-    ----------
-    profile, feature_mm, pixel_edges_mm, mask_distance_mm, depth_mm
-        as there.
-    scene_edges_mm
-        (c + 1,) increasing edges of the scene's pixels on the plane at ``depth_mm``.
-    """
+    """Return :func:`shadow_factor` for scene pixels, whose (c + 1,) edges on the plane at ``depth_mm`` are in mm."""
     _require_positive("scene depth", depth_mm)
     tan_edges = np.asarray(scene_edges_mm, dtype=np.float64) / depth_mm
     return shadow_factor(profile, feature_mm, pixel_edges_mm, tan_edges, mask_distance_mm, depth_mm)
 
 
 def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
-    """Mean of the profile around each crossing over two boxes of the given half-widths, which broadcast; in features.
+    """Return the mean of the profile around each crossing over two boxes of the given half-widths, in features.
 
     ``half_b`` may be 0.
     """
@@ -351,7 +316,6 @@ def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArra
 
 
 def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
-    """Distribution function at x of the sum of two centred uniform variables of the given half-widths."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
     distance = np.abs(x)
     # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
@@ -364,14 +328,13 @@ def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> Flo
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:
-    """(``count``,) Chebyshev's nodes between those of ``places`` that are farthest from 0; 0 for one."""
+    """Return (``count``,) Chebyshev nodes between the ``places`` that are farthest from 0; 0 for one."""
     reach = float(np.abs(places).max())
     return np.asarray(reach * np.cos(np.pi * (np.arange(count) + 0.5) / count) if count > 1 else np.zeros(1))
 
 
 def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
-    """At each of the ``places``, the polynomial that is 1 at each of the ``nodes`` and 0 at the others: weights that
-    interpolate between values at the nodes."""
+    """Return for each node the weights that interpolate to ``places`` by Lagrange polynomials."""
     weights = []
     for node in nodes:
         others = nodes[nodes != node]
@@ -382,7 +345,7 @@ def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
 
 
 def _shrink(distance_mm: float, depth_mm: float) -> float:
-    """1 - d/z as (z - d)/z: beside the scene the difference of two lengths keeps digits that 1 - d/z has lost."""
+    """Return 1 - d/z as (z - d)/z, which keeps its digits for a scene close to the mask."""
     return (depth_mm - distance_mm) / depth_mm if np.isfinite(depth_mm) else 1.0
 
 

@@ -1,24 +1,25 @@
-"""Laser speckle on the sensor: from irradiance to one realisation of what coherent light makes of it; and its contrast.
+"""Laser speckle on the sensor: one realisation of coherent light, and its contrast.
 
 Integrated speckle after Goodman (Speckle Phenomena in Optics, section 4.6): light that averages over M independent
 modes (polarisations, laser lines, grains within a pixel, moments of a scanned beam) follows a gamma distribution of
-mean 1 and standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent: a grain lambda z / D of
-an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 passes light through unchanged.
+mean 1 and standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent, because a grain
+lambda z / D of an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 leaves light unchanged.
 
-The contrast of a pixel of width p follows from what it sees. Points u of a rough surface at distance z shine with
-independent phases, B(u) of their light reaches the pixel through the mask, and a beam that is scanned over them lights
-some together. With <> the mean over pairs of points u, u', each weighed by B, and over the sensor's pixels,
+Points u of a rough surface at distance z shine with independent phases, B(u) of their light reaches the pixel (width p)
+through the mask, and a scanned beam lights some together. With <> the mean over pairs of points u, u', weighted by B,
+and over the sensor's pixels::
 
-    C^2 = (1 + P^2) / 2  sum_kl w_k w_l mu_kl^2  < g(u - u') sinc^2(p dx / lambda z) sinc^2(p dy / lambda z) >.
+    C^2 = (1 + P^2) / 2  sum_kl w_k w_l mu_kl^2  < g(u - u') sinc^2(p dx / lambda z) sinc^2(p dy / lambda z) >
 
-- P is the degree of polarisation of the scattered light: two polarisations speckle apart (Goodman, 3.3).
-- w_k are the lines' shares of the photons. Over heights of standard deviation h their fields have a coherence mu_kl =
-  exp(-(4 pi h (1/lambda_k - 1/lambda_l))^2 / 2) (Goodman, chapter 6; light falls and leaves near the normal). Within a
-  line of standard deviation s the same leaves mu_kk^2 = (1 + (8 pi h s / lambda^2)^2)^(-1/2).
-- sinc^2 is what a pixel's area leaves of the grains of two points: the van Cittert-Zernike theorem, with Goodman's
-  number of grains in an aperture (4.4). Light through a fraction of the mask's openings comes from fewer points.
-- g is how coherently the beam lights two points: 1 where all is lit at once, exp(-|u - u'|^2 / r^2) for a Gaussian beam
-  of 1/e^2 radius r, whose places add up in one exposure as intensities.
+- P is the degree of polarisation of the scattered light, because two polarisations speckle independently (Goodman,
+  3.3).
+- w_k are the lines' shares of the photons. Over heights of standard deviation h, their fields have a coherence mu_kl =
+  exp(-(4 pi h (1/lambda_k - 1/lambda_l))^2 / 2) (Goodman, chapter 6; light near the normal). Within a line of standard
+  deviation s, mu_kk^2 = (1 + (8 pi h s / lambda^2)^2)^(-1/2).
+- sinc^2 is the part of the grains of two points that remains over the area of a pixel: the van Cittert-Zernike theorem,
+  with Goodman's number of grains in an aperture (4.4). Light through fewer openings comes from fewer points.
+- g is the coherence with which the beam lights two points: 1 if all is lit at once, exp(-|u - u'|^2 / r^2) for a
+  Gaussian beam of 1/e^2 radius r, whose positions add up in one exposure as intensities.
 """
 
 from __future__ import annotations
@@ -34,28 +35,15 @@ from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence
 
 _NODES = 16
-"""Of Gauss and Legendre's rule over half a triangle that two projector pixels' points are apart: six digits of the
-widest kernel's bend, four of a beam as narrow as a tenth of a pixel."""
+"""Nodes of the Gauss-Legendre rule over half a triangle of distances between points of two projector pixels."""
 Kernel = Callable[[FloatArray], FloatArray]
-"""Of distances along one axis [mm]."""
+"""Function of distances along one axis [mm]."""
 
 
 def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Irradiance times a gamma field of mean 1.
+    """Multiply ``irradiance`` (any shape and unit) by a gamma field of mean 1 and standard deviation ``contrast``.
 
-    Parameters
-    ----------
-    irradiance
-        any shape and unit, which the result has.
-    contrast
-        the field's standard deviation, 0 to 1.
-    rng
-        where the field is drawn from.
-
-    Raises
-    ------
-    MitsimError
-        for a contrast outside 0..1: single fully developed speckle has 1.
+    Raises MitsimError for a contrast outside 0..1, because single fully developed speckle has 1.
     """
     if not 0 <= contrast <= 1:
         raise MitsimError(f"speckle contrast is {contrast}; give a number from 0 (none) to 1 (fully developed)")
@@ -65,21 +53,21 @@ def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generato
 
 
 def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
-    """The contrast of speckle in one sensor pixel, by the formula above, mean over the sensor.
+    """Return the mean contrast of speckle in one sensor pixel by the module's formula.
 
     Parameters
     ----------
     devices
-        camera and projector, whose table ``speckle`` says how coherent its light is; its defaults where there is none.
+        Camera and projector, whose table ``speckle`` states the coherence of its light.
     pixels_mm
-        height and width of a projector pixel on the aligned plane [mm].
+        Height and width of a projector pixel on the aligned plane [mm].
     lit
         (n, n) light of each projector pixel, any unit.
 
     Raises
     ------
     MitsimError
-        where no pixel is lit.
+        If no pixel is lit.
     """
     if not lit.any():
         raise MitsimError("speckle contrast: no projector pixel is lit; light makes it")
@@ -97,17 +85,6 @@ def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArra
 
 
 def _coherences(wavelengths_nm: FloatArray, roughness_um: float | None, linewidth_nm: float) -> FloatArray:
-    """(lines, lines) mu_kl^2; lines are independent where the roughness is not known.
-
-    Parameters
-    ----------
-    wavelengths_nm
-        (lines,).
-    roughness_um
-        standard deviation of the surface's height, or None.
-    linewidth_nm
-        standard deviation of each line.
-    """
     if roughness_um is None:
         return np.eye(len(wavelengths_nm))
     height = 1e3 * roughness_um
@@ -119,10 +96,9 @@ def _coherences(wavelengths_nm: FloatArray, roughness_um: float | None, linewidt
 
 
 def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
-    """The mean over pairs of points, for one wavelength [mm]; other parameters as for :func:`contrast_of`.
+    """Return the mean over pairs of points for one wavelength [mm].
 
-    Of speckle's variance over all pixels, relative to the sum of their light's squares: the mask's shadow has pixels of
-    more light and of less.
+    It is relative to the sum of the squares of all pixels' light, because pixels of the mask's shadow differ.
     """
     camera, radius = devices.camera, (devices.projector.speckle or Coherence()).beam_radius_mm
 
@@ -148,18 +124,6 @@ def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wa
 
 
 def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> FloatArray:
-    """(2 count,) mean of two kernels' product over pairs of points of two pixels, by how many pixels these are apart: 0
-    to count - 1, then -count to -1.
-
-    Parameters
-    ----------
-    kernels
-        of the points' distance [mm].
-    size
-        of a pixel [mm].
-    count
-        of pixels.
-    """
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     part, share = (nodes + 1) / 2, weights / 2 * (1 - (nodes + 1) / 2)
     lags = np.fft.fftfreq(2 * count, 1 / (2 * count))[:, None]
@@ -168,8 +132,6 @@ def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> 
 
 
 def _pairs_seen(camera: CameraGeometry) -> tuple[tuple[float, Kernel], ...]:
-    """How much more often than by chance a pixel sees both of two points, as a sum of weights times kernels of rows and
-    of columns: codes whose features are open independently, each half of them or as many as are."""
     apart = camera.mask_distance / (camera.scene_distance * camera.mask_feature)
 
     def always(distance: FloatArray) -> FloatArray:
@@ -185,5 +147,4 @@ def _pairs_seen(camera: CameraGeometry) -> tuple[tuple[float, Kernel], ...]:
 
 
 def _open_part(camera: CameraGeometry) -> float:
-    """Mean transmission of a camera file's mask."""
     return float(sum(weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms))

@@ -1,8 +1,4 @@
-"""Shadow of a camera's mask as it is mounted: its geometry and directions in, separable terms out.
-
-The shadow of a mask at rest and even is :mod:`mitsim.optics.shadow`'s or :mod:`mitsim.optics.diffraction`'s. What
-turns, shakes or is tilted casts a sum of such shadows.
-"""
+"""Shadow of a camera's mask as it is mounted, turned, shaking or tilted, as a sum of separable terms."""
 
 from __future__ import annotations
 
@@ -35,23 +31,23 @@ def shadow_terms(
     spectrum: Spectrum | None = None,
     places: Places | None = None,
 ) -> SeparableTerms:
-    """Shadow on each pixel of directions at one depth, as separable terms: [(left (m, r), right (m', c)), ...].
+    """Return the shadow of directions at one depth as separable terms [(left (m, r), right (m', c)), ...].
 
-    The mean over a pixel's active area times the fill factor: irradiance is per pixel area. All weights are folded
-    into left. The angular response is not in here; it belongs to the light.
+    Each value is the mean over a pixel's active area times the fill factor, because irradiance is per pixel area.
+    Weights are folded into left. The angular response belongs to the light and is not included.
 
     Parameters
     ----------
     geometry
-        the camera.
+        The camera.
     rows, columns
-        directions along the two axes, r and c of them.
+        Directions along the two axes, r and c of them.
     depth
-        where they end [mm].
+        Distance of the scene [mm].
     spectrum
-        wave-optical with one: each wavelength has terms of its own, weighted by its share. None: geometric.
+        Lines of a wave-optical shadow, each with its own terms weighted by its share; None for a geometric shadow.
     places
-        rows and columns of a frame, increasing; None: all.
+        Increasing rows and columns of the frame; None for all.
     """
     shadow, waves = ShadowGeometry.of(geometry, depth, places), spectrum is not None
     if geometry.is_drawn(waves):
@@ -89,36 +85,26 @@ def shadow_terms(
 # where it is: of each profile the mean over its shifts, which keeps the number of terms.
 
 NODE_UM = 0.5
-"""Shift from node to node. It leaves less than 1 % of what turning by 1 mrad changes in the shadow on pixels of 11.7 um
-(tests/unit/optics/test_motion.py)."""
+"""Shift between nodes: it errs by less than 1 % of the effect of a rotation by 1 mrad."""
 _REACH, _STEPS = 4.0, 25
-"""Deviations on either side over which a shaking mask is averaged, and places there: a third of a deviation apart,
-which leaves 1 % of what shaking changes, of shadows with corners (same test)."""
+"""Deviations on either side over which a shaking mask is averaged, and number of places."""
 
 Shadow = Callable[[CameraGeometry], SeparableTerms]
-"""The shadow of a camera whose mask is at rest."""
+"""Function that returns the shadow of a camera whose mask is at rest."""
 
 
 def moving_terms(
     geometry: CameraGeometry, shadow: ShadowGeometry, rows: Directions, columns: Directions, at_rest: Shadow
 ) -> SeparableTerms:
-    """Shadow of a camera whose ``mask_motion`` is not None, as separable terms.
+    """Return the shadow of a camera whose mask is turned or shakes, as separable terms.
 
-    Parameters
-    ----------
-    geometry, shadow
-        the camera, and its sensor, mask and depth.
-    rows, columns
-        r and c directions.
-    at_rest
-        gives the terms of the camera with its mask at rest anywhere.
+    ``at_rest`` returns the terms of a camera with its mask at rest.
     """
     motion = geometry.mask_motion
     assert motion is not None
     still = geometry.model_copy(update={"mask_motion": None})
 
     def shift_mask(by_mm: float) -> SeparableTerms:
-        """Of the mask moved by so much the other way, along both axes."""
         row, column = geometry.mask_offset
         return at_rest(still.model_copy(update={"mask_offset_row": row - by_mm, "mask_offset_column": column - by_mm}))
 
@@ -145,7 +131,7 @@ def moving_terms(
 
 
 def _mean_of(shifted: Callable[[float], SeparableTerms], by_mm: float, deviation_mm: float) -> SeparableTerms:
-    """Mean of ``shifted`` terms over normal shifts about ``by_mm``, factor by factor: both axes shake on their own."""
+    """Average terms over normal shifts, factor by factor, because the axes shake independently."""
     places = np.linspace(-_REACH, _REACH, _STEPS)
     weights = np.exp(-np.square(places) / 2)
     weights /= weights.sum()
@@ -157,7 +143,6 @@ def _mean_of(shifted: Callable[[float], SeparableTerms], by_mm: float, deviation
 
 
 def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
-    """Weight of each of the equally spaced ``nodes`` at every ``shift`` between the first and the last."""
     place = (shift - nodes[0]) / (nodes[1] - nodes[0])
     return [np.maximum(1 - np.abs(place - index), 0.0) for index in range(len(nodes))]
 
@@ -189,20 +174,20 @@ def tilted_terms(
     nodes: tuple[int, int],
     formed: Callable[[ShadowGeometry], SeparableTerms],
 ) -> SeparableTerms:
-    """Shadow of a mask whose distance grows along both axes, as separable terms.
+    """Return the shadow of a mask whose distance grows along both axes, as separable terms.
 
     Parameters
     ----------
     shadow
-        sensor, even mask and depth.
+        Sensor, even mask and depth.
     rows, columns
-        r and c directions.
+        Directions.
     tilt
-        how the distance grows along rows, and along columns.
+        Growth of the distance along rows and along columns.
     nodes
-        of the columns' coordinate that rows are moved by, and of the rows' that columns are; 1 where nothing moves.
+        Numbers of interpolation nodes; 1 where nothing moves.
     formed
-        gives the terms of a shadow whose axes have a tilt each.
+        Function that returns the terms of a shadow whose axes have one tilt each.
     """
     along, across = tilt
     by_row, by_column = (
@@ -236,22 +221,16 @@ def tilted_terms(
 # 1993). Left and right factors of all terms have one shape each.
 
 _LEFT_OUT = 0.03
-"""Part of what factors lack that its terms may leave out, rms: a thousandth of an energy. Two or three terms hold the
-rest of FlatCam's masks and of MURA in three lines."""
+"""Part of the residual (rms) that its terms may neglect: a thousandth of its energy."""
 _TURNS = 2
-"""Steps to the brightness of a session's pixels: the third moves the residual by 1e-7."""
+"""Iterations for the brightness of a session's pixels: the third changes the residual by 1e-7."""
 
 
 @dataclass(frozen=True, eq=False)
 class BestTerm:
-    """The separable term ``left (x) right`` nearest to an operator, in the Frobenius norm.
+    """The separable term ``left (x) right`` nearest to an operator A in the Frobenius norm.
 
-    Attributes
-    ----------
-    left, right
-        (m, n), (m', n') of equal norm.
-    residual
-        ||A - left (x) right|| / ||A||; 0 for one term.
+    Both factors have equal norms; ``residual`` is ||A - left (x) right|| / ||A||.
     """
 
     left: FloatArray
@@ -261,14 +240,9 @@ class BestTerm:
 
 @dataclass(frozen=True, eq=False)
 class Lacking:
-    """What factors lack of a camera.
+    """Part of a camera's operator that its factors lack.
 
-    Attributes
-    ----------
-    terms
-        [(left (m, n), right (m', n')), ...] of the operator less the factors', but for 3 % of it, rms.
-    residual
-        its Frobenius norm as a part of the operator's: of the light of single pixels, rms.
+    ``terms`` hold the difference but for 3 % of it (rms); ``residual`` is its Frobenius norm relative to the operator.
     """
 
     terms: SeparableTerms
@@ -276,10 +250,10 @@ class Lacking:
 
 
 def best_term(terms: SeparableTerms) -> BestTerm:
-    """The one separable term that comes closest to the sum of ``terms``; its factors' sign is like the largest term's.
+    """Return the separable term that is closest to the sum of ``terms``, with the sign of the largest term.
 
-    The singular values of A are those of the product of two small triangles, from QR factorisations of the two sides:
-    Gram matrices would square the condition number and leave 1e-8 where the residual is zero.
+    The singular values follow from a product of two small triangles from QR factorisations. Gram matrices would square
+    the condition number and leave 1e-8 where the residual is zero.
     """
     values, split = _singular(terms)
     left, right = split(0)
@@ -290,17 +264,17 @@ def best_term(terms: SeparableTerms) -> BestTerm:
 
 
 def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacking:
-    """What factors that a session's stripes gave lack of the camera's operator.
+    """Return the part of an operator that factors estimated from a session's stripes lack.
 
-    Stripes give factors of an operator in closed form (:func:`_of_stripes`). Those of ``terms``, of pixels of one
-    brightness, tell by each column how bright its pixels were in the session, and so the operator as it was.
+    Stripes give factors of an operator in closed form (:func:`_of_stripes`). Comparing those of ``terms``, which assume
+    pixels of one brightness, with the found factors gives the brightness of each column in the session.
 
     Parameters
     ----------
     terms
-        the operator [(left (m, n), right (m', n')), ...].
+        The operator [(left (m, n), right (m', n')), ...].
     left, right
-        the factors (m, n) and (m', n'), centred as the terms are.
+        The factors (m, n) and (m', n'), centred like the terms.
     """
     whole = terms
     for _ in range(_TURNS):
@@ -316,9 +290,11 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
 
 
 def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
-    """The factors that stripes give of an operator (:mod:`mitsim.reconstruct.estimate_factors`): with its uniform
-    response sum_k (L_k 1) (R_k 1)^T split into a v^T, stripes h 1^T into u v^T with u = sum_k L_k h <R_k 1, v> / |v|^2,
-    so the left factor is the sum of L_k with these weights; and the right one likewise."""
+    """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.estimate_factors`).
+
+    The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with
+    u = sum_k L_k h <R_k 1, v> / |v|^2. So the left factor is the sum of L_k with these weights; the right one likewise.
+    """
     uniform = best_term([(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True)) for a, b in terms])
     split = uniform.left[:, 0], uniform.right[:, 0]
     return (
@@ -328,7 +304,6 @@ def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
 
 
 def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], SeparableTerm]]:
-    """Singular values of an operator, and what gives the term (of factors of equal norm) of the one of a number."""
     (left, small_left), (right, small_right) = (
         np.linalg.qr(np.stack([np.ravel(pair[side]) for pair in terms], axis=1)) for side in (0, 1)
     )
@@ -345,7 +320,7 @@ def _singular(terms: SeparableTerms) -> tuple[FloatArray, Callable[[int], Separa
 
 
 def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> float:
-    """||A - B|| / ||B|| of the operators of ``terms`` and ``reference``; rounding hides what is below 1e-7."""
+    """Return ||A - B|| / ||B|| of two operators; rounding hides values below 1e-7."""
     minus = [(-left, right) for left, right in reference]
     return float(np.sqrt(_energy([*terms, *minus]) / _energy(reference)))
 
@@ -356,6 +331,5 @@ def centre_terms(terms: SeparableTerms) -> SeparableTerms:
 
 
 def _energy(terms: SeparableTerms) -> float:
-    """Squared Frobenius norm, sum_kl <L_k, L_l> <R_k, R_l>."""
     left, right = (np.stack([np.ravel(pair[side]) for pair in terms]) for side in (0, 1))
     return max(float(((left @ left.T) * (right @ right.T)).sum()), 0.0)

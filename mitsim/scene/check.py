@@ -1,10 +1,9 @@
-"""A scene file in, the tree that Mitsuba's parser makes of it out, or a refusal: what Mitsuba would crash on, obey or
-silently accept.
+"""Checks of a scene file before Mitsuba makes objects of it.
 
-Making objects of a scene can run native code and read any file, and it takes NaN, negative light or a reflectance of 2
-without a word. So :mod:`mitsim.scene.outline` looks at the bytes, ``mitsuba.parser`` reads them (which loads no
-plugin and needs no variant), and what it read is checked here: ``limits`` knows the plugins and the
-numbers, ``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of that same tree.
+Making objects can run native code and read any file, and Mitsuba accepts NaN, negative light or a reflectance of 2
+without a word. Therefore :mod:`mitsim.scene.outline` checks the bytes, ``mitsuba.parser`` parses them (it loads no
+plugin and needs no variant), and the resulting tree is checked here: ``limits`` has the plugins and numbers,
+``headers`` the files. :func:`mitsim.scene.load.load_scene` makes objects of the same tree.
 """
 
 from __future__ import annotations
@@ -29,40 +28,53 @@ from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, SceneFiles, Ta
 _IMAGES = ("bitmap", "envmap")
 _READERS = (*_IMAGES, "ply", "obj")
 _LARGEST_MATERIAL = 256
-"""Objects of one BSDF: all of them are compiled into every kernel; shipped materials have up to 4."""
+"""Objects of one BSDF, because all of them are compiled into every kernel; shipped materials have up to 4."""
 _COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", "mitsim_grating", "regular")
-"""Plugins whose light or reflectance is one by wavelength, lies in a mesh that may hold colours, or turns with it."""
+"""Plugins whose light or reflectance may depend on wavelength."""
 _PARTING = "mitsim_glass"
-"""The material that bends each wavelength by an index of its own."""
+"""Material with a dispersive index."""
 _ON_SHAPES = ("area", "mitsim_projector")
-"""Emitters that are a shape's surface."""
+"""Emitters that are the surface of a shape."""
 _RIGID = ("mitsim_lensless", "mitsim_projector", "projector")
-"""What is turned and moved only."""
+"""Plugins that may only be rotated and moved."""
 _METALS = ("conductor", "roughconductor")
-"""Materials that are copper where nothing else is said."""
+"""Materials whose default is copper."""
 _PLACES = {
     "to_world": (("Transform",), "a <transform>"),
     **dict.fromkeys(("center", "p0", "p1", "position"), (("Vector",), "a <point>")),
     **dict.fromkeys(("radius", "scene_distance"), (("Float", "Integer"), "a <float>")),
     **dict.fromkeys(("face_normals", "flip_normals"), (("Bool",), "a <boolean>")),
 }
-"""What places and sizes are given by, which mitsim reads before Mitsuba does: types of the property, and its tag."""
+"""Property types and tags of positions and sizes that mitsim reads before Mitsuba does."""
 PREPARED = PICTURE, _ = "picture", "object"
-"""Parameters whose files mitsim prepares where a user names them."""
+"""Parameters whose files mitsim prepares if a user names them."""
 _Type = mi.Properties.Type
 
 
 @dataclass(frozen=True)
 class CheckedScene:
-    """A scene that Mitsuba may make objects of.
+    """A scene of which Mitsuba may make objects.
 
-    ``files`` lists what it reads, the scene first; ``limits`` what bitmaps and the attributes of meshes may hold, by
-    the name of the parameter, of the bitmap's file or of the attribute; ``unfit`` which estimators must refuse it;
-    ``shapes`` and ``small_lamps`` are the tags, in the scene's order, of its shapes and of its lamps that no path runs
-    into; ``coloured`` those of what may differ by wavelength, ``parting`` of glass that sends each its own way;
-    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``without_normals`` are names
-    of the meshes' files that give their vertices no normals; ``own`` are paths of files that a user names and mitsim
-    prepares, with their parameter; ``unread`` are names of materials that meshes refer to, by the mesh's path.
+    Attributes
+    ----------
+    files
+        Files that it reads, the scene first.
+    limits
+        Allowed ranges of bitmaps and mesh attributes, by name of parameter, file or attribute.
+    unfit
+        Estimators that must refuse the scene.
+    shapes, small_lamps
+        Tags of shapes, and of lamps that no path can hit, in the scene's order.
+    coloured, parting
+        Tags of objects that may depend on wavelength, and of dispersive glass.
+    samples
+        ``sample_count`` of the camera's sampler, or None.
+    without_normals
+        Names of mesh files without vertex normals.
+    own
+        Paths of files that a user names and mitsim prepares, with their parameters.
+    unread
+        Names of materials that meshes refer to, by path of the mesh.
     """
 
     outline: Outline
@@ -84,24 +96,23 @@ class CheckedScene:
 def check_file(
     path: Path, defines: Mapping[str, str], outside: bool = False, variant: str | None = None
 ) -> CheckedScene:
-    """Read a scene, and refuse it when it must not become objects or lacks a parameter named by ``defines``.
+    """Read and check a scene.
 
     Parameters
     ----------
     path
-        the scene's XML. What it includes, its bitmaps, meshes and spectra must lie in its folder.
+        Scene XML. Includes, bitmaps, meshes and spectra must be in its folder.
     defines
-        values of parameters by name, which replace those of ``<default>``.
+        Values of parameters by name, which replace those of ``<default>``.
     outside
-        allows files outside the scene's folder.
+        Allow files outside the scene's folder.
     variant
-        of Mitsuba, that objects will be made in; None: any.
+        Variant of Mitsuba in which objects will be made; None for any.
 
     Raises
     ------
     MitsimError
-        one line ``file:line: name: got VALUE in <tag ...>; what is allowed`` for content, or with the file alone where
-        no line is at fault.
+        ``file:line: name: got VALUE in <tag ...>; what is allowed``, or without a line if none is at fault.
     """
     files = SceneFiles(path, outside)
     outline = Outline(path, defines, files)
@@ -124,7 +135,7 @@ def check_file(
 
 @contextmanager
 def looking_beside(outline: Outline) -> Iterator[None]:
-    """Let Mitsuba find files from the folder of the scene of ``outline``; its errors become MitsimError of one line."""
+    """Let Mitsuba find files in the scene's folder; turn its errors into MitsimError of one line."""
     before = mi.file_resolver()
     beside = mi.FileResolver(before)
     beside.prepend(mi.filesystem.path(str(outline.path.parent)))
@@ -139,7 +150,7 @@ def looking_beside(outline: Outline) -> Iterator[None]:
 
 @dataclass
 class _Tree:
-    """Copies of the tree's nodes: Mitsuba takes a property that is read for one that is used."""
+    """Copies of the tree's nodes, because Mitsuba marks a property that is read as used."""
 
     outline: Outline
     files: SceneFiles
@@ -154,7 +165,6 @@ class _Tree:
     unread: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:
-        """MitsimError for the first object that a scene cannot have."""
         for node in self.nodes:
             tag, plugin = self.outline.tag(node), node.props.plugin_name()
             check_plugin(tag, plugin)
@@ -177,7 +187,6 @@ class _Tree:
         self._check_sizes()
 
     def tags_of(self, plugins: Sequence[str]) -> Iterator[Tag]:
-        """Tags of the root's own objects that are one of the ``plugins``."""
         for child in (self.nodes[index] for index in references(self.nodes[0].props)):
             if child.props.plugin_name() in plugins:
                 yield self.outline.tag(child)
@@ -222,7 +231,7 @@ class _Tree:
                 self.coloured.append(tag)
 
     def _check_texture(self, node: mi.parser.SceneNode, name: str, limit: Range) -> None:
-        """What a texture stands for keeps the limit of the parameter ``name`` that it is given for."""
+        """Apply the limits of the parameter ``name`` to the texture that is given for it."""
         plugin = node.props.plugin_name()
         if plugin in ("blackbody", "d65") and limit.high <= 1:
             raise self.outline.tag(node).refusal("type", repr(plugin), f"{name} is no light; give another texture")
@@ -236,7 +245,6 @@ class _Tree:
                 limit.check(self.outline.tag(node, key), name, self._numbers(node, key))
 
     def _check_resource(self, node: mi.parser.SceneNode) -> None:
-        """The file of a bitmap or mesh."""
         plugin, tag = node.props.plugin_name(), self.outline.tag(node, "filename")
         name = _text(node, "filename")
         if name is None:
@@ -280,11 +288,9 @@ class _Tree:
             raise MitsimError(head, *map(str, found)) from None
 
     def _check_sizes(self) -> None:
-        """What references unfold to is neither deep nor large."""
         known: dict[int, tuple[int, int]] = {}
 
         def unfold(index: int, depth: int) -> tuple[int, int]:
-            """Levels and objects from the node downwards, references followed."""
             node = self.nodes[index]
             if index not in known and depth <= DEEPEST:
                 parts = [unfold(below, depth + 1) for below in references(node.props)]
@@ -305,7 +311,6 @@ class _Tree:
         return self.nodes[node.props[name].index()]
 
     def _numbers(self, node: mi.parser.SceneNode, name: str) -> list[float]:
-        """Values of a number, point, colour, spectrum or list; wavelengths must rise from above 0."""
         if node.props.type(name) != _Type.Spectrum:
             try:
                 return [float(word) for word in _words(node, name)]
@@ -317,22 +322,18 @@ class _Tree:
 
 
 def _text(node: mi.parser.SceneNode, name: str) -> str | None:
-    """A property that is text; None when there is none, or an object in its place, which Mitsuba cannot give out."""
     return node.props[name] if name in node.props and node.props.type(name) == _Type.String else None
 
 
 def _is_plain(node: mi.parser.SceneNode) -> bool:
-    """Whether a metal reflects all wavelengths alike: by constants of its own, looked at as spectra, or as no metal."""
     return _text(node, "material") == "none" or ("material" not in node.props and "eta" in node.props)
 
 
 def _words(node: mi.parser.SceneNode, name: str) -> list[str]:
-    """A property's numbers as text, which needs no variant."""
     return re.findall(r"[^\s,\[\]\"]+", node.props.as_string(name))
 
 
 def _check_text(tag: Tag, plugin: str, name: str, value: str) -> None:
-    """Texts that Mitsuba makes file names of."""
     if name == "filename":
         if plugin not in _READERS:
             raise tag.refusal(name, repr(value), "only bitmap, envmap, ply and obj read a file")

@@ -1,7 +1,7 @@
-"""Why a scene is dark: a loaded scene in, the sentence out that says what keeps the projector's light from the camera.
+"""Explanation of a dark scene: the reason why light of the projector does not reach the camera.
 
-A few hundred rays go from the projector through its window, or, where they miss all, through the part of it that the
-scene lies in, and from what they meet to the sensor's centre; holes, filters and glass let them pass.
+A few hundred rays go from the projector through its window, or through the part of it that contains the scene, and
+from the points that they hit to the sensor's centre. Holes, filters and glass let them pass.
 """
 
 from __future__ import annotations
@@ -14,25 +14,19 @@ from mitsim.core.arrays import FloatArray
 from mitsim.scene.load import LoadedScene
 
 _RAYS = 24
-"""Rays a side: they meet anything larger than a 24th of the window."""
+"""Rays per side: they hit anything larger than a 24th of the window."""
 _FAR = 3.0
-"""Beyond so many times the aligned plane's distance, a scene is called too far: the window is three times as wide."""
+"""Multiple of the aligned plane's distance beyond which a scene counts as too far."""
 _SMALL = 1e-2
-"""Part of the aligned plane's distance below which a whole scene is taken for one in metres; theirs is 1e-3."""
+"""Part of the aligned plane's distance below which a scene is assumed to be in metres."""
 _MOST_SHAPES = 64
-"""Shapes that are aimed at one by one, where no ray at all of them together meets one: each takes milliseconds."""
+"""Shapes that are aimed at one by one; each takes milliseconds."""
 _MOST_PASSED = 16
 """Surfaces that a ray passes: eight panes of two faces."""
 
 
 def why_dark(loaded: LoadedScene) -> str:
-    """What is wrong with a scene of which the sensor sees nothing, and what to do.
-
-    Parameters
-    ----------
-    loaded
-        a scene with its projector.
-    """
+    """Return what is wrong with a scene of which the sensor sees nothing, and the remedy."""
     geometry, grid = loaded.camera.geometry, loaded.pixels
     to_world = loaded.camera.world_transform()
     projector_to_world = mi.traverse(loaded.projector)["to_world"]
@@ -90,8 +84,6 @@ _Edges = tuple[tuple[float, float], tuple[float, float]]
 
 
 def _part_with(box: mi.BoundingBox3f, loaded: LoadedScene, start: mi.Point3f) -> _Edges | None:
-    """The part of the window through which rays from ``start``, in the camera's frame, may meet a ``box``; None where
-    there is none."""
     distance = loaded.camera.geometry.scene_distance
     if not box.valid():
         return None
@@ -111,13 +103,11 @@ def _part_with(box: mi.BoundingBox3f, loaded: LoadedScene, start: mi.Point3f) ->
 
 
 def _corners(box: mi.BoundingBox3f, to_world: mi.Transform4f) -> FloatArray:
-    """(3, 8) corners of a ``box`` in the camera's frame."""
     corners = np.array([list(box.corner(i)) for i in range(8)]).T
     return np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1)
 
 
 def _meet_opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
-    """What rays meet that lets no light pass, before their ``target`` if there is one; panes are taken for thin."""
     si = scene.ray_intersect(ray)
     for _ in range(_MOST_PASSED):
         clear = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
@@ -130,8 +120,6 @@ def _meet_opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> m
 
 
 def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
-    """Where the scene lies, when no ray of the projector meets it; ``within`` tells whether the box of a shape lies in
-    the window."""
     distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
     if not box.valid():
         return "the scene has no surfaces; add a shape"

@@ -1,4 +1,4 @@
-"""What the files of a scene claim to hold, read before Mitsuba allocates it: images and meshes.
+"""Checks of images and meshes before Mitsuba allocates memory for them.
 
 Each function raises ValueError with a sentence that completes "the file ...", or OSError.
 """
@@ -22,38 +22,37 @@ from mitsim.core.errors import cut
 MOST_TEXELS = 1 << 25
 """An environment map of 8192 x 4096."""
 FARTHEST = 1e7
-"""Largest coordinate [mm], 10 km: single precision resolves 1 mm there."""
+"""Largest coordinate [mm]: single precision resolves 1 mm at 10 km."""
 _ORIENTATION = 274
-"""Tag of Exif (JEITA CP-3451, 4.6.4): how a picture is turned when it is shown; 1 is as stored."""
+"""Exif tag of the orientation (JEITA CP-3451, 4.6.4); 1 is as stored."""
 _HEADER = 1 << 16
-"""Bytes in which a header must end; those of meshes and Radiance pictures have some 500."""
+"""Bytes in which a header must end; usual ones have some 500."""
 _GREY = ("1", "L", "LA", "I", "I;16")
-"""What Pillow calls pictures without colours."""
+"""Pillow's modes of pictures without colours."""
 _PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-"""NumPy's name of each type in a header."""
+"""NumPy's type for each type in a header."""
 _CORNERS, _INDICES = "corner count", "corner indices"
-"""A triangle's list as fields of an array: names with a blank, which no property has."""
+"""Field names of a triangle's list; no property has a blank in its name."""
 _LINE = re.compile(
     rb"f\s+(?P<face>(?:[1-9][0-9]{0,8}(?:/[0-9]{0,9}){0,2}(?:\s+|$)){3,})(?:#.*)?|"
     rb"v\s+(?P<vertex>\S+\s+\S+\s+\S+)(?:\s[^\r]*)?|(?P<normal>vn)\s[^\r]*|(?:mtllib|usemtl)\s+(?P<material>[^\r]*)|#[^\r]*|"
     rb"(?:g|l|o|p|s|vt|bevel|[cd]_interp|lod|maplib|mg|shadow_obj|trace_obj|usemap)(?:\s[^\r]*)?|"
 )
-"""Lines of Wavefront files that are read, or do not change a mesh: faces of three or more corners, each the number of a
-vertex, of its place in textures and of its normal; but no free-form surfaces (Wavefront, "Object Files")."""
+"""Lines of Wavefront files that are read or ignored; free-form surfaces are refused (Wavefront, "Object Files")."""
 _TURNED, _BENT = 1e-3, 1e-2
-"""Part of a face's area by which one of its triangles may be turned over (coordinates are rounded), and by which the
-triangles may exceed the face: 16 degrees between two of them."""
+"""Part of a face's area by which one of its triangles may be turned over, because coordinates are rounded, and by which
+the triangles may exceed the face: 16 degrees between two of them.
+"""
 _MOST_TEXT = 64 << 20
-"""Chosen so that its words, some ten million Python objects, stay below 1 GiB."""
+"""Bytes of a text whose words, some ten million Python objects, stay below 1 GiB."""
 
 
 def check_image(path: Path) -> tuple[int, bool]:
-    """Number of texels of the PNG, JPEG, OpenEXR, Radiance (.hdr) or PFM image at ``path``, and whether its header says
-    that it has no colours."""
+    """Return the number of texels of a PNG, JPEG, OpenEXR, Radiance or PFM image, and True if it has no colours."""
     with open(path, "rb") as file:
         start = file.read(_HEADER)
     if start.startswith(exr.MAGIC):
@@ -77,10 +76,14 @@ def check_image(path: Path) -> tuple[int, bool]:
 
 
 def check_ply(path: Path) -> tuple[bool, str]:
-    """Refuse ``path`` unless it is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
+    """Check that ``path`` is a PLY mesh of triangles whose corners exist and lie within ``FARTHEST``.
 
-    Mitsuba would read beyond its arrays. Elements and properties beside those of triangles may be there, in any order.
-    Returns whether its vertices have normals, and the name of the texture that it refers to, "" without.
+    Mitsuba would read beyond its arrays. Further elements and properties are allowed in any order.
+
+    Returns
+    -------
+    tuple
+        True if vertices have normals, and the name of the texture, "" without.
     """
     with open(path, "rb") as file:
         start = file.read(_HEADER)
@@ -102,14 +105,15 @@ def check_ply(path: Path) -> tuple[bool, str]:
 
 
 def check_obj(path: Path) -> tuple[bool, str]:
-    """Refuse ``path`` unless it is a Wavefront mesh that Mitsuba reads as it is meant, of vertices within ``FARTHEST``.
+    """Check that ``path`` is a Wavefront mesh that Mitsuba reads correctly, with vertices within ``FARTHEST``.
 
-    Mitsuba drops what follows a backslash at the end of a line, faces that it cannot read, and free-form surfaces; and
-    it covers every face by a fan of triangles from its first corner, which overlap where the face is concave.
+    Mitsuba drops continued lines, faces that it cannot read, and free-form surfaces. It covers every face by a fan of
+    triangles from its first corner, which overlap where the face is concave.
 
     Returns
     -------
-    whether any vertices have normals, and the name of the materials that it refers to, "" without.
+    tuple
+        True if any vertices have normals, and the name of the materials, "" without.
     """
     if path.stat().st_size > _MOST_TEXT:
         raise ValueError(f"is a text of over {_MOST_TEXT >> 20} MiB; export it as binary PLY")
@@ -160,8 +164,6 @@ def _check_points(points: npt.NDArray[np.float64]) -> None:
 
 
 def _pillow_size(path: Path, start: bytes) -> tuple[tuple[int, int], bool]:
-    """Width and height in the header of a PNG or JPEG file, of which what is stored is what is seen, and whether it has
-    no colours. Not by ``PIL.Image.open``, which warns of large images."""
     from PIL.Image import Exif
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
@@ -200,14 +202,12 @@ _Mesh = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class _Element:
-    """An element of a PLY file: how many there are, and its properties: name and type, of the list of a triangle's
-    corners the types of its length and of its items."""
+    """An element of a PLY file: number and properties (name and type; two types for the list of corners)."""
 
     count: int
     properties: list[tuple[str, str]]
 
     def dtype(self, order: str) -> np.dtype[np.void]:
-        """Of one of them in a binary file of that byte ``order``, its list three items long."""
         fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for name, kind in self.properties:
             if " " in kind:
@@ -218,26 +218,22 @@ class _Element:
         return np.dtype(fields)
 
     def column(self, name: str) -> int:
-        """Words before the property ``name`` in one of them."""
         before = self.properties[: [other for other, _ in self.properties].index(name)]
         return len(before) + 3 * any(" " in kind for _, kind in before)
 
     @property
     def words(self) -> int:
-        """Of one of them in a text."""
         return len(self.properties) + 3 * any(" " in kind for _, kind in self.properties)
 
     @property
     def lists(self) -> list[str]:
-        """Names of its lists."""
         return [name for name, kind in self.properties if " " in kind]
 
 
 def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
-    """Byte order (None: text), and the elements in their order, as the header says.
+    """Return the byte order (None for text) and the elements in order.
 
-    Refused is what Mitsuba would not load, or not as it is meant: whole numbers as coordinates, which it divides by
-    their type's largest.
+    Whole numbers as coordinates are refused because Mitsuba divides them by the largest of their type.
     """
     order: str | None = ""
     parts: dict[str, _Element] = {}
@@ -280,14 +276,12 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:
 
 
 def _check_claim(parts: Mapping[str, _Element], claimed: int, held: int, what: str) -> None:
-    """Refuse a body that ends before what its header claims, in words or bytes."""
     if claimed > held:
         counts = f"{parts['vertex'].count} vertices and {parts['face'].count} triangles"
         raise ValueError(f"claims {counts}, more than its {what} hold{'s' * (what == 'text')}; export the mesh again")
 
 
 def _check_triangles(corners: npt.NDArray[Any], more: int) -> None:
-    """Refuse faces of other than three ``corners``, and what a body holds beyond its header's claim."""
     if (corners != 3).any():
         raise ValueError("has faces that are no triangles; export triangles")
     if more:

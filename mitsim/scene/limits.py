@@ -1,4 +1,4 @@
-"""Numbers that a scene can have: finite, of a sensible size, and no more light out of a surface than into it."""
+"""Limits of a scene: finite numbers of sensible size, reflectances up to 1, allowed plugins, and unfit estimators."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from mitsim.scene.outline import Outline
 
 _LARGEST = 1e20
-"""Squared, still far from the end of single precision (3.4e38) in which Mitsuba calculates."""
+"""Largest number: its square is far from the end of single precision (3.4e38)."""
 _RIGID = 1e-4
-"""Above the 2e-5 by which a matrix that is written with five digits departs from a rotation."""
+"""Tolerance of a rotation: a matrix with five digits departs by 2e-5."""
 _SMALLEST_SIZE = 1e-9
-"""Of what a transform stretches, in mm: far below any light's wavelength, and 1 / its cube is still finite."""
+"""Smallest scale of a transform [mm]: below any wavelength, and 1 / its cube is still finite."""
 _MOST_UNEVEN = 1e7
-"""Single precision has seven digits: a transform that stretches one side so much more cannot be undone."""
+"""Largest ratio of scales, because single precision has seven digits."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from ``low`` to ``high``; ``above`` and ``below`` leave out the bounds themselves."""
+    """Numbers from ``low`` to ``high``; ``above`` and ``below`` exclude the bounds."""
 
     low: float
     high: float
@@ -40,15 +40,7 @@ class Range:
     hint: str = ""
 
     def check(self, tag: Tag, name: str, numbers: Iterable[float]) -> None:
-        """MitsimError for the first number that is not allowed.
-
-        Parameters
-        ----------
-        tag, name
-            where it stands, and what it is called.
-        numbers
-            in order.
-        """
+        """Raise MitsimError for the first of the ``numbers`` that is not allowed."""
         for number in numbers:
             if not np.isfinite(number):
                 raise tag.refusal(name, number, "give a finite number")
@@ -59,7 +51,6 @@ class Range:
 
 
 def _of_camera(field: str) -> Range:
-    """What the camera allows."""
     bounds = {
         kind: getattr(bound, kind)
         for bound in CameraGeometry.model_fields[field].metadata
@@ -73,9 +64,9 @@ ANY = Range(-_LARGEST, _LARGEST)
 LIGHT = Range(0, _LARGEST, hint=", light is at least 0")
 REFLECTED = Range(0, 1, hint=": light is at least 0, and nothing reflects more than 1")
 WHOLE = Range(-1e9, 1e9)
-"""Mitsuba stores whole numbers of 32 bits."""
+"""Whole numbers of 32 bits."""
 WAVELENGTH = Range(0, 1e6, above=True)
-"""In nm, to a millimetre."""
+"""Wavelengths in nm, up to a millimetre."""
 COORDINATE = Range(-FARTHEST, FARTHEST)
 _PART = Range(0, 1)
 _ANGLE = Range(0, 180, above=True, below=True)
@@ -86,7 +77,7 @@ REFLECTANCES = (
     *("reflectance", "diffuse_reflectance", "albedo", "base_color"),
     *("specular_reflectance", "specular_transmittance", "transmittance"),
 )
-"""Parameters that are the part of light that a surface sends on."""
+"""Parameters that state the reflected or transmitted part of light."""
 LIMITS = {
     **dict.fromkeys(REFLECTANCES, REFLECTED),
     **dict.fromkeys(("radiance", "irradiance", "intensity", "scale", "sigma_t", "sigma_a"), LIGHT),
@@ -115,23 +106,13 @@ LIMITS = {
     **dict.fromkeys(("pixel_pitch", "row_pitch", "mask_feature"), Range(1e-4, FARTHEST, hint=_METRES)),
     "scene_distance": Range(1, FARTHEST, hint=_METRES),
 }
-"""What a number may be, by the name of the parameter, whatever plugin has it; those of the camera it checks itself."""
+"""Allowed range by name of the parameter, for any plugin; the camera checks its own."""
 TABLES = ("value", "values", "color", "color0", "color1", "scale")
-"""Numbers by which a texture without a file says how much light it stands for."""
+"""Numbers by which a texture without a file states its light."""
 
 
 def check_transform(tag: Tag, name: str, matrix: npt.NDArray[np.float64], rigid: bool) -> None:
-    """MitsimError for a transform that cannot be undone.
-
-    Parameters
-    ----------
-    tag, name
-        where it stands, and what it is called.
-    matrix
-        (4, 4).
-    rigid
-        whether it may only turn and move.
-    """
+    """Raise MitsimError if a (4, 4) ``matrix`` cannot be inverted, or if it is not rigid although it must be."""
     if not np.isfinite(matrix).all():
         raise tag.refusal(name, np.nan, "give finite numbers")
     turn = matrix[:3, :3]
@@ -169,7 +150,7 @@ PLUGINS = {
     "texture": _TEXTURES,
     "volume": "constvolume",
 }
-"""Plugins by tag, beside ``<scene>``."""
+"""Allowed plugins by tag, beside ``<scene>``."""
 _SPECTRAL_ALONE = "only spectral variants have it; use --variant {spectral}, or --colour lines or mosaic"
 _LACKED = {
     "blackbody": _SPECTRAL_ALONE,
@@ -177,18 +158,17 @@ _LACKED = {
     "regular": f'{_SPECTRAL_ALONE}, or write the table as value="400:0.2, 700:0.5"',
     "specfilm": "only spectral variants have it; use hdrfilm",
 }
-"""Plugins of Mitsuba 3.9.1 that its variants without wavelengths lack, and what to do. Textures are loaded there, and
-end the run when light meets them."""
+"""Plugins of Mitsuba 3.9.1 that variants without wavelengths lack, and the remedy."""
 
 
 def references(props: mi.Properties) -> list[int]:
-    """Numbers of the nodes that an object's ``props`` refer to."""
+    """Return the indices of the nodes to which an object's ``props`` refer."""
     resolved = mi.Properties.Type.ResolvedReference
     return [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118 - no dict
 
 
 def check_plugin(tag: Tag, plugin: str) -> None:
-    """MitsimError when the object at ``tag`` cannot be a ``plugin``."""
+    """Raise MitsimError if the object at ``tag`` cannot be a ``plugin``."""
     allowed = PLUGINS.get(tag.name, "scene").split()
     if plugin not in allowed or (tag.name == "scene" and "version" not in tag.attributes):
         raise tag.refusal(
@@ -197,17 +177,7 @@ def check_plugin(tag: Tag, plugin: str) -> None:
 
 
 def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) -> None:
-    """MitsimError when a Mitsuba ``variant`` lacks the ``plugin`` at ``tag``, or what it needs of it.
-
-    Parameters
-    ----------
-    tag, plugin
-        the object.
-    given
-        names of its properties.
-    variant
-        of Mitsuba.
-    """
+    """Raise MitsimError if a ``variant`` lacks the ``plugin`` at ``tag``, or properties that it needs."""
     backend, _, kind = variant.rpartition("_")
     if plugin in _LACKED and kind != "spectral":
         rule = f"{variant} lacks it: {_LACKED[plugin].format(spectral=f'{backend}_spectral')}"
@@ -226,34 +196,34 @@ def check_variant(tag: Tag, plugin: str, given: Container[str], variant: str) ->
 # they connect a surface to a lamp or projector, and lose that light without a word.
 
 STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric")
-"""Materials that let light straight on."""
+"""Materials that let light pass straight on."""
 BUMPS = ("bumpmap", "normalmap")
-"""Materials that turn another's frame, and do not tell which light it lets straight on."""
+"""Materials that change the frame of another one and hide which light it lets pass."""
 DIRECTED = (*BUMPS, "hair", "principledthin")
-"""All materials that are not reciprocal."""
+"""Materials that are not reciprocal."""
 CHOICES = ("blendbsdf", "mask", "twosided")
-"""Materials that choose one of two others."""
+"""Materials that choose between two others."""
 MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
-"""Materials that reflect or bend light into single directions."""
+"""Materials that reflect or refract into single directions."""
 _TURNING, _ALONG = (*BUMPS, "hair", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
-"""Materials that differ along the surface, and parameters that make others do so."""
+"""Materials that vary with direction along the surface, and parameters that make others do so."""
 SMALL_LAMPS = ("directional", "point", "spot")
-"""Lamps that no path runs into."""
+"""Lamps that no path can hit."""
 _VOLUMETRIC = ("volpath", "volpathmis")
 
 
 @dataclass(frozen=True)
 class Unfit:
-    """Why each estimator refuses a scene, and which light it loses of a scene that it takes. None: no refusal, no loss.
+    """Reasons why estimators refuse a scene, and light that they lose in a scene that they accept; None for neither.
 
     Attributes
     ----------
     factored, reference
-        the refusal of each estimator.
+        Refusal of each estimator.
     caustics
-        what the reference loses: light that mirrors or glass bring to surfaces from what no path runs into.
+        Loss of the reference: light from lamps that no path can hit, over mirrors or glass to surfaces.
     lamps, instances
-        what the factored estimator loses: the same of lamps, and light over mirrors or glass inside of instances.
+        Losses of the factored estimator: the same for lamps, and light over mirrors or glass inside instances.
     """
 
     factored: MitsimError | None = None
@@ -264,7 +234,7 @@ class Unfit:
 
     @classmethod
     def of(cls, outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
-        """What is known from the ``nodes`` of a scene, the root first, whose tags the ``outline`` has."""
+        """Determine the reasons from the ``nodes`` of a scene, the root first, whose tags are in ``outline``."""
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
         if medium is None:
@@ -287,7 +257,6 @@ class Unfit:
 
 
 def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estimator: str) -> str | None:
-    """What an ``estimator`` loses where one of the ``lights`` shines on a mirror."""
     mirror = next(tree.to(MIRRORS), None)
     light = next((node for node in tree.nodes if node.props.plugin_name() in lights), None)
     if mirror is None or light is None:
@@ -301,7 +270,7 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
 
 
 def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
-    """The refusal of a projector whose picture blends its texels: the factored estimator takes pixels for even."""
+    """Return the refusal of a projector whose picture blends its texels, because pixels are assumed to be even."""
     for node in tree.nodes:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
         if picture is None or picture.props.plugin_name() != "bitmap":
@@ -344,7 +313,7 @@ def _in_instances(outline: Outline, tree: _References) -> str | None:
 
 
 def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a material inside of bumps that these hide from connections, or turn the wrong way."""
+    """Return the refusal of a material under bumps that Mitsuba treats as opaque or turns about the normal."""
     for node, name in tree.to(BUMPS):
         bumps = tree.nodes[node.props[name].index()]
         what = str(bumps.props.plugin_name())
@@ -369,8 +338,6 @@ def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:
 def _lost_by_integrator(
     outline: Outline, tree: _References, cause: tuple[mi.parser.SceneNode, str] | None
 ) -> MitsimError | None:
-    """The refusal of an integrator that has no paths from the camera, or that loses light at the ``cause``, a node and
-    the name of its property."""
     found = (node for node in tree.nodes if node.props.plugin_name() in PLUGINS["integrator"].split())
     integrator = next(found, None)
     plugin = integrator.props.plugin_name() if integrator is not None else "path"  # Mitsuba's own default
@@ -386,14 +353,14 @@ def _lost_by_integrator(
 
 @dataclass(frozen=True)
 class _References:
-    """The tree's nodes, and what they refer to."""
+    """The nodes of a tree and their references."""
 
     nodes: Sequence[mi.parser.SceneNode]
 
     def to(self, plugins: Sequence[str]) -> Iterator[tuple[mi.parser.SceneNode, str]]:
-        """Nodes, and names of their properties, that refer to one of the ``plugins``.
+        """Yield nodes, and names of their properties, that refer to one of the ``plugins``.
 
-        Neither the scene nor a material that no shape has: they only list.
+        The scene and materials without a shape are ignored because they only list.
         """
         materials = PLUGINS["bsdf"].split()
         users = [node for node in self.nodes[1:] if node.props.plugin_name() not in materials]
@@ -404,19 +371,16 @@ class _References:
                     yield node, name
 
     def below(self, node: mi.parser.SceneNode, plugins: Sequence[str]) -> Iterator[mi.parser.SceneNode]:
-        """Nodes of one of the ``plugins`` that a ``node`` refers to, itself or by others."""
         for other in (self.nodes[index] for index in references(node.props)):
             if other.props.plugin_name() in plugins:
                 yield other
             yield from self.below(other, plugins)
 
     def child(self, node: mi.parser.SceneNode, name: str) -> mi.parser.SceneNode | None:
-        """What the property refers to; None unless there is one, and an object."""
         if name not in node.props or node.props.type(name) != mi.Properties.Type.ResolvedReference:
             return None
         return self.nodes[node.props[name].index()]
 
     def plugin(self, node: mi.parser.SceneNode, name: str) -> str:
-        """The plugin that the property refers to; nothing unless it is an object."""
         child = self.child(node, name)
         return "" if child is None else str(child.props.plugin_name())

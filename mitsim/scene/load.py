@@ -1,4 +1,4 @@
-"""From a scene file to a loaded Mitsuba scene with its camera geometry and its projector grid, or one clear refusal."""
+"""Loading a scene file: a Mitsuba scene with its camera geometry and projector grid, or a refusal in one line."""
 
 from __future__ import annotations
 
@@ -29,28 +29,45 @@ if TYPE_CHECKING:
 
 SENSOR_PLUGIN = "mitsim_lensless"
 _SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
-"""Mitsuba's classes of the lamps that no path runs into."""
+"""Mitsuba's classes of lamps that no path can hit."""
 _FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
-"""Mitsuba's classes of shapes that have one normal, and by how much normals of parallel ones differ: single precision
-rounds turned ones to 1e-7, and of surfaces that are turned by 1e-6 one sees 1e-12 of the other's light."""
+"""Mitsuba's flat shapes, and the difference between normals that counts as parallel: single precision makes 1e-7."""
 
 
 @dataclass(frozen=True)
 class LoadedScene:
     """A scene ready for transport.
 
-    ``camera`` is the Mitsuba sensor (it carries ``geometry``), ``projector`` the emitter and ``grid`` the projector's
-    pixels; both are None only when the file was opened for ``render``, which needs no projector. ``lamps`` are all
-    other emitters; ``mirrors`` tells whether a surface reflects or bends light into single directions, ``glossy``
-    whether one sends it into lobes. ``files`` lists all that Mitsuba read, the scene first; ``unfit`` says which
-    estimators must refuse it; ``shapes`` are the tags of ``scene.shapes()``, in that order, or none where one tag gave
-    several; ``small_lamps`` are lamps that no path runs into, with their tags; ``coloured`` are tags of what may
-    differ by wavelength, none of a scene in greys, ``parting`` of glass that sends each wavelength its own way;
-    ``samples`` is the ``sample_count`` of the camera's sampler, None where it has none; ``notes`` say what was changed
-    of the scene to render it rightly; ``one_way`` tells that no surface sees another, as all are flat and turn the only
-    side that reflects the same way; ``sensor_note`` says how a camera file's sensor differs from the scene's, None
-    where the scene's counts; ``own`` are the parameters of files that the user named, by their paths; ``in_view``
-    tells that a projector shines on the sensor itself, over no surface: such light is traced as that of mirrors.
+    Attributes
+    ----------
+    files
+        All files that Mitsuba read, the scene first.
+    camera, projector, grid
+        Mitsuba sensor (with ``geometry``), emitter and projector pixels; the last two are None only for ``render``.
+    lamps
+        All other emitters.
+    mirrors, glossy
+        True if a surface reflects or refracts into single directions, or into lobes.
+    unfit
+        Estimators that must refuse the scene, with reasons.
+    shapes
+        Tags of ``scene.shapes()`` in that order; empty if one tag gave several shapes.
+    small_lamps
+        Lamps that no path can hit, with their tags.
+    coloured, parting
+        Tags of objects that may depend on wavelength, and of dispersive glass.
+    samples
+        ``sample_count`` of the camera's sampler, or None.
+    notes
+        Changes that were made to the scene to render it correctly.
+    one_way
+        True if no surface sees another, because all are flat, reflect on one side and face the same way.
+    sensor_note
+        Difference between the sensor of a camera file and the scene's; None if the scene's is used.
+    own
+        Parameters whose files the user named, by path.
+    in_view
+        True if a projector shines directly on the sensor; such light is traced like that of mirrors.
     """
 
     path: Path
@@ -76,7 +93,7 @@ class LoadedScene:
 
     @property
     def pixels(self) -> ProjectorGrid:
-        """The projector's grid; of a scene without one, MitsimError says why."""
+        """Return the projector's grid; raise MitsimError with the reason if there is none."""
         return self.grid or locate_projector(str(self.path), _only_projector(self.path, self.scene), self.camera)
 
     @cached_property
@@ -86,7 +103,7 @@ class LoadedScene:
 
     @cached_property
     def smoothed(self) -> bool:
-        """Whether a surface has shading normals that are not its own; what an instance hides may have."""
+        """Return True if a surface has shading normals that differ from its own, or an instance may hide one."""
         return any(_is_smoothed(shape) for shape in self.scene.shapes())
 
 
@@ -103,20 +120,20 @@ def load_scene(
     Parameters
     ----------
     path
-        the scene's XML.
+        Scene XML.
     defines
-        values of its parameters by name.
+        Values of its parameters by name.
     needs_projector
-        refuse a scene without exactly one projector, or one that the factored estimator cannot render.
+        Refuse a scene without exactly one projector, or one that the factored estimator cannot render.
     outside
-        allow files outside the scene's folder.
+        Allow files outside the scene's folder.
     sensor
-        whose pitch and format count; None: the scene's.
+        Sensor whose pitch and format replace the scene's; None keeps them.
 
     Raises
     ------
     MitsimError
-        one line that names the file for anything wrong with it.
+        One line that names the file, for any fault.
     """
     checked = check_file(path, defines or {}, outside, mi.variant())
     if needs_projector and checked.unfit.factored is not None:
@@ -182,7 +199,6 @@ def _projectors(scene: mi.Scene) -> list[mi.Emitter]:
 
 
 def _only_projector(path: Path, scene: mi.Scene) -> mi.Emitter:
-    """The projector of a ``scene``; MitsimError, with its ``path``, where there is not exactly one."""
     found = _projectors(scene)
     if len(found) != 1:
         raise MitsimError(f"{path}: needs one emitter of type projector, the file has {len(found) or 'none'}")
@@ -190,10 +206,6 @@ def _only_projector(path: Path, scene: mi.Scene) -> mi.Emitter:
 
 
 def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
-    """Whether a surface of the scene is a mirror or bends light, and whether one has a glossy component.
-
-    An instance hides its materials: what is glossy there is looked for by rays, so it may be.
-    """
     flags = [shape.bsdf().flags() for shape in scene.shapes() if shape.bsdf()]
     mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     mirrors = any(own & mirror for own in flags) or unfit.instances is not None
@@ -208,7 +220,6 @@ def holds_hair(flags: Any) -> Any:
 
 
 def _faces_one_way(scene: mi.Scene) -> bool:
-    """Whether no surface of the ``scene`` can see the side of another that reflects."""
     normals = list[npt.NDArray[np.generic]]()
     for shape in scene.shapes():
         bsdf = shape.bsdf()
@@ -225,7 +236,6 @@ _PARALLEL = 0.9999
 
 
 def _is_smoothed(shape: mi.Shape) -> bool:
-    """Whether a ``shape`` has shading normals that are not its own."""
     if not shape.is_mesh() or not shape.has_vertex_normals():
         return shape.class_name() in _SMOOTH_BY_CLASS
     # Rectangles and cubes are meshes that tell no parameters of one.
@@ -247,14 +257,14 @@ _ROUNDING = 1e-5
 
 
 _WHOLE = 2.0**40
-"""Whole numbers of a normal of length 1: as fine as 32 bits need, and a vertex may have a million faces."""
+"""Whole number for a normal of length 1: fine enough for 32 bits, and a vertex may have a million faces."""
 
 
 def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
-    """Give meshes of files ``without_normals`` the same at every loading, in any number of threads and on a GPU.
+    """Compute vertex normals of meshes without normals such that every load gives the same bits.
 
-    Mitsuba adds them up over the faces in 32 bits, in the order in which threads come to them. Of shapes that are
-    merged, some with normals of their own, all stay as they are.
+    Mitsuba adds them up over faces in 32 bits, in the order of its threads. Merged shapes of which some have normals of
+    their own stay as they are.
     """
     parameters = mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict
@@ -267,10 +277,10 @@ def _add_up_normals(scene: mi.Scene, without_normals: frozenset[str]) -> None:
 
 
 def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
-    """Of each vertex: those of its faces, by the angles that they have there.
+    """Return vertex normals weighted by the angles of the faces (Thuermer and Wuethrich 1998, as in Mitsuba).
 
-    Thuermer and Wuethrich 1998, as in Mitsuba, but in whole numbers, whose sums in any order are the same. Where the
-    sum is 0, as on a sheet that is folded on itself, that of Mitsuba for a vertex without faces.
+    The sums are whole numbers, whose order does not matter. A zero sum gives Mitsuba's normal for a vertex without
+    faces.
     """
     corners = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
     points = [mesh.vertex_position(corner) for corner in corners]
@@ -288,21 +298,21 @@ def _vertex_normals(mesh: mi.Mesh) -> mi.Normal3f:
 
 
 def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> None:
-    """Refuse a scene with a bitmap or mesh of impossible light or reflectance, or of numbers that are not finite.
+    """Refuse bitmaps and meshes with impossible light or reflectance, or numbers that are not finite.
 
     Parameters
     ----------
     path
-        the scene's XML, for the message.
+        Scene XML, for the message.
     scene
-        what Mitsuba loaded from it.
+        The loaded scene.
     limits
-        what the texels of a bitmap and the numbers of a mesh may be, by the name of what they are used for.
+        Allowed ranges by the name of the use.
 
     Raises
     ------
     MitsimError
-        one line with the bitmap's file name or the mesh, the texel or number and its value.
+        One line with the file or mesh, the texel and its value.
     """
     parameters = mi.traverse(scene)
     for key in parameters.keys():  # noqa: SIM118 - SceneParameters is no dict

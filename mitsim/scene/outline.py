@@ -1,12 +1,12 @@
-"""A scene's bytes in; the place of every tag out, or a refusal of what Mitsuba's parser must not be given.
+"""Positions of all tags of a scene file, and refusals of content that Mitsuba's parser must not receive.
 
-Mitsuba's parser reads the scene (:mod:`mitsim.scene.check`). Left to this module is what that does not do
-(names of cases in tests/hard/hostile/): it calls itself for each level, until its stack overflows ("depth of
-100000"). It opens what ``<include>`` and ``<spectrum>`` name while it reads, a pipe or a file outside too ("included
-pipe", "include above"), and each include again ("million includes"); ``<path>`` lets it find native code. It reads
-``$albedo2`` as the value of ``$albedo`` and a 2 ("longer name with a known beginning"), an empty number as 0 ("empty
-number"), and a matrix without its last row ("last row"). Of two objects of one name it takes the second ("name
-twice"). It knows the lines of objects, not those of their numbers.
+Mitsuba's parser (:mod:`mitsim.scene.check`) has faults that this module prevents (names of cases in
+tests/hard/hostile/): it recurses until its stack overflows ("depth of 100000"); it opens what ``<include>`` and
+``<spectrum>`` name while it reads, even a pipe or a file outside ("included pipe", "include above"), and each include
+again ("million includes"); ``<path>`` lets it find native code. It reads ``$albedo2`` as ``$albedo`` followed by 2
+("longer name with a known beginning"), an empty number as 0 ("empty number"), and a matrix without its last row ("last
+row"). Of two objects with one name it takes the second ("name twice"). It knows the lines of objects, but not those of
+their numbers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 
 DEEPEST = 16
-"""Elements inside elements, references followed: shipped scenes have 5; Mitsuba's stack ends below 10 000."""
+"""Nesting with references followed: shipped scenes have 5, and Mitsuba's stack ends below 10 000."""
 MOST_ELEMENTS = 10_000
-"""A hundred times the largest shipped scene; they are read and checked in 0.2 s."""
+"""A hundred times the largest shipped scene; they are checked in 0.2 s."""
 _MOST_INCLUDES = 64
-"""Files that one scene is spread over; each is opened and read anew."""
+"""Files of one scene, each of which is opened and read anew."""
 _DEEPEST_INCLUDE = 8
 """Below the 15 at which Mitsuba's parser ends."""
 _MOST_BYTES = 4 << 20
@@ -45,7 +45,7 @@ _NUMBERS = (*_TRIPLES, "float", "integer", "lookat", "matrix", "rgb")
 
 @dataclass(frozen=True)
 class Tag:
-    """One tag as it is written in a file."""
+    """One tag as written in a file."""
 
     path: Path
     line: int
@@ -57,45 +57,33 @@ class Tag:
         return f"<{cut(self.name + written, 200)}>"
 
     def refusal(self, what: str, value: object, rule: str) -> MitsimError:
-        """``file:line: what: got value in <tag ...>; rule``, to be raised.
-
-        Parameters
-        ----------
-        what, value
-            what is wrong, and what was given.
-        rule
-            what is allowed, and what to do.
-        """
+        """Return ``file:line: what: got value in <tag ...>; rule`` as an error to raise."""
         got = cut(value if isinstance(value, str) else f"{value:g}")
         return MitsimError(f"{self.path}:{self.line}: {cut(what)}: got {got} in {self}; {rule}")
 
 
 class Outline:
-    """Where the tags of a scene and of all that it includes stand.
+    """Positions of the tags of a scene and of its includes.
 
     Parameters
     ----------
     path
-        the scene's XML.
+        Scene XML.
     defines
-        values of parameters by name, which come before those of ``<default>``.
+        Values of parameters by name, which precede those of ``<default>``; files become absolute paths.
     files
-        what the scene may read; takes a note of what is included.
+        Files that the scene may read; records includes.
 
     Raises
     ------
     MitsimError
-        for what is no well-formed scene XML, too large or nested too deep, for files that ``files`` does not allow,
-        and for parameters that are missing, unknown or not plain.
+        If the XML is not well formed, too large or nested too deep, names files that are not allowed, or has parameters
+        that are missing, unknown or not plain.
 
     Attributes
     ----------
-    path
-        the scene's XML.
-    defines
-        values of parameters by name, where they are files by their whole paths.
     projected
-        files that objects inside its projectors name.
+        Files that objects inside its projectors name.
     """
 
     def __init__(self, path: Path, defines: Mapping[str, str], files: SceneFiles) -> None:
@@ -127,12 +115,12 @@ class Outline:
             raise MitsimError(f"{path}: {len(unknown)} parameters are unknown; it knows {known}:", *unknown)
 
     def tag(self, node: mi.parser.SceneNode, name: str = "") -> Tag:
-        """The tag of the object ``node``, or that of its property ``name``."""
+        """Return the tag of the object ``node``, or of its property ``name``."""
         key = node.file_index, node.offset
         return self._tags.get((*key, name)) or self._tags[(*key, "")]
 
     def refusal(self, error: BaseException) -> MitsimError:
-        """One line for an ``error`` of Mitsuba's, with the last place that it names."""
+        """Return one line for an ``error`` of Mitsuba, with the last place that it names."""
         message = one_line(error)
         places = [*re.finditer(r"(?:[Ww]hile loading|At) (\S.*?) \(line (\d+), col (\d+)\): ", message)]
         if not places:
@@ -142,7 +130,6 @@ class Outline:
         return MitsimError(f"{file}:{line}: Mitsuba refuses {what}: {message[places[-1].end() :]}")
 
     def _read(self, path: Path, beside: Path, above: tuple[Path, ...]) -> None:
-        """One file and what it includes; Mitsuba looks for the spectra of a file from ``beside``, its includer."""
         content = _content(path)
         file, self._opened = self._opened, self._opened + 1
         parser = expat.ParserCreate()
@@ -213,14 +200,12 @@ class Outline:
             raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
 
     def _name_file(self, tag: Tag) -> None:
-        """Where the file is that a user gave for the parameter that a ``tag`` is, if it is one."""
         value = tag.attributes.get("value", "")
         if value.startswith("$") and value[1:] in self._given:
             path = str(self._files.find_named(value[1:], self._given[value[1:]]))
             self.defines[value[1:]] = self._values[value[1:]] = path
 
     def _with_parameters(self, tag: Tag, text: str) -> str:
-        """The text with its parameters put in."""
         if "\\" in text:
             raise tag.refusal("text", repr(text), "backslashes are not allowed")
 
@@ -251,7 +236,6 @@ class Outline:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file of UTF-8."""
     try:
         with open(path, "rb") as file:
             content = file.read(_MOST_BYTES + 1)
@@ -282,7 +266,6 @@ def _check_root(tag: Tag, above: tuple[Path, ...]) -> None:
 
 
 def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
-    """What Mitsuba's parser takes without a word, or refuses without its line."""
     name, words = texts.get("name", tag.name), re.split(r"[\s,]+", texts.get("value", "").strip())
     for text in texts.values():
         if not text.strip():
@@ -298,7 +281,7 @@ def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """The last sentence of an ``error`` of Mitsuba's: its first lines repeat the place in Mitsuba's own source."""
+    """Return the last sentence of an ``error`` of Mitsuba, whose first lines repeat a place in Mitsuba's own source."""
     text = re.sub(r"\x1b\[[0-9;]*m|\[\w+\.cpp:\d+\] ", "", str(error))
     lines = [re.sub(r"\s+", " ", line).strip(" -*│╰╭─") for line in text.splitlines()]
     lines = [re.sub(r"^\d{4}-\d\d-\d\d [\d:]+ \w+ +\w* *\[[^\]]*\] *", "", line) for line in lines if line]
@@ -311,20 +294,27 @@ def one_line(error: BaseException) -> str:
 
 _NATIVE = (".so", ".dylib", ".dll")
 _MOST_BYTES_OF_A_SCENE = 512 << 20
-"""An environment map of 8192 x 4096 texels of float32, as large as one may be, has 400 MiB."""
+"""The largest environment map, 8192 x 4096 texels of float32, has 400 MiB."""
 _MOST_SPECTRUM = 1 << 20
 """Some 50 000 lines; measured spectra have 1000."""
 
 
 class SceneFiles:
-    """What one scene may read; ``used`` lists it, the scene first, ``own`` the parameters of files that a user names.
+    """Files that one scene may read.
 
     Parameters
     ----------
     scene
-        the scene's XML; all else lies in its folder.
+        Scene XML; all other files are in its folder.
     outside
-        allows files outside that folder.
+        Allow files outside that folder.
+
+    Attributes
+    ----------
+    used
+        Files that are read, the scene first.
+    own
+        Parameters of files that a user names.
     """
 
     def __init__(self, scene: Path, outside: bool = False) -> None:
@@ -334,7 +324,7 @@ class SceneFiles:
         self.used: dict[Path, None] = {}
 
     def scene(self, path: Path) -> Path:
-        """``path`` itself; MitsimError when it is no plain file, or when native code lies where Mitsuba looks."""
+        """Return ``path``; raise MitsimError unless it is a plain file without native code beside it."""
         if not path.is_file():
             raise MitsimError(f"{path}: no such scene file; give the path of a Mitsuba scene XML")
         self.used[path] = None
@@ -344,43 +334,33 @@ class SceneFiles:
         return path
 
     def include(self, tag: Tag, name: str) -> Path:
-        """The file ``name`` of the ``<include>`` at ``tag``, beside the file that names it; MitsimError as a
-        resource."""
+        """Return the file ``name`` of the ``<include>`` at ``tag``, relative to the file that names it."""
         path = self._find(tag, tag.path.parent, name)
         _check_native(tag.path, path.parent)
         return path
 
     def spectrum(self, tag: Tag, folder: Path, name: str) -> None:
-        """Allow the file of a spectrum; MitsimError as for :meth:`resource`.
-
-        Parameters
-        ----------
-        tag, name
-            that asks for it, and by which name.
-        folder
-            where Mitsuba looks for it first.
-        """
+        """Check the file ``name`` of a spectrum, for which Mitsuba looks in ``folder`` first."""
         if self._find(tag, folder, name).stat().st_size > _MOST_SPECTRUM:
             raise tag.refusal("filename", repr(name), "the file is over 1 MiB; a spectrum is smaller")
 
     def resource(self, tag: Tag, name: str) -> Path:
-        """The bitmap or mesh ``name`` at ``tag``: Mitsuba looks for it from the scene's folder, also where an included
-        file names it. MitsimError when it lies elsewhere, or is no plain file of at most 512 MiB."""
+        """Return the bitmap or mesh ``name`` at ``tag``, relative to the scene's folder.
+
+        Raises MitsimError if it lies elsewhere, or is no plain file of at most 512 MiB.
+        """
         return self._find(tag, self.folder, name)
 
     def find_named(self, parameter: str, name: str) -> Path:
-        """The whole path of the file that a user names in place of a scene's own, which may lie anywhere.
+        """Return the path of the file that a user names for a scene ``parameter``.
 
-        Parameters
-        ----------
-        parameter, name
-            the scene's parameter, and what it was set to: from the working folder if it begins with a dot, in the
-            scene's folder if only that has it.
+        A ``name`` is relative to the working folder if it starts with a dot, and to the scene's folder if only that has
+        it.
 
         Raises
         ------
         MitsimError
-            for a file that there is not, and a name that both folders have.
+            If the file is missing, or both folders have one of that name.
         """
         own, here = self.folder / name, Path(name)
         places = [here] if name.startswith(".") or here.is_absolute() else [own, here]
@@ -435,8 +415,7 @@ _MOST_TEXELS = 1 << 24
 
 
 def lit_side(picture: Path) -> int | None:
-    """Rows and columns of the lit square in the PNG file ``picture``; None where it is no such picture: what is wrong
-    with it, :func:`mitsim.scene.window.locate_projector` says."""
+    """Return the side of the lit square in the PNG file ``picture`` in pixels; None if there is no such square."""
     from PIL.PngImagePlugin import PngImageFile
 
     try:

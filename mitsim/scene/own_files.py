@@ -1,4 +1,4 @@
-"""A checked scene and a user's picture or mesh in; the same tree, with files that Mitsuba reads, out.
+"""Pictures and meshes of the user in the tree of a checked scene, converted to files that Mitsuba reads.
 
 A picture becomes the reflectances of a sheet (:func:`mitsim.core.reflectance.read_reflectance`), in the middle of a
 square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
@@ -22,23 +22,18 @@ from mitsim.scene.headers import check_obj, check_ply
 from mitsim.scene.tree import placement_of, tilts
 
 _BEHIND = 0.01
-"""Part of a mesh's corners whose normal may face against the way that the face is wound: rounding of slivers."""
+"""Part of a mesh's corners whose normal may oppose the winding of the face, because of slivers."""
 
 
 @contextmanager
 def with_own_files(checked: CheckedScene) -> Iterator[None]:
-    """Have a tree read what its user names; the files that this takes exist while the context lasts.
-
-    Parameters
-    ----------
-    checked
-        the scene, whose tree is changed.
+    """Prepare the files that the user named; the prepared files exist within the context.
 
     Raises
     ------
     MitsimError
-        for a picture that is none or whose numbers are no reflectances, a mesh that is none, has no faces or normals
-        that face into it, and where files cannot be written.
+        For a picture that is no reflectance, a mesh without faces or with normals that point inwards, and if files
+        cannot be written.
     """
     with ExitStack() as stack:
         for node in checked.state.nodes:
@@ -55,7 +50,6 @@ def with_own_files(checked: CheckedScene) -> Iterator[None]:
 
 
 def _print(path: Path, folder: Path) -> Path:
-    """The file in a ``folder`` that has the reflectances of the picture at ``path``."""
     square = fit_square(read_reflectance(path))
     codes = np.rint(255 * square)
     # As a shipped print's where that holds them: the same file gives the same frames, whichever way it is named.
@@ -70,12 +64,10 @@ def _print(path: Path, folder: Path) -> Path:
 
 
 _ROUNDING = 1e-9
-"""Of codes of eight bits that were divided by 255 and are multiplied again."""
+"""Rounding of 8-bit codes that were divided by 255 and are multiplied again."""
 
 
 def _stand(props: mi.Properties, path: Path) -> str:
-    """Have a node be the mesh at ``path``, upright, and of a longest side of 1 before its ``to_world``; return the name
-    of the materials that the mesh refers to."""
     kinds = {".ply": check_ply, ".obj": check_obj}
     kind = path.suffix.lower()
     if kind not in kinds:

@@ -1,7 +1,7 @@
-"""The tree of a checked scene in; the same tree, changed so that Mitsuba renders rightly what it describes, out.
+"""Changes to the tree of a checked scene that let Mitsuba render what the scene describes.
 
-Mitsuba makes objects in single precision, and its parser's tree is in double precision: so what would lose its place,
-width or brightness is changed in the tree, before objects are made of it.
+Mitsuba makes objects in single precision, but its parser's tree is in double precision. Therefore whatever would lose
+its position, width or brightness is changed in the tree, before objects are made of it.
 """
 
 from __future__ import annotations
@@ -29,38 +29,35 @@ from mitsim.scene.outline import Outline, Tag
 # file are single precision already; where too few of their digits are left near the camera the scene is refused.
 
 _CENTRES = {"sphere": "center", "cylinder": "p0"}
-"""Points of shapes that are places beside ``to_world``, and single precision in Mitsuba."""
+"""Positions of shapes beside ``to_world``, which are single precision in Mitsuba."""
 _PLACED = ("point", "spot", "projector", "mitsim_projector")
-"""Lamps that stand somewhere; all others but those of shapes only have a direction."""
+"""Lamps with a position."""
 _ROUNDING = 2.0**-24
-"""Half of the distance between numbers of single precision, relatively."""
+"""Relative rounding of single precision."""
 _COARSEST = 5e-6
-"""Rounding over distance from the camera [rad]: 1/400 of a pixel of 128 over 17 degrees, by which frames of a print
-change by 1e-3."""
+"""Largest rounding over distance [rad]: 1/400 pixel of 128 over 17 degrees, which changes frames by 1e-3."""
 _ALIGNED = float(CameraGeometry.model_fields["scene_distance"].default)
 
 
 def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tuple[Tag, float], ...]:
-    """Move all that stands in the world of a checked tree so that its first ``mitsim_lensless`` is at the origin.
-
-    A scene whose camera is there already, or that has none, is left as it is. Directions are kept.
+    """Move all objects of a checked tree so that its first ``mitsim_lensless`` is at the origin; directions are kept.
 
     Parameters
     ----------
     outline
-        of the scene, for refusals.
+        Outline of the scene, for refusals.
     state
-        the tree, which is changed.
+        The tree, which is changed.
 
     Returns
     -------
-    for each shape of the scene, in its order, its tag and how far [mm] vertices of single precision are moved to the
-    world: 0 for what has none.
+    tuple
+        Tag of each shape, and the distance [mm] by which its single precision vertices are moved.
 
     Raises
     ------
     MitsimError
-        for a projector so far from its camera that single precision loses its light's places.
+        If a projector is so far from its camera that single precision loses the places of its light.
     """
     nodes = state.nodes
     cameras = [node for node in nodes if node.props.plugin_name() == "mitsim_lensless"]
@@ -91,15 +88,7 @@ def move_to_camera(outline: Outline, state: mi.parser.ParserState) -> tuple[tupl
 
 
 def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
-    """MitsimError for a mesh whose vertices have lost their digits near the camera.
-
-    Parameters
-    ----------
-    moved
-        as :func:`move_to_camera` gives it.
-    scene
-        made of that tree.
-    """
+    """Raise MitsimError for a mesh that loses its digits near the camera (``moved``: :func:`move_to_camera`)."""
     if len(moved) != len(scene.shapes()):
         return
     for (tag, distance), shape in zip(moved, scene.shapes(), strict=True):
@@ -120,16 +109,9 @@ def check_meshes(moved: Sequence[tuple[Tag, float]], scene: mi.Scene) -> None:
 
 
 def standing(nodes: Sequence[mi.parser.SceneNode], at: int = 0, merged: bool = True) -> Iterator[int]:
-    """Numbers of the nodes that stand in the world.
+    """Yield the indices of nodes that have a place in the world, below node ``at``.
 
-    Parameters
-    ----------
-    nodes
-        of a tree, the root first.
-    at
-        number of the node that they are below.
-    merged
-        give each part of what is merged into one shape, in place of the whole.
+    With ``merged``, the parts of a merged shape replace the whole.
     """
     props = nodes[at].props
     for index in references(props):
@@ -146,22 +128,13 @@ def _is(node: mi.parser.SceneNode, kind: str) -> bool:
 
 
 def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
-    """(4, 4) from an object to the world.
-
-    Parameters
-    ----------
-    props
-        of the object.
-    centred
-        from about its ``center``, ``p0`` or ``position``, where it has one.
-    """
+    """Return the (4, 4) transform from an object to the world, about its own centre if ``centred``."""
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
     return matrix @ _shift(props[name]) if centred and name in props else matrix
 
 
 def _place(props: mi.Properties, matrix: FloatArray) -> None:
-    """Have what is described stand where a ``matrix`` says, about its centre."""
     plugin = props.plugin_name()
     if plugin == "cylinder" and "p0" in props:
         last = np.array(props.get("p1", (0, 0, 1)), dtype=np.float64)  # its default
@@ -193,40 +166,38 @@ def _shift(point: mi.ScalarPoint3d) -> FloatArray:
 # 0.05 mm. Of a mesh points are drawn by area. (Cauchy: a convex body shows a quarter of its area in the mean.)
 
 _SLENDER = 400.0
-"""Distance over radius from which Mitsuba's cylinders lose 8e-4 of their light (2e-4 at half of it)."""
+"""Ratio of distance to radius from which Mitsuba's cylinders lose 8e-4 of their light."""
 _SMALL = 64.0
-"""The same for spheres that shine, whose light is out by 5e-4 there, and by 2e-3 on what is twice as far away."""
+"""The same ratio for emitting spheres, whose light errs by 5e-4."""
 _FINEST = {"cylinder": 1e5, "lamp": 1e5, "sphere": 1e6}
-"""Distance over radius at which rounding moves a mesh's corners by 3e-3 of the radius, and a sphere loses 5e-3."""
+"""Ratio at which rounding moves a mesh's corners by 3e-3 of the radius, and a sphere loses 5e-3."""
 _SIDES = 96
-"""Of a prism: its width changes by 5e-4 with the direction that it is seen from."""
+"""Sides of a prism: its width changes by 5e-4 with direction."""
 _RINGS = 24
-"""Of a lamp, with twice as many sides: its area as it is seen changes by 3e-4 (standard deviation over directions), and
-rounding moves corners by 2 % of an edge at 1e-5 of the distance."""
+"""Rings of a lamp, with twice as many sides: its visible area changes by 3e-4 (standard deviation over directions)."""
 _POLISHED = ("conductor", "dielectric", "mitsim_glass", "thindielectric")
-"""Materials whose light comes by single directions alone, which are followed on the cylinder itself."""
+"""Materials with light in single directions alone, which are followed on the cylinder itself."""
 _MIXED = ("plastic", "pplastic")
-"""Materials that need the cylinder for their specular chains, which holds no matt light."""
+"""Materials whose specular chains need the cylinder, which cannot hold their matt light."""
 Mesh = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Corners (k, 3), normals (k, 3) and uv (k, 2), and triangles (m, 3)."""
+"""Corners (k, 3), normals (k, 3), uv (k, 2), and triangles (m, 3)."""
 
 
 @contextmanager
 def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -> Iterator[None]:
-    """Have thin cylinders and small lamps of a tree be meshes, whose files exist while the context lasts.
+    """Replace thin cylinders and small lamps by meshes, whose files exist within the context.
 
     Parameters
     ----------
     outline
-        of the scene, for refusals.
+        Outline of the scene, for refusals.
     state
-        the tree with its camera at the origin, which is changed.
+        The tree with its camera at the origin, which is changed.
 
     Raises
     ------
     MitsimError
-        for a cylinder or sphere that is too thin for its distance, for a thin cylinder of smooth plastic, and where the
-        meshes cannot be written.
+        If a shape is too thin for its distance, for a thin cylinder of smooth plastic, and if files cannot be written.
     """
     thin = set(_thin_shapes(outline, state.nodes))
     with ExitStack() as stack:
@@ -243,7 +214,6 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
 
 
 def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
-    """Numbers of the nodes of thin cylinders and small lamps; MitsimError for what cannot be held."""
     eyes = [placement_of(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [
         np.zeros(3)
     ]
@@ -277,12 +247,10 @@ def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iter
 
 
 def _farthest(ends: Sequence[FloatArray], places: Sequence[FloatArray]) -> float:
-    """Largest distance of the ``ends`` from any of the ``places``."""
     return max(float(np.linalg.norm(end - place)) for end in ends for place in places)
 
 
 def _occurrences(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
-    """Numbers of all nodes of shapes, and (4, 4) from where they stand to the world: of a group's once an instance."""
     for index in standing(nodes):
         yield index, np.eye(4)
         if nodes[index].props.plugin_name() == "instance":
@@ -291,7 +259,6 @@ def _occurrences(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, Fl
 
 
 def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> None:
-    """Have a node be the mesh of its cylinder or sphere, written to ``path``."""
     props = nodes[index].props
     _write(path, ball(props) if props.plugin_name() == "sphere" else prism(props))
     props.set_plugin_name("ply")
@@ -304,7 +271,6 @@ def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> No
 
 
 def _extent(props: mi.Properties, to_world: FloatArray) -> tuple[list[FloatArray], float]:
-    """Ends or centre in the world, and the largest radius there."""
     local = to_world @ placement_of(props, centred=False)
     ends = [(to_world @ placement_of(props))[:3, 3]]
     if props.plugin_name() == "cylinder":
@@ -314,7 +280,6 @@ def _extent(props: mi.Properties, to_world: FloatArray) -> tuple[list[FloatArray
 
 
 def _plugins_below(nodes: Sequence[mi.parser.SceneNode], index: int) -> set[str]:
-    """Names of all plugins below a node."""
     found = set[str]()
     for below in references(nodes[index].props):
         found |= {str(nodes[below].props.plugin_name())} | _plugins_below(nodes, below)
@@ -326,7 +291,7 @@ def _point(props: mi.Properties, name: str, default: tuple[float, float, float])
 
 
 def prism(props: mi.Properties) -> Mesh:
-    """The prism of a cylinder's ``props`` in the world, with normals and uv as Mitsuba has the cylinder's."""
+    """Return the prism of a cylinder's ``props`` in the world, with normals and uv as Mitsuba's cylinder has them."""
     radius = float(props.get("radius", 1.0))
     first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
     v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")
@@ -338,7 +303,7 @@ def prism(props: mi.Properties) -> Mesh:
 
 
 def ball(props: mi.Properties) -> Mesh:
-    """The mesh of a sphere's ``props`` in the world, of the same area."""
+    """Return the mesh of a sphere's ``props`` in the world, of equal area."""
     v, u = np.meshgrid(np.linspace(0, 1, _RINGS + 1), np.linspace(0, 1, 2 * _RINGS + 1), indexing="ij")
     sine = np.sin(np.pi * v)
     normal = np.stack([sine * np.cos(2 * np.pi * u), sine * np.sin(2 * np.pi * u), np.cos(np.pi * v)], axis=-1)
@@ -352,8 +317,6 @@ def ball(props: mi.Properties) -> Mesh:
 def _in_world(
     props: mi.Properties, points: FloatArray, normals: FloatArray, uv: Sequence[FloatArray], turned: bool
 ) -> Mesh:
-    """The mesh of a grid (k, l, 3) of points and normals in the frame of ``props``; ``turned``: its triangles the other
-    way round."""
     matrix = placement_of(props, centred=False)
     triangles = _triangles(*uv[0].shape)
     points = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -365,7 +328,6 @@ def _in_world(
 
 
 def _triangles(rows: int, columns: int) -> FloatArray:
-    """Two (m, 3) of each square of a grid of corners."""
     a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     b, c, d = a + 1, a + columns, a + columns + 1
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
@@ -380,7 +342,6 @@ def _axes_across(n: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _write(path: Path, mesh: Mesh) -> None:
-    """A binary PLY."""
     points, normals, uv, triangles = mesh
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
@@ -399,14 +360,9 @@ def _write(path: Path, mesh: Mesh) -> None:
 
 
 def put_wrappers(state: mi.parser.ParserState) -> None:
-    """Replace materials of Mitsuba in a tree by those that give all light, forward and backward.
+    """Replace materials of Mitsuba by wrappers that return all light, forward and backward.
 
-    A choice between materials without mirrors or holes is right as it is, and stays.
-
-    Parameters
-    ----------
-    state
-        the tree, which is changed.
+    A choice between materials without mirrors or holes is correct in Mitsuba and stays.
     """
     below = [_plugins_below(state.nodes, index) for index in range(len(state.nodes))]
     for node, inner in zip(state.nodes, below, strict=True):
@@ -425,20 +381,16 @@ def put_wrappers(state: mi.parser.ParserState) -> None:
 
 _MESHES = ("obj", "ply")
 _FLAT = 1e-4
-"""Sine of the angle to a face below which a normal is the face's own: meshes are written with five digits."""
+"""Sine of the angle to a face below which a normal counts as the face's own: meshes are written with five digits."""
 
 
 def emit_by_faces(checked: CheckedScene) -> tuple[str, ...]:
-    """Set ``face_normals`` on meshes of the ``checked`` scene that emit and whose normals are not those of their faces.
-
-    Returns
-    -------
-    for each of them, a sentence that says so.
+    """Set ``face_normals`` on emitting meshes whose normals are not those of their faces; return a sentence for each.
 
     Raises
     ------
     MitsimError
-        for a mesh whose normals lie on either side of its faces: then no side is known to emit.
+        If normals lie on either side of the faces, because then no side is known to emit.
     """
     notes, nodes = [], checked.state.nodes
     for node in nodes:
@@ -471,8 +423,10 @@ def _emits(props: mi.Properties, nodes: Sequence[mi.parser.SceneNode]) -> bool:
 
 
 def tilts(props: mi.Properties) -> tuple[FloatArray, FloatArray]:
-    """At every corner of the faces of a mesh's ``props``, (k,) each: sine of the angle between its normal and the face,
-    and their cosine; none where vertices have no normals."""
+    """Return sine of the angle between normal and face, and their cosine, (k,) at every corner of the faces of a mesh.
+
+    Both are empty if vertices have no normals.
+    """
     geometry = {name: props[name] for name in ("filename", "flip_normals", "to_world") if name in props}
     mesh = mi.load_dict({"type": props.plugin_name(), **geometry})
     if not mesh.has_vertex_normals():
@@ -501,24 +455,20 @@ _PITCH = float(CameraGeometry.model_fields["pixel_pitch"].default)
 
 
 def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
-    """Give the cameras of a scene the pitch and the format of a camera file.
+    """Give the cameras of a scene the pitch and format of a camera file; return a sentence if something changes.
 
     Parameters
     ----------
     checked
-        the scene, whose tree is changed.
+        The scene, whose tree is changed.
     sensor
-        whose pitch counts where it differs by more than :data:`PITCH_TOLERANCE`, and whose rows and columns, where it
-        states them, count in place of the film's size and crop window.
-
-    Returns
-    -------
-    a sentence that names both, where something changes; else nothing.
+        Its pitch replaces the scene's if they differ by more than :data:`PITCH_TOLERANCE`; its rows and columns, if
+        stated, replace the film's size and crop window.
 
     Raises
     ------
     MitsimError
-        for a camera without a film whose size can be set.
+        For a camera without a film whose size can be set.
     """
     nodes, words = checked.state.nodes, ""
     for node in nodes:
@@ -541,7 +491,6 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
 
 
 def _sensor_words(camera: mi.Properties, film: mi.Properties) -> str:
-    """Pixels and pitch of a film in words."""
     column = float(camera.get("pixel_pitch", _PITCH))
     row = float(camera.get("row_pitch", column))
     rows, columns = (int(film.get(name, default)) for name, default in (("height", 576), ("width", 768)))

@@ -1,9 +1,9 @@
-"""The projector's pixel grid: from a stock ``projector`` emitter to n x n pixels and the directions they light.
+"""The projector's pixel grid: n x n pixels of a stock ``projector`` emitter and the directions that they light.
 
-The emitter's texture in the scene file is its all-white frame: the rectangle of lit texels is the *window* that the
-patterns use, n x n pixels, and the dark texels around it are canvas. A window off the canvas's centre is a lens shift,
-as real projectors have it, and casts no keystone. Rows and columns follow the project's convention (row 0 at +y,
-column 0 at +x for one looking along +z), which is also how Mitsuba lays texels out for an unrotated projector.
+The emitter's texture in the scene file is its all-white frame. The rectangle of lit texels is the *window* of n x n
+pixels that patterns use; dark texels around it are canvas. A window off the canvas's centre is a lens shift, as real
+projectors have it, and causes no keystone. Row 0 is at +y and column 0 at +x for a viewer along +z, which is Mitsuba's
+order of texels for an unrotated projector.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 
 _NO_KEYSTONE = 1e-3
-"""Projector pixels: chosen so that what rounding makes of a shifted lens is none; it shows in no frame."""
+"""Keystone in projector pixels that counts as rounding."""
 
 
 _MOST_ACROSS = 16384
-"""Projector pixels across the camera's field: light is collected in cells of their size, and the shadow of so many
-takes 67 MB for a sensor of 512 pixels and one layer. The paper's geometry has 150; a fov of 1e-6 degrees took 24 GB."""
+"""Largest number of projector pixels across the camera's field: their shadow takes 67 MB for 512 sensor pixels and one
+layer. The paper's geometry has 150.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Window:
     Attributes
     ----------
     n
-        pixels a side of the window.
+        Pixels per side of the window.
     first_row, first_column
-        canvas texel of the window's pixel (0, 0); between texels where a picture has drifted.
+        Canvas texel of the window's pixel (0, 0); fractional for a drifted picture.
     canvas
         (rows, columns) of the whole texture.
     """
@@ -48,15 +49,15 @@ class Window:
 
 @dataclass(frozen=True)
 class ProjectorGrid(Window):
-    """A projector's window, and where it lands on the camera's aligned plane.
+    """A projector's window and its position on the camera's aligned plane.
 
     Attributes
     ----------
     row_tan, column_tan
-        (first edge, last edge) of the window as tan-angles y/z and x/z from the camera, index coordinates, on the plane
-        at the camera's scene distance (bounding box when the projector casts a keystone).
+        (first edge, last edge) of the window as tan-angles y/z and x/z from the camera in index coordinates, on the
+        plane at the camera's scene distance; the bounding box in case of keystone.
     keystone
-        largest departure of the window's corners from that box, in projector pixels; 0 for a shifted lens.
+        Largest deviation of the window's corners from that box in projector pixels; 0 for a shifted lens.
     """
 
     row_tan: tuple[float, float]
@@ -65,21 +66,21 @@ class ProjectorGrid(Window):
 
 
 def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> ProjectorGrid:
-    """Find the lit window of a projector and its place in front of a camera.
+    """Find the lit window of a projector and its position in front of a camera.
 
     Parameters
     ----------
     where
-        what an error begins with, the scene's path.
+        Path of the scene, with which errors begin.
     projector
-        a stock emitter whose bitmap shows the window.
+        Stock emitter whose bitmap shows the window.
     camera
-        the sensor, which carries its geometry.
+        Sensor with its geometry.
 
     Raises
     ------
     MitsimError
-        when the texture is no bitmap with a lit square window, or it does not light the camera's aligned plane.
+        If the texture is no bitmap with a lit square window, or does not light the camera's aligned plane.
     """
     parameters = mi.traverse(projector)
     if "irradiance.data" not in parameters:
@@ -122,21 +123,12 @@ def locate_projector(where: str, projector: mi.Emitter, camera: mi.Sensor) -> Pr
 def window_at(
     where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Row and column tan-angles (first edge, last edge) of the window on a plane in front of the camera.
-
-    Parameters
-    ----------
-    where, projector, camera
-        as in :func:`locate_projector`, whose result is ``grid``.
-    grid
-        the window on the projector's canvas.
-    depth
-        distance of the plane [mm].
+    """Return row and column tan-angles (first edge, last edge) of the window on a plane at ``depth`` [mm].
 
     Raises
     ------
     MitsimError
-        when the projector does not light the plane.
+        If the projector does not light the plane.
     """
     corners = _window_corners(where, projector, camera, grid, depth)
     (top, left), (bottom, right) = corners.min(axis=0), corners.max(axis=0)
@@ -146,18 +138,14 @@ def window_at(
 def straightening(
     where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, depth: float
 ) -> FloatArray:
-    """(3, 3) homography that takes tan-angles (row, column, 1) on the plane at ``depth`` to where the same projector
-    pixel would lie if the window filled its bounding box evenly: what takes a keystone out.
+    """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at ``depth``.
 
-    Parameters
-    ----------
-    where, projector, camera, grid, depth
-        as in :func:`window_at`.
+    It maps to the positions of the projector pixels if the window filled its bounding box evenly.
 
     Raises
     ------
     MitsimError
-        when the projector does not light the plane.
+        If the projector does not light the plane.
     """
     corners = _window_corners(where, projector, camera, grid, depth)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -165,9 +153,9 @@ def straightening(
 
 
 def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: Window, z: float) -> FloatArray:
-    """(4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
+    """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, in index coordinates.
 
-    Between that plane and the projector's image lies a homography; four probes of the emitter determine it.
+    The plane and the projector's image are related by a homography, which four probes of the emitter determine.
     """
     half = 0.25 * z  # any four points do
     probes = np.array([[half, half], [half, -half], [-half, half], [-half, -half]])
@@ -192,7 +180,6 @@ def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window
 
 
 def _homography(source: FloatArray, target: FloatArray) -> FloatArray:
-    """3 x 3 matrix that maps four points (x, y) of ``source`` to ``target`` (direct linear transform)."""
     rows = []
     for (x, y), (u, v) in zip(source, target, strict=True):
         rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, -u])
