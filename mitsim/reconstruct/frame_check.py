@@ -109,8 +109,8 @@ class FrameCheck:
             found += by_others
         patterns = [(shot.row, shot.column) for shot in self._shots]
         named = {patterns[number] for fault in found for number in fault.numbers}
-        known = [each for each in powers if each.kind == "power" and named & {patterns[n] for n in each.numbers}]
-        return (*found, *(fault for fault in powers if fault not in known), *self._closing())
+        powers = [each for each in powers if each.kind != "power" or not named & {patterns[n] for n in each.numbers}]
+        return (*found, *powers, *self._closing())
 
     # ---- Tests of single frames
 

@@ -236,9 +236,8 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     ratio = 1.0 if test is None or (noise.stated and not off) else test.ratio if off else max(test.ratio, 1.0)
     energies = sums.residual, sums.energy, sums.expected_energy(ratio, factor_energy or 0.0), sums.pixels
     found, excess = weigh(energies, known, noise, of_ramps)
-    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change)
-    if off:  # chi-square is of the stated noise
-        found = replace(found, chi_square=whole / max(stated + beside, TINY))
+    chi_square = whole / max(stated + beside, TINY) if off else found.chi_square  # by the stated noise
+    found = replace(found, noise=test, gain=data.digital.gain_dn_per_e, common=change, chi_square=chi_square)
     if lack := data.lack(image):
         found = replace(found, predicted=float(np.sqrt(lack.energy / energy)))
     if with_defects and noise.stated and not sums.clipped and (defects := find_defects(data, sums.squares, ratio)):
@@ -282,7 +281,7 @@ def faulty_frames(data: Accumulation, image: FloatArray, lam: float) -> tuple[Fr
 
 
 def _common_light(data: Accumulation, sums: Residuals, stated: float, beside: float) -> FloatArray | None:
-    """Return the light (m, m') that is the same in all measurements; None if chance or errors of the factors explain it.
+    """Return the light (m, m') that is the same in all measurements; None if chance or factor errors explain it.
 
     It must have more energy than the factors' errors (``beside``), which are common to all frames, and most of the
     residual beyond that of the ``stated`` noise and of these errors.
