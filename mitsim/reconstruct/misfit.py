@@ -249,7 +249,7 @@ def find_misfit(data: Accumulation, solution: Solution, with_defects: bool = Tru
     # A reading is looked for in dim light, too, where chance hides half of what is off.
     hint = 1 + noise_chance(noise, float(sums.pixels.sum())) / 2
     hinted = found.stated and found.unexplained > UNEXPLAINED and found.chi_square > hint
-    readings = (scaled,) if scaled else ()
+    readings = tuple(filter(None, [scaled]))
     if not scaled and (found.flagged or faults or places or off or turned or hinted):
         readings = find_readings(data, ratio, beside + of_ramps)
     if found.flagged and not (readings or faults) and (detail := _detail(data, sums, excess, beside)):

@@ -210,7 +210,7 @@ class Residuals:
             beyond = (total * (1 + others) - every) / others
             halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
             normal = halves @ halves.T
-            powers, errors = np.zeros(2), np.full(2, np.inf)
+            powers, errors = np.asarray(np.zeros(2)), np.asarray(np.full(2, np.inf))
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
                 inverse = np.linalg.inv(normal)

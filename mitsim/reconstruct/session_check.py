@@ -391,7 +391,7 @@ class _Check:
                 f"others do; check their order, that nothing moves ({moved:.1g} pixels), that no frame holds light of "
                 f"the one before ({lag:.1%}), and that numbers are in proportion to light"
             )
-        for axis in np.flatnonzero(bad[:, 0]):  # all others hang on it
+        for axis in np.flatnonzero(bad[:, 0]).tolist():  # all others hang on it
             self._refuse(self.sides[axis], 0, "the two do not add up to what others do")
         self._judge()
         for axis, (own, good) in enumerate(zip(self.sides, self.good, strict=True)):
@@ -530,7 +530,7 @@ class _Check:
                 self._refuse(own, index, "they are in each other's place")
             detail = "in each other's place" + f", as in all pairs of {own.side} stripes" * int(turned.all())
             self._mend(own, index, None if self.paired else 1, ("exchanged", detail, "they count in their right order"))
-        for index in np.flatnonzero(own.odd()):
+        for index in np.flatnonzero(own.odd()).tolist():
             self._refuse(own, index, f"they show light that no {own.side} stripes cast")
         light = np.square(own.vectors).sum(axis=1)
         lower, upper = np.sort([np.roll(light, 1), np.roll(light, -1)], axis=0)
