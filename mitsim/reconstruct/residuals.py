@@ -214,7 +214,7 @@ class Residuals:
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
                 inverse = np.linalg.inv(normal)
-                powers, errors = inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse))
+                powers, errors = inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse), dtype=np.float64)
             rest = beyond - powers @ halves
             self.powers[pattern], self.rest[pattern], self.compared = (powers, errors), sum_of_squares(rest), rest.size
             self.side[pattern] = rest @ left_over / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
