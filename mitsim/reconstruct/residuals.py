@@ -210,11 +210,11 @@ class Residuals:
             beyond = (total * (1 + others) - every) / others
             halves, variance = np.stack([total + difference, total - difference]) / 2, 2 * self.noise.variance[pattern]
             normal = halves @ halves.T
-            powers, errors = np.asarray(np.zeros(2)), np.asarray(np.full(2, np.inf))
+            powers, errors = np.zeros((2, 2)) + [[0.0], [np.inf]]
             bright = np.diag(normal).min() > _BRIGHT * variance * total.size / 4
             if bright and np.linalg.det(normal) > _ALIKE * np.diag(normal).max() ** 2:
                 inverse = np.linalg.inv(normal)
-                powers, errors = inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse), dtype=np.float64)
+                powers, errors = np.stack([inverse @ (halves @ beyond), np.sqrt(variance * np.diag(inverse))])
             rest = beyond - powers @ halves
             self.powers[pattern], self.rest[pattern], self.compared = (powers, errors), sum_of_squares(rest), rest.size
             self.side[pattern] = rest @ left_over / max(float(np.linalg.norm(rest) * np.linalg.norm(left_over)), TINY)
