@@ -157,7 +157,7 @@ def _numbers() -> list[Case]:
         camera("fov", "20", "180"),
         camera("fov", "20", "-20"),
         camera("mask_order", "9", "40", "equal to 16"),
-        camera("mask_distance", "2", "0", "above 0"),
+        camera("mask_distance", "2", "0", "greater than"),
         camera("mask_distance", "2", "400", "less than scene_distance"),
         camera("mask_distance", "2", "-1"),
         camera("scene_distance", "400", "0.4", "1 unit is 1 mm", "metres"),
