@@ -40,19 +40,18 @@ from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds
+from mitsim.studies.framework import legacy as claims
 from mitsim.studies.framework.experiment import (
     QUICK_IMAGES,
     SIDE,
     Claim,
-    Experiment,
     Found,
     Point,
     Results,
     Scope,
     picture,
 )
+from mitsim.studies.framework.legacy import Experiment, Holds
 from mitsim.studies.framework.studio import Studio, reason_of
 
 MEASURED, TRACED = "measured", "rendered"

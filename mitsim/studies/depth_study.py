@@ -19,8 +19,9 @@ from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, group_by_setup
+from mitsim.studies.framework import legacy as claims
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, group_by_setup
+from mitsim.studies.framework.legacy import Experiment
 from mitsim.studies.framework.studio import Image, Studio
 
 CALIBRATED_MM = 400.0

@@ -47,13 +47,11 @@ from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, pair_chart
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
-from mitsim.studies.framework.claims import Cell, difference, grid_with_truths, single_precision, verdict, within
 from mitsim.studies.framework.experiment import (
     IMAGE,
     TEST_IMAGES,
     TRUTH,
     Claim,
-    Experiment,
     Found,
     Point,
     Results,
@@ -61,6 +59,15 @@ from mitsim.studies.framework.experiment import (
     Setup,
     group_by_setup,
     number_of,
+)
+from mitsim.studies.framework.legacy import (
+    Cell,
+    Experiment,
+    difference,
+    grid_with_truths,
+    single_precision,
+    verdict,
+    within,
 )
 from mitsim.studies.framework.studio import Studio, reason_of
 from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise

@@ -26,8 +26,8 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.plots import curves
-from mitsim.studies.framework.claims import difference, finding, sample_mean, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, Setup
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, Setup
+from mitsim.studies.framework.legacy import Experiment, difference, finding, sample_mean, verdict, within
 from mitsim.studies.framework.studio import Image, Studio
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}

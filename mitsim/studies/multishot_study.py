@@ -46,9 +46,9 @@ from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Table
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Lines, image_arrays, images
-from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework import legacy as claims
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment, Lines, image_arrays, images
 from mitsim.studies.framework.studio import Image, Studio, reason_of
 
 REACH = 15.0

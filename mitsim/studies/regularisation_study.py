@@ -18,9 +18,9 @@ from mitsim.report import EQUAL_FRAME, MODELS, in_text, label
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.pages import Table, Value
 from mitsim.report.plots import quality_bars
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework import legacy as claims
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment, Holds
 from mitsim.studies.framework.studio import Studio, reason_of
 
 FAMILIES = ("uniform", "dots:4", "dots:7")

@@ -49,9 +49,9 @@ from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, image_grid
 from mitsim.sensor.moments import frame_moments
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework import legacy as claims
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment, Holds
 from mitsim.studies.framework.studio import Studio, reason_of
 
 # -------- Light of a glossy scene and of its matt twin in

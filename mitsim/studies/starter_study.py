@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from mitsim.report import EQUAL_PEAK, RENDERED
-from mitsim.studies.framework.claims import measure_image
-from mitsim.studies.framework.experiment import Claim, Experiment, Point, Results, Scope
+from mitsim.studies.framework.experiment import Claim, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment, measure_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

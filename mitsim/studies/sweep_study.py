@@ -16,12 +16,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.pages import DASH, Table, Value, scientific
 from mitsim.report.plots import curves
-from mitsim.studies.framework.claims import Cell, grid_with_truths, kept_images, measure_image
 from mitsim.studies.framework.experiment import (
     KNOBS,
     MEASURES,
     NO_SCENE,
-    Experiment,
     PageTable,
     Point,
     Results,
@@ -31,6 +29,7 @@ from mitsim.studies.framework.experiment import (
     group_by_setup,
     number_of,
 )
+from mitsim.studies.framework.legacy import Cell, Experiment, grid_with_truths, kept_images, measure_image
 
 
 def _points(scope: Scope) -> Sequence[Point]:

@@ -25,11 +25,11 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.bench.apparatus import check_scene, open_apparatus
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import read_json, sweep, write_json
+from mitsim.core.files import read_json, sweep, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, Setup, find_experiment
+from mitsim.studies.framework.experiment import HEADS, Claim, Found, Point, Scope, Setup, Study, find_experiment
 from mitsim.studies.framework.run import (
     KEPT,
     POINTS,
@@ -71,7 +71,7 @@ class Where:
         name, points
             of the experiment, and where it is measured.
         kept
-            as :attr:`mitsim.studies.framework.experiment.Experiment.kept`.
+            as :attr:`mitsim.studies.framework.experiment.Study.kept`.
         """
         if self.scheduler is not None:
             return on_cluster(name, batches(points, kept), self.scheduler)
@@ -275,7 +275,7 @@ class _Campaign:
         return cls(study, scope)
 
     @cached_property
-    def experiment(self) -> Experiment:
+    def experiment(self) -> Study:
         return find_experiment(self.study)
 
     @cached_property
@@ -306,11 +306,11 @@ class _Campaign:
         if missing := len(self.points) - there:
             return CampaignResult(self.study, str(folder), there, missing, seconds)
         results = replace(store.results(self.points), scope=self.scope)
-        claims, figures = tuple(experiment.claims(results)), write_figures(folder, experiment.figures(results))
-        results.table.write(folder / f"{experiment.name}.csv")
+        claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
+        write_text(folder / f"{experiment.name}.csv", results.frame.to_csv(index=False))
         section = Section.of(experiment, self.study, self.scope, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", section.title)
-        rows = tuple(dict(row) for row in results.table.rows)
+        rows = tuple(map(dict, results.rows))
         found = CampaignResult(
             self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section, section.warnings
         )

@@ -13,7 +13,7 @@ from mitsim.core.environment import versions
 from mitsim.core.files import write_text
 from mitsim.report.pages import page_figure, render_page
 from mitsim.studies.framework.claims import CONFIRMED, NOT_CONFIRMED
-from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, Experiment, PageTable, Results, Scope, Setup
+from mitsim.studies.framework.experiment import KNOBS, TEST_IMAGES, Claim, PageTable, Results, Scope, Setup, Study
 
 _IN_PART, _NOT_DECIDED = "confirmed in part", "not decided"
 """What a tally says of claims that hold somewhere, and of those that more prints or seeds would decide."""
@@ -25,7 +25,7 @@ class Section:
     and its width [pixels]; ``quick``: of a few points alone; ``warnings`` are on what was measured; ``prints``: over
     how many test images means are."""
 
-    experiment: Experiment
+    experiment: Study
     title: str
     message: str
     claims: tuple[Claim, ...]
@@ -40,7 +40,7 @@ class Section:
     @classmethod
     def of(
         cls,
-        experiment: Experiment,
+        experiment: Study,
         study: str,
         scope: Scope,
         claims: Sequence[Claim],
@@ -56,7 +56,7 @@ class Section:
         claims, figures, results
             what it came to.
         """
-        prints = sorted(set(results.table.distinct("picture")) & set(TEST_IMAGES))
+        prints = sorted({row.get("picture") for row in results.rows} & set(TEST_IMAGES))
         of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
         setup = scope.setup
         command = ["mitsim study", study, *([] if any(scope.pictures) else [setup.scene]), *_options(scope)]
@@ -69,7 +69,7 @@ class Section:
             message=experiment.message(results) or tally(claims),
             claims=tuple(claims),
             pictures={name: page_figure(figures[name]) for name in sorted(figures, key=_images_first)},
-            count=f"{len(results.table)} measurements{of}{good}",
+            count=f"{len(results.rows)} measurements{of}{good}",
             command=" ".join(command),
             tables=tuple(experiment.tables(results)),
             quick=scope.quick,
@@ -101,7 +101,7 @@ def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     # An image may have many rows, such as a transfer function's.
     rows = {
         (row.get("point"), row.get("exposure"), row.get("psnr_db")): row
-        for row in results.table.rows
+        for row in results.rows
         if row.get("flagged") is not None
     }
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]

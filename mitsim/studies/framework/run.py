@@ -103,11 +103,9 @@ class InFolder:
         raise NotImplementedError
 
     def to_pandas(self) -> Any:
-        """The rows as a ``pandas.DataFrame``; MitsimError where pandas is not installed."""
-        try:
-            import pandas
-        except ImportError:
-            raise MitsimError("pandas is not installed, which tables need; type: pip install pandas") from None
+        """Return the rows as a ``pandas.DataFrame``."""
+        import pandas
+
         return pandas.DataFrame([*self.rows])
 
     @property
@@ -275,12 +273,10 @@ class Store:
 
     def results(self, points: Iterable[Point]) -> Results:
         """Everything found at ``points``, in their order."""
-        from mitsim.report.pages import Table
-
         found = {point.key: self.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
-        return Results(Table(rows), arrays)
+        return Results(rows, arrays)
 
     def _file(self, point: Point) -> Path:
         return self.folder / f"{point.key}.npz"

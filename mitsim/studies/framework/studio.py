@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -29,7 +29,7 @@ from mitsim.reconstruct.solution import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.pages import Value
-from mitsim.studies.framework.experiment import Point, Setup, picture
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Found, Point, Setup, picture
 
 Kept = TypeVar("Kept")
 _KEY_DIGITS = 16
@@ -292,3 +292,49 @@ class Studio:
         kept.move_to_end(key)
         found: Kept = kept[key]
         return found
+
+
+# -------- The measurement of one point
+
+
+def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+    """Return the findings of a point in one row.
+
+    Parameters
+    ----------
+    studio, point
+        studio that measured it, and the point.
+    image
+        image of the point, if figures show it; kept for a few prints, with the truth.
+    **measured
+        columns of the row.
+    """
+    kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
+    arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
+    return Found((point.row(**measured),), arrays)
+
+
+def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
+    """Return an ``image`` and its ``truth`` as findings keep them."""
+    return single_precision({IMAGE: image, TRUTH: truth})
+
+
+def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return named ``arrays`` in single precision, because a page shows no more."""
+    return {name: array.astype("float32") for name, array in arrays.items()}
+
+
+def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
+    """Return the quality of the image that a user gets at a point with model, patterns, exposure and seed.
+
+    Parameters
+    ----------
+    studio, point
+        studio that measures, and the point.
+    shown
+        patterns whose images are kept; None: all.
+    """
+    values = dict(point.values)
+    patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
+    return finding(studio, point, image.image if shown is None or patterns in shown else None, **image.row())

@@ -13,7 +13,6 @@ from mitsim.report import MODELS, label
 from mitsim.report.pages import Table
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
-from mitsim.studies.framework.claims import UNDECIDED, image_rows, judge_claim, psnr_claim
 from mitsim.studies.framework.experiment import (
     IMAGE,
     Point,
@@ -24,6 +23,7 @@ from mitsim.studies.framework.experiment import (
     measures_of,
     values_of,
 )
+from mitsim.studies.framework.legacy import UNDECIDED, image_rows, judge_claim, psnr_claim
 from mitsim.studies.framework.page import Section, build_page, flag_warnings
 from mitsim.studies.framework.run import batches
 from mitsim.studies.scene_studies import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES

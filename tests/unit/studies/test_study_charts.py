@@ -95,7 +95,7 @@ def invented(name: str) -> Results:
 def test_axes_have_units_and_decades_are_logarithmic(name: str) -> None:
     """Of all charts of a study. (Seen failing: numbers of patterns and frames without a unit in four studies, a sweep
     over the bare name of its parameter, lambda from 1e5 to 1e9 on a linear axis.)"""
-    drawn = find(name).figures(invented(name))
+    drawn = find(name).draw(invented(name))
     found = {file: faults(figure) for file, figure in drawn.items() if tells(figure)}
     assert found and not any(found.values()), found
 
@@ -147,7 +147,7 @@ def sweep(knobs: Sequence[tuple[str, tuple[str, ...]]], truth_by: str = "") -> R
 
 def grid(results: Results) -> tuple[list[str], list[str], list[str]]:
     """Titles of columns, names of rows and captions of its images."""
-    cells = find("sweep").figures(results)["images.png"].axes
+    cells = find("sweep").draw(results)["images.png"].axes
     titles = [axes.get_title() for axes in cells if axes.get_title()]
     return titles, [axes.get_ylabel() for axes in cells if axes.get_ylabel()], [axes.get_xlabel() for axes in cells]
 
@@ -171,7 +171,7 @@ def test_truths_stand_above_images_where_they_differ_along_a_row() -> None:
 def test_a_long_sweep_shows_both_ends_and_says_how_many_there_are() -> None:
     """(Planted: the first six.)"""
     results = sweep((("sheet_z", tuple(f"{390 + each}" for each in range(11))),))
-    figure = find("sweep").figures(results)["images.png"]
+    figure = find("sweep").draw(results)["images.png"]
     titles, names, _ = grid(results)
     assert titles == ["truth", *(f"sheet_z {390 + each}" for each in (0, 2, 4, 6, 8, 10))] and not names
     assert figure.get_suptitle().replace("\n", " ") == "Images by sheet_z [mm] (6 of 11 columns)"
@@ -195,7 +195,7 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
 def test_images_of_a_drift_stand_beside_the_truth() -> None:
     """Of the kinds that cost the most. (Planted: in the table's order.)"""
     results = invented("drift")
-    cells = find("drift").figures(results)["images.png"].axes
+    cells = find("drift").draw(results)["images.png"].axes
     assert [axes.get_title() for axes in cells[:3]] == ["truth", "without the drift", "with it"] and len(cells) == 12
     most = max(results.table.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
     assert str(most["amount"]) and cells[2].get_xlabel() == f"{most['after_db']:.1f} dB"

@@ -12,7 +12,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.studies import drift_study
-from mitsim.studies.framework.claims import (
+from mitsim.studies.framework.experiment import Results, find_experiment
+from mitsim.studies.framework.legacy import (
     CONFIRMED,
     NOT_CONFIRMED,
     UNDECIDED,
@@ -22,7 +23,6 @@ from mitsim.studies.framework.claims import (
     verdict_at,
     within,
 )
-from mitsim.studies.framework.experiment import Results, find_experiment
 from mitsim.studies.waterfall_study import EFFECTS
 
 Row = dict[str, Value]
@@ -105,13 +105,14 @@ def binned(**gains: tuple[str, int, str, int]) -> Build:
 
 def shared(better: str, other: str) -> Build:
     third = [rows(20, patterns=name) for name in ("1 uniform", "49 uniform", "49 dots") if name not in (better, other)]
-    law = rows(1.0, "ser", patterns="49 dots", ser_law=1.0)
+    law = rows(1.0, "ser_over_law", patterns="49 dots", model=IDEALISED)
     return beside(gain("psnr_db", {"patterns": better}, {"patterns": other}), *third, law)
 
 
 def law(value: float) -> list[Row]:
     """A ratio of measured error and law; its scatter is a tenth of the others', as its borders are nearer."""
-    found = [{**row, "ser": value + 0.1 * row["ser"]} for row in rows(0.0, "ser", jitter=True, ser_law=1.0)]
+    ratios = rows(0.0, "ser_over_law", jitter=True, model=IDEALISED)
+    found = [{**row, "ser_over_law": value + 0.1 * row["ser_over_law"]} for row in ratios]
     return [*found, *(row for name in ("1 uniform", "49 uniform", "49 dots") for row in rows(20, patterns=name))]
 
 
@@ -286,7 +287,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
     0; the lower border of "comparable" left out; means of all images in place of pairs.)"""
 
     def verdict(value: float) -> str:
-        return find_experiment(study).claims(Results(Table(tuple(build(value)))))[claim].verdict
+        return find_experiment(study).judge(Results(Table(tuple(build(value)))))[claim].verdict
 
     aside = ASIDE / 10 if (study, claim) == ("exposure", 2) else ASIDE  # of a ratio near 1
     for border, inwards in ((low, aside), (high, -aside)):

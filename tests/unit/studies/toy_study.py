@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment
 
 
 def points(scope: Scope) -> Sequence[Point]:
