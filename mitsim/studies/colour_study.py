@@ -46,8 +46,9 @@ from mitsim.report.plots import (
     label_axes,
 )
 from mitsim.studies import lit_lines
+from mitsim.studies.framework.claims import every, verdict, within
 from mitsim.studies.framework.experiment import Claim, Found, PageTable, Point, Results, Scope, Setup
-from mitsim.studies.framework.legacy import Experiment, difference, every, sample_mean, verdict, within
+from mitsim.studies.framework.legacy import Experiment, difference, sample_mean
 from mitsim.studies.framework.studio import Studio
 
 # -------- Beside daylight of any brightness

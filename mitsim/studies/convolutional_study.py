@@ -40,7 +40,7 @@ from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.studies.framework import legacy as claims
+from mitsim.studies.framework.claims import TOLERANCE_DB, Holds, every, verdict, verdict_at, within
 from mitsim.studies.framework.experiment import (
     QUICK_IMAGES,
     SIDE,
@@ -51,8 +51,9 @@ from mitsim.studies.framework.experiment import (
     Scope,
     picture,
 )
-from mitsim.studies.framework.legacy import Experiment, Holds
-from mitsim.studies.framework.studio import Studio, reason_of
+from mitsim.studies.framework.legacy import Experiment, sample_mean
+from mitsim.studies.framework.panels import Images
+from mitsim.studies.framework.studio import Studio, image_arrays, reason_of
 
 MEASURED, TRACED = "measured", "rendered"
 PERIODS = (1, 2, 3, 4, 5, 7)
@@ -129,7 +130,7 @@ def _measure(studio: Studio, point: Point) -> Found:
             stated: dict[str, Value] = {"flagged": bool(reason := reason_of(solution.status)), "reason": reason}
             rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **stated))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
-                arrays = claims.image_arrays(solution.image, truth)
+                arrays = image_arrays(solution.image, truth)
     return Found(tuple(rows), arrays)
 
 
@@ -147,7 +148,7 @@ def _claims(results: Results) -> Sequence[Claim]:
             ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (found.min(), found.max()))
             # Seconds vary by factors; numbers of patterns stand for repeats.
             ratio = Mean.of_numbers(list(np.log(found)), f"{column} over {over}")
-            return f"{' to '.join(ends)} times as long", claims.within(ratio, low=float(np.log(least)))
+            return f"{' to '.join(ends)} times as long", within(ratio, low=float(np.log(least)))
 
         return judge
 
@@ -176,12 +177,18 @@ def _claims(results: Results) -> Sequence[Claim]:
 def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
     """A claim of PSNR within a ``band`` [dB] of what is called ``name``, at each way of exposing."""
     means = {
-        (psf, exposure): claims.sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
+        (psf, exposure): sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
         for psf in rows.distinct("psf")
         for exposure in EXPOSURES
     }
     at = {
-        exposure: claims.every(*(claims.near(mean, band) for (_, each), mean in means.items() if each == exposure))
+        exposure: every(
+            *(
+                within(mean, band[0] - TOLERANCE_DB, band[1] + TOLERANCE_DB)
+                for (_, each), mean in means.items()
+                if each == exposure
+            )
+        )
         for exposure in EXPOSURES
     }
 
@@ -189,14 +196,14 @@ def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
         return "; ".join(f"{exposure}: {means[psf, exposure]} dB" for exposure in EXPOSURES), None
 
     claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", judgements)
-    return replace(claim, verdict=claims.verdict_at(at))
+    return replace(claim, verdict=verdict_at(at))
 
 
 def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
     """A claim judged with each point spread function in ``rows``; that of the measured one stands under "idealised"."""
     judgements = {psf: judge(psf) for psf in rows.distinct("psf")}
     texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in judgements.items()}
-    holds = claims.verdict(claims.every(*(each for _, each in judgements.values())))
+    holds = verdict(every(*(each for _, each in judgements.values())))
     return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
 
 
@@ -218,14 +225,16 @@ def _figures(results: Results) -> Mapping[str, Figure]:
         )
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
-    by_scene = {
-        f"{name or 'scene'}, {psf}": quality.where(psf=psf, picture=name, exposure=EQUAL_FRAME)
-        for psf in psfs
-        for name in (*QUICK_IMAGES, None)
-    }
-    title = f"Images, exposure {EQUAL_FRAME}, best lambda"
-    columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
-    return drawn | claims.images("images.png", results, by_scene, "patterns", few, title, columns)
+    images = Images(
+        file="images.png",
+        title=f"Images, exposure {EQUAL_FRAME}, best lambda",
+        where={"part": "quality", "exposure": EQUAL_FRAME},
+        across="patterns",
+        columns=few,
+        down=("picture", "psf"),
+        names={count: f"{count} frame{'s' if count > 1 else ''}" for count in few},
+    )
+    return drawn | images.draw(results)
 
 
 def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:

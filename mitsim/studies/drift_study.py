@@ -47,6 +47,7 @@ from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, pair_chart
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
+from mitsim.studies.framework.claims import verdict, within
 from mitsim.studies.framework.experiment import (
     IMAGE,
     TEST_IMAGES,
@@ -60,16 +61,9 @@ from mitsim.studies.framework.experiment import (
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.legacy import (
-    Cell,
-    Experiment,
-    difference,
-    grid_with_truths,
-    single_precision,
-    verdict,
-    within,
-)
-from mitsim.studies.framework.studio import Studio, reason_of
+from mitsim.studies.framework.legacy import Experiment, difference
+from mitsim.studies.framework.panels import Cell, grid_with_truths
+from mitsim.studies.framework.studio import Studio, reason_of, single_precision
 from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise
 
 AMBIENT, SESSION = "ambient frame", "session"

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 from mitsim.learn.training_request import FLATNET, REFINED
 from mitsim.report import IDEALISED, RENDERED, in_text
 from mitsim.report.pages import Mean, Table, Value
+from mitsim.studies.framework.claims import Holds, every, verdict, within
 from mitsim.studies.framework.experiment import Claim, Results
-from mitsim.studies.framework.legacy import Holds, every, verdict, within
 from mitsim.studies.learned_bench import CONDITIONS, MISMATCHES
 from mitsim.studies.learned_cells import VARIED
 from mitsim.studies.learned_scores import AUTOMATIC, BEST

@@ -8,11 +8,10 @@ factors have the noise of their session in closed form (:mod:`mitsim.calibrate.s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
-
-from matplotlib.figure import Figure
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from mitsim.api.bench import Bench
 from mitsim.calibrate.board_session import Session
@@ -25,10 +24,13 @@ from mitsim.devices.session import Modelling, SessionRecipe, load_recipe
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.plots import curves
-from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, Setup
-from mitsim.studies.framework.legacy import Experiment, difference, finding, sample_mean, verdict, within
-from mitsim.studies.framework.studio import Image, Studio
+from mitsim.studies.framework.claims import Holds, Judged, choose_rows, distinct, mean_of, within
+from mitsim.studies.framework.experiment import Found, Point, Scope, Setup, Study
+from mitsim.studies.framework.panels import Lines
+from mitsim.studies.framework.studio import Image, Studio, finding
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
 """How the camera differs from its plan: as a mask that is glued on by hand, under a microscope."""
@@ -131,55 +133,47 @@ def _model_factors(bench: Bench, lit: LitSession, point: Point) -> Factors:
     return modelled_factors(camera, fitted, frames, manifest, Job())
 
 
-def _claims(results: Results) -> Sequence[Claim]:
-    reported = []
-    for fraction in results.table.distinct("exposure_fraction"):
-        rows = results.table.where(exposure_fraction=fraction)
-        measured = rows.where(factors=MEASURED)
-        most = max(measured.distinct("frames"))
-        longest = measured.where(frames=most)
-        for model in (WAVE, GEOMETRIC):
-            own = rows.where(factors=model)
-            gains = {
-                frames: difference(own.where(frames=frames), longest, "psnr_db")
-                for frames in sorted(own.distinct("frames"))
-            }
-            suffices = {frames: within(gain, low=-_SUFFICES_DB) for frames, gain in gains.items()}
-            few = next((frames for frames, holds in suffices.items() if holds), max(gains))
-            holds = True if suffices[few] else None if None in suffices.values() else False
-            reported.append(
-                Claim(
-                    f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
-                    "",
-                    "",
-                    f"{sample_mean(own.where(frames=few), 'psnr_db')} dB with {few} frames; measured factors "
-                    f"{sample_mean(longest, 'psnr_db')} dB with {most}: {gains[few]:+} dB",
-                    verdict(holds),
-                )
-            )
-    return reported
+def _suffices(rows: DataFrame, model: str) -> tuple[str, Holds]:
+    """Judge whether a ``model`` of a few frames is as good as measured factors of the longest session."""
+    measured_ = choose_rows(rows, {"factors": MEASURED})
+    most = max(distinct(measured_, "frames"))
+    longest, own = choose_rows(measured_, {"frames": most}), choose_rows(rows, {"factors": model})
+    by_frames = {frames: choose_rows(own, {"frames": frames}) for frames in sorted(distinct(own, "frames"))}
+    gains = {frames: mean_of(each, "psnr_db", longest) for frames, each in by_frames.items()}
+    holds = {frames: within(gain, low=-_SUFFICES_DB) for frames, gain in gains.items()}
+    few = next((frames for frames, each in holds.items() if each), max(gains))
+    text = f"{mean_of(by_frames[few])} dB with {few} frames; measured factors {mean_of(longest)} dB with {most}"
+    return f"{text}: {gains[few]:+} dB", True if holds[few] else None if None in holds.values() else False
 
 
-def _figures(results: Results) -> Mapping[str, Figure]:
-    table, panels = results.table, {}
-    for fraction in table.distinct("exposure_fraction"):
-        rows = table.where(exposure_fraction=fraction)
-        panels[f"brightest pixel at {fraction:g} of the full well"] = {
-            name: {
-                frames: rows.mean("psnr_db", factors=name, frames=frames)
-                for frames in sorted(rows.where(factors=name).distinct("frames"))
-            }
-            for name in FACTORS
-        }
-    title = "PSNR by the frames of the calibration session"
-    return {"psnr.png": curves(panels, "frames of the calibration session [1]", log=True, title=title)}
-
-
-EXPERIMENT = Experiment(
+STUDY = Study(
     "models",
     "Modelled factors against measured ones",
     "How few frames of a calibration session suffice?",
-    _points, _measure, _claims, _figures,
+    points=_points,
+    measure=_measure,
+    claims=tuple(
+        Judged(
+            claim=f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
+            where={"exposure_fraction": fraction},
+            optional=True,  # a quick study has one exposure
+            decide=partial(_suffices, model=model),
+        )
+        for fraction in _EXPOSURES
+        for model in (WAVE, GEOMETRIC)
+    ),
+    panels=(
+        Lines(
+            file="psnr.png",
+            title="PSNR by the frames of the calibration session",
+            x="frames",
+            x_label="frames of the calibration session [1]",
+            colour="factors",
+            facet="exposure_fraction",
+            names={fraction: f"brightest pixel at {fraction:g} of the full well" for fraction in _EXPOSURES},
+            log=True,
+        ),
+    ),
     about="PSNR of images with three kinds of factors. Measured: each number of them by a session of striped light. "
     "Wave and geometric: the closed-form shadow of the mask, with diffraction and without, whose distance, shift, "
     "rotation, magnification and gain are fitted to a few frames of that session. The mask is 50 um too far off and "
@@ -187,4 +181,4 @@ EXPERIMENT = Experiment(
     "frames are bright. Bars are one standard error over seeds. Frames are simulated with the very shadow that the "
     "wave model has: what a real mask has beside it only measured factors hold.",
     heads=("", "", "PSNR"),
-)  # fmt: skip
+)

@@ -24,8 +24,9 @@ from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
 from mitsim.devices.session import Drift
+from mitsim.reconstruct.request import METHODS
 from mitsim.report import CONVENTIONS
-from mitsim.studies import ALL, EXPERIMENTS, SHARED, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED, STUDIES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -392,7 +393,7 @@ def find_experiment(name: str) -> Study:
     MitsimError for another name, with the names of all studies, and for a module without a ``STUDY``.
     """
     if not is_experiment(name) or name == ALL:
-        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+        raise no_such_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
         loaded = _load_file(module) if module.endswith(_PYTHON) else importlib.import_module(module)
@@ -403,6 +404,13 @@ def find_experiment(name: str) -> Study:
             "`mitsim new study NAME` writes one"
         ) from error
     return found
+
+
+def no_such_study(name: str) -> MitsimError:
+    """Return the refusal of a ``name`` that is no study's, with the replacement of one that there was."""
+    if name in GONE:
+        return MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
+    return MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
 
 
 def _declared(module: Any) -> Any:
@@ -436,9 +444,10 @@ MEASURES = {
     "chi_square": ("chi_square", "chi-square of a measurement, 1 where the model fits [1]"),
     "uncertainty": ("uncertainty", "standard uncertainty, rms [reflectance]"),
     "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
+    "seconds": ("seconds", "time of the solution [s]"),
 }
 """Column of the table and axis, by what people ask for."""
-NO_SCENE = ("patterns", "exposure", "seed", "accuracy")
+NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
 """What a sweep may vary besides parameters of the scene."""
 OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", "lambda", "psnr_db", "ssim"} | {
     column for column, _ in MEASURES.values()
@@ -446,7 +455,7 @@ OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason
 """Columns of every study's table, which are no knob."""
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
 """As Python and Mitsuba read them."""
-_LISTED = ("patterns", "exposure", "seed")
+_LISTED = ("patterns", "exposure", "seed", "method")
 """Knobs whose values are a list, whatever stands between its commas."""
 _MOST = 10_000
 """Points of one sweep: more are a typing error."""
@@ -502,6 +511,9 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
             raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")
     for text in knobs.get("patterns", ()):
         read_name(text)
+    for text in knobs.get("method", ()):
+        if text not in METHODS:
+            raise MitsimError(f"--over method={text}: use {', '.join(METHODS)}")
     for name, kind in (("seed", int), ("accuracy", float)):
         for text in knobs.get(name, ()):
             Request.of(**{name: number_of(name, text, kind)})

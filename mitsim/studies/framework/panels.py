@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.devices.patterns import FAMILIES
 from mitsim.report import label
 from mitsim.report.pages import Mean
-from mitsim.studies.framework.claims import Where, choose_rows, distinct, mean_of, value_name
-from mitsim.studies.framework.experiment import TRUTH, Results
+from mitsim.studies.framework.claims import Where, choose_rows, distinct, mean_of, measured, value_name
+from mitsim.studies.framework.experiment import IMAGE, TRUTH, Results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +29,7 @@ Columns = str | Sequence[str] | Mapping[str, str]
 """A column whose values are told apart, several whose combinations are, or names by column whose numbers are shown
 beside each other."""
 Names = Mapping[Any, str] | str
-"""Names of values, or a template such as "{} mm"."""
+"""Names by value, or by (column, value); or a template such as "{} mm"."""
 PSNR = "PSNR [dB]"
 
 
@@ -74,28 +75,32 @@ class Panel:
         """Return the name of a ``value`` of a ``column``."""
         if isinstance(self.names, str) and value is not None:
             return self.names.format(f"{float(value):g}" if _is_number(value) else value)
-        if not isinstance(self.names, str) and value in self.names:
-            return self.names[value]
+        for key in ((column, value), value):
+            if not isinstance(self.names, str) and key in self.names:
+                return self.names[key]
         if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
             return label(str(value))
         if value is None:
             return "scene" if column == "picture" else ""
         return value_name(column, value)
 
+    def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
+        """Return the combinations of the values of some columns that ``rows`` have, in the order of the table."""
+        columns = [by] if isinstance(by, str) else list(by)
+        values = [[*distinct(rows, each), *([None] if _lacks(rows, each) else [])] for each in columns]
+        found = [dict(zip(columns, chosen, strict=True)) for chosen in product(*values)]
+        return [each for each in found if len(choose_rows(rows, each))]
+
     def parts(self, rows: DataFrame, by: Columns) -> dict[str, tuple[DataFrame, str]]:
         """Return rows, and the column that is shown instead of the panel's own, by the name of each part of ``by``."""
         if isinstance(by, Mapping):
             return {name: (rows, column) for column, name in by.items() if column in rows}
-        columns = [by] if isinstance(by, str) else list(by)
-        if not by:
-            return {"": (rows, "")}
-        found = {}
-        values = [distinct(rows, each) + [None] * _lacks(rows, each) for each in columns]
-        for chosen in product(*values):
-            own = choose_rows(rows, dict(zip(columns, chosen, strict=True)))
-            if len(own):
-                found[", ".join(filter(None, map(self.name, columns, chosen)))] = own, ""
-        return found
+        chosen = self.combinations(rows, by) if by else [{}]
+        return {self.joined(each): (choose_rows(rows, each), "") for each in chosen}
+
+    def joined(self, values: Mapping[str, Any]) -> str:
+        """Return the names of some ``values`` by column, separated by commas."""
+        return ", ".join(filter(None, (self.name(*item) for item in values.items())))
 
 
 def _lacks(rows: DataFrame, column: str) -> bool:
@@ -214,60 +219,68 @@ class Images(Panel):
     Attributes
     ----------
     across
-        column whose values are the grid's columns; or (title, caption) by the name of an array, for several arrays of
-        one point side by side.
+        columns whose combinations are the grid's columns; or (title, caption) by the name of an array, for several
+        arrays of one point side by side.
     columns
         values of ``across`` in their order; None: all of the table.
     down
         columns whose combinations are the grid's rows.
+    array, before
+        template of the arrays' names, filled from their row, and titles by name of arrays that stand before the others.
     caption
         template of the text below an image, filled from its row.
     """
 
-    across: str | Mapping[str, tuple[str, str]]
+    across: str | Sequence[str] | Mapping[str, tuple[str, str]]
     columns: Sequence[Any] | None = None
     down: Sequence[str] = ("picture", "model")
+    array: str = IMAGE
+    before: Mapping[str, str] = field(default_factory=dict)
     caption: str = "{psnr_db:.1f} dB"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return the grid; None if no row of it has all images."""
         kept = {key for key, _ in results.arrays}
-        rows = rows[rows["point"].isin(kept)] if "point" in rows else rows
-        if isinstance(self.across, str):
-            values = list(self.columns) if self.columns is not None else distinct(rows, self.across)
-            titles = [self.name(self.across, value) for value in _few(values)]
+        rows = rows[rows["point"].isin(kept)] if "point" in rows else rows[:0]
+        shown: list[tuple[dict[str, Any], str, str]] = [({}, name, "") for name in self.before]
+        titles = list(self.before.values())
+        if isinstance(self.across, Mapping):
+            shown += [({}, name, caption) for name, (_, caption) in self.across.items()]
+            titles += [title for title, _ in self.across.values()]
+            count = len(titles)
         else:
-            values, titles = [], [title for title, _ in self.across.values()]
-        groups = self.parts(rows, self.down)
-        grid = {name: self._cells(results, own, values) for name, (own, _) in groups.items()}
+            chosen = self.combinations(rows, self.across)
+            if self.columns is not None:
+                chosen = [{str(self.across): value} for value in self.columns]
+            shown += [(each, self.array, self.caption) for each in _few(chosen)]
+            titles += [self.joined(each) for each in _few(chosen)]
+            count = len(self.before) + len(chosen)
+        groups = {self.joined(each): choose_rows(rows, each) for each in self.combinations(rows, self.down)}
+        grid = {name: [cell for each in shown for cell in _cells(results, own, *each)] for name, own in groups.items()}
         grid = {name: cells for name, cells in grid.items() if len(cells) == len(titles)}
         if not grid:
             return None
-        sides = {"columns": (len(titles), len(values)), "rows": (min(len(grid), _MOST_SHOWN), len(grid))}
-        cut = ", ".join(f"{shown} of {count} {side}" for side, (shown, count) in sides.items() if shown < count)
+        sides = {"columns": (len(titles), count), "rows": (min(len(grid), _MOST_SHOWN), len(grid))}
+        cut = ", ".join(f"{few} of {all_} {side}" for side, (few, all_) in sides.items() if few < all_)
         title = f"{self.title}{f' ({cut})' if cut else ''}"
         return grid_with_truths({name: grid[name] for name in _few(list(grid))}, titles, title)
-
-    def _cells(self, results: Results, rows: DataFrame, values: Sequence[Any]) -> list[Cell]:
-        if not isinstance(self.across, str):
-            shown = rows.to_dict("records")[:1]
-            found = [(results.array(row, name), None, caption, row) for row in shown
-                     for name, (_, caption) in self.across.items()]  # fmt: skip
-        else:
-            found = []
-            for value in _few(values):
-                own = choose_rows(rows, {self.across: value}).to_dict("records")
-                found += [(results.array(row), results.array(row, TRUTH), self.caption, row) for row in own
-                          if results.array(row) is not None][:1]  # fmt: skip
-        return [
-            (image, truth, caption.format(**row) + ("\nflagged" if caption and row.get("flagged") is True else ""))
-            for image, truth, caption, row in found
-            if image is not None
-        ]
 
 
 Cell = tuple[FloatArray, FloatArray | None, str]
 """Image, truth where it was kept, and caption."""
+
+
+def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption: str) -> list[Cell]:
+    """Return the first image of the ``rows`` that ``where`` chooses, if it was kept."""
+    for row in choose_rows(rows, where).to_dict("records"):
+        image = results.array(row, array.format(**row))
+        if image is not None:
+            known = all(measured(row.get(name)) for _, name, kind, _ in Formatter().parse(caption) if kind and name)
+            text = (caption.format(**row) if known else "") + "\nflagged" * (
+                bool(caption) and row.get("flagged") is True
+            )
+            return [(image, results.array(row, TRUTH) if array == IMAGE else None, text)]
+    return []
 
 
 def _few(items: Sequence[Any]) -> list[Any]:

@@ -20,8 +20,8 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_output, check_plain, output_folder, read_json, whole_file, write_json, write_text
 from mitsim.core.job import Job
-from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
-from mitsim.studies.framework.experiment import Found, Point, Results
+from mitsim.studies import ALL, PAPER, STUDIES
+from mitsim.studies.framework.experiment import Found, Point, Results, no_such_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,7 +209,7 @@ def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
         for another name, with those that there are.
     """
     if name not in STUDIES:
-        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+        raise no_such_study(name)
 
     def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
         """What the study finds."""

@@ -25,6 +25,7 @@ from mitsim.metrics import Quality
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solution import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
@@ -54,6 +55,8 @@ class Image:
         where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
     reason
         of a flagged image: what it is flagged for.
+    seconds
+        time of the solution of rendered frames.
     """
 
     image: FloatArray
@@ -64,6 +67,7 @@ class Image:
     flagged: bool
     trust: Mapping[str, float | None] = field(default_factory=dict)
     reason: str = ""
+    seconds: float | None = None
 
     @classmethod
     def of(
@@ -205,6 +209,7 @@ class Studio:
         seed: int = 0,
         exposure: str = EQUAL_PEAK,
         focus: Literal["auto", "map"] | None = None,
+        method: str = TIKHONOV,
     ) -> Image:
         """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
 
@@ -220,7 +225,7 @@ class Studio:
             of the frames' noise, and of the calibration's.
         exposure
             one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
-        focus
+        focus, method
             of rendered frames, as for :func:`mitsim.reconstruct`.
         """
         frames = self.frames(setup, model, patterns, seed)
@@ -228,7 +233,7 @@ class Studio:
             return Image.of(frames, frames.seconds(exposure))
         seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
-        found = reconstruct(shots, self.factors(setup, seed), focus=focus)
+        found = reconstruct(shots, self.factors(setup, seed), focus=focus, method=method)
         misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
@@ -237,7 +242,8 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         reason = reason_of(found.status, misfit)
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason)
+        seconds_ = sum(found.seconds.values())
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason, seconds_)
 
     def _plan(self, setup: Setup) -> Plan:
         """That of a ``setup``, made by this studio or by another that was first: one in a file is as one in memory."""
@@ -336,5 +342,7 @@ def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = 
     """
     values = dict(point.values)
     patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
-    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
-    return finding(studio, point, image.image if shown is None or patterns in shown else None, **image.row())
+    method = str(values.get("method", TIKHONOV))
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure, method=method)
+    measured = image.row() | ({"seconds": image.seconds} if "method" in values else {})
+    return finding(studio, point, image.image if shown is None or patterns in shown else None, **measured)

@@ -15,8 +15,8 @@ from mitsim.devices.sensor import SensorModel
 from mitsim.report.pages import Mean, Table
 from mitsim.studies import colour_study
 from mitsim.studies.colour_study import BY_LUX, LEAST, METHODS, kept_lx, ladder_claim
+from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Scope, Setup
-from mitsim.studies.framework.legacy import UNDECIDED
 from mitsim.studies.lit_lines import DaylitLine, expected_delta_e, most
 
 N, PIXELS = 8, 15

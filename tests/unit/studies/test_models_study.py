@@ -3,17 +3,17 @@ is rendered."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import pytest
 
 from mitsim.devices.camera import CameraGeometry
-from mitsim.report.pages import Table, Value
+from mitsim.report.pages import Value
 from mitsim.studies import models_study
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 
-EXPERIMENT = find_experiment("models")
+STUDY = find_experiment("models")
 
 
 def row(factors: str, frames: int, psnr: float, fraction: float = 0.8, seed: int = 0) -> dict[str, Value]:
@@ -28,13 +28,13 @@ def results(wave: float) -> Results:
     for seed in (0, 1):  # pairs differ alike
         rows += [row("wave", 2, wave - 1 + seed * 2, seed=seed), row("wave", 16, 50.0 + seed * 2, seed=seed)]
         rows += [row("geometric", frames, 29.0 + seed * 2, seed=seed) for frames in (2, 16)]
-    return Results(Table(tuple(rows)))
+    return Results(rows)
 
 
 def test_points_are_models_by_frames_and_sessions_by_how_they_are_taken() -> None:
     """Of both exposures and two seeds; a quick study is a start of the whole. (Planted: repeats of the wrong session;
     sessions of as many frames as models.)"""
-    points, few = (EXPERIMENT.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
+    points, few = (STUDY.points(Scope(Setup(), ("astronaut", "page"), quick=quick)) for quick in (False, True))
     assert len({point.key for point in points}) == len(points) == 2 * 2 * 2 * (3 + 2 * 5)
     assert {point.key for point in few} <= {point.key for point in points} and len(few) == 3 + 2 * 2
     taken = {point["mode"]: models_study._recipe(point) for point in points if point["factors"] == "measured"}
@@ -70,7 +70,7 @@ def test_the_camera_as_built_has_its_mask_off_its_place() -> None:
 @pytest.mark.parametrize(("wave", "enough"), [(50.6, 2), (50.4, 16)])
 def test_few_frames_suffice_where_their_image_is_as_good_as_the_longest_sessions(wave: float, enough: int) -> None:
     """Within 0.5 dB of 51.0. (Planted: the shortest session's image; the mean over all frames.)"""
-    wave_claim, geometric = EXPERIMENT.claims(results(wave))
+    wave_claim, geometric = STUDY.judge(results(wave))
     assert wave_claim.verdict == "confirmed" and geometric.verdict == "not confirmed"
     assert f"with {enough} frames; measured factors 51.0 \N{PLUS-MINUS SIGN} 1.0 dB with 2048" in wave_claim.rendered
     assert (
@@ -81,8 +81,8 @@ def test_few_frames_suffice_where_their_image_is_as_good_as_the_longest_sessions
 
 def test_each_exposure_is_a_panel_with_all_factors() -> None:
     both = results(51.0)
-    dim = tuple({**one, "exposure_fraction": 0.01} for one in both.table.rows)
-    figures = EXPERIMENT.figures(replace(both, table=Table((*both.table.rows, *dim))))
+    dim = tuple({**one, "exposure_fraction": 0.01} for one in both.rows)
+    figures = STUDY.draw(Results([*both.rows, *dim]))
     (figure,) = figures.values()
     assert [axes.get_title() for axes in figure.axes][:2] == [
         f"brightest pixel at {fraction} of the full well" for fraction in ("0.8", "0.01")

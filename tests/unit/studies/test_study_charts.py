@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
-from mitsim.report.pages import Table, Value
+from mitsim.report.pages import Value
 from mitsim.report.plots import curves, spans_decades, tells
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Point, Results, Scope, Setup
 from mitsim.studies.framework.experiment import find_experiment as find
@@ -22,7 +22,7 @@ from mitsim.studies.sweep_study import axis_of
 from tests.unit.report.test_charts import curve
 
 STUDIES = (
-    "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient", "regularisation",
+    "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient",
     "convolutional", "depth", "drift", "models", "waterfall", "sweep",
 )  # fmt: skip
 KNOBS = ("sheet_z", ("390", "400", "410")), ("patterns", ("dots:4", "dots:7"))
@@ -67,6 +67,7 @@ def rows_of(point: Point, rng: np.random.Generator) -> Iterator[dict[str, Value]
     measured |= {"change_db": -1.5, "called_for": True, "lambda": float(10 ** rng.uniform(5, 9))}
     measured["ratio"] = float(dict(point.setup.parameters).get("lamp", 1.0)) / 1170
     kind, _, size = str(own.get("patterns", "")).partition(":")
+    measured["kind"] = kind
     measured["patterns_count"] = int(size) ** 2 if size.isdecimal() else 1
     measured["pixels"] = 512 // int(own.get("binning", 1) or 1)
     measured |= {"frames": int(rng.integers(2, 512))} if "factors" in own else {}
@@ -88,7 +89,7 @@ def invented(name: str) -> Results:
     if name == "waterfall":
         rows = [{**row, "model": model} for row in rows for model in ("assumed", "calibrated")]
     arrays = {(point.key, array): rng.random((4, 4)) for point in points for array in (IMAGE, TRUTH, *OTHERS)}
-    return Results(Table(tuple(rows)), arrays, scope)
+    return Results(rows, arrays, scope)
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -142,7 +143,7 @@ def sweep(knobs: Sequence[tuple[str, tuple[str, ...]]], truth_by: str = "") -> R
     for point, row in zip(points, rows, strict=True):
         grey = 0.8 + 0.01 * values.index(str(row[truth_by])) if truth_by else 0.9
         arrays[point.key, TRUTH] = np.full((2, 2), grey)
-    return Results(Table(tuple(rows)), arrays, scope)
+    return Results(rows, arrays, scope)
 
 
 def grid(results: Results) -> tuple[list[str], list[str], list[str]]:
@@ -197,5 +198,5 @@ def test_images_of_a_drift_stand_beside_the_truth() -> None:
     results = invented("drift")
     cells = find("drift").draw(results)["images.png"].axes
     assert [axes.get_title() for axes in cells[:3]] == ["truth", "without the drift", "with it"] and len(cells) == 12
-    most = max(results.table.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
+    most = max(results.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
     assert str(most["amount"]) and cells[2].get_xlabel() == f"{most['after_db']:.1f} dB"

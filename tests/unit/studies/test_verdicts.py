@@ -10,19 +10,18 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.pages import Mean, Table, Value
+from mitsim.report.pages import Mean, Value
 from mitsim.studies import drift_study
-from mitsim.studies.framework.experiment import Results, find_experiment
-from mitsim.studies.framework.legacy import (
+from mitsim.studies.framework.claims import (
     CONFIRMED,
     NOT_CONFIRMED,
     UNDECIDED,
-    difference,
     every,
-    sample_mean,
+    mean_of,
     verdict_at,
     within,
 )
+from mitsim.studies.framework.experiment import Results, find_experiment
 from mitsim.studies.waterfall_study import EFFECTS
 
 Row = dict[str, Value]
@@ -151,7 +150,7 @@ def lit(**gains: float) -> list[Row]:
     return [
         row
         for name, value in gains.items()
-        for row in level("gain_db", subject=name, patterns="dots:7", depth="as it is")(value)
+        for row in level("gain_db", part="global light", subject=name, patterns="dots:7", depth="as it is")(value)
     ]
 
 
@@ -191,7 +190,14 @@ def glossy(card: float = 40.0, disc: float = 10.0) -> list[Row]:
         for name, decibels in (("gift_card", card), ("compact_disc", disc))
         for exposure in (EQUAL_PEAK, "as the matt scene")
         for row in rows(
-            decibels, "artefacts_db", jitter=True, model=RENDERED, subject=name, exposure=exposure, patterns="dots:7"
+            decibels,
+            "artefacts_db",
+            jitter=True,
+            part="gloss",
+            model=RENDERED,
+            subject=name,
+            exposure=exposure,
+            patterns="dots:7",
         )
     ]
 
@@ -226,21 +232,6 @@ BORDERS = [
              {"mask_distance": "2.0", "patterns": "uniform"}),
         rows(18, mask_distance="0.75", patterns="uniform"), rows(30, mask_distance="0.75", patterns="dots:7"),
     ), -1.0, 1.0),
-    *(
-        ("regularisation", claim, beside(
-            lambda value: [
-                {**row, "psnr_best_db": row["psnr_db"], "seconds": 1.0, "peak_mib": 1.0}
-                for name in ("uniform", "dots:7")
-                for row in gain("psnr_db", {"method": "tv"}, {"method": "tikhonov"}, patterns=name)(value)
-            ]
-        ), -1.0, 1.0)
-        for claim in range(4)
-    ),
-    ("regularisation", 4, lambda value: [
-        {**row, "psnr_db": 20.0, "psnr_best_db": 20.0, "peak_mib": 1.0}
-        for name in ("uniform", "dots:7")
-        for row in gain("seconds", {"method": "tikhonov"}, {"method": "tv"}, patterns=name)(value)
-    ], -math.inf, 0.0),
     ("multishot", 4, frames("shifting dots", "SweepCam"), 0.5, math.inf),
     ("multishot", 5, frames("SweepCam", "uniform frames"), 0.5, math.inf),
     ("resolution", 0, bars(
@@ -262,7 +253,7 @@ BORDERS = [
     ("ambient", 0, lambda value: lamps(1.0, 0.5 + value), -math.inf, 0.0),
     ("ambient", 1, lamps, 0.0, math.inf),
     ("ambient", 2, lamps, -math.inf, 0.0),
-    ("separation", 0, lambda value: lit(corner=value, cookie_bag=9.0), 0.0, math.inf),
+    ("reflectivity", 2, lambda value: [*glossy(), *lit(corner=value, cookie_bag=9.0)], 0.0, math.inf),
     ("models", 0, fitted, -0.5, math.inf),
     ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
@@ -287,7 +278,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
     0; the lower border of "comparable" left out; means of all images in place of pairs.)"""
 
     def verdict(value: float) -> str:
-        return find_experiment(study).judge(Results(Table(tuple(build(value)))))[claim].verdict
+        return find_experiment(study).judge(Results(build(value)))[claim].verdict
 
     aside = ASIDE / 10 if (study, claim) == ("exposure", 2) else ASIDE  # of a ratio near 1
     for border, inwards in ((low, aside), (high, -aside)):
@@ -316,11 +307,11 @@ def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
     one = [{"picture": name, "seed": seed, "x": value} for name, seed, value in
            (("a", 0, 10.0), ("a", 1, 12.0), ("b", 0, 20.0), ("b", 1, 22.0))]  # fmt: skip
     other = [{**row, "x": float(row["x"]) - 1.0 - (row["picture"] == "b")} for row in one]
-    assert sample_mean(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
-    assert difference(Table(tuple(one)), Table(tuple(other)), "x") == Mean(1.5, pytest.approx(0.5), 2)
-    assert sample_mean(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
+    assert mean_of(Results(one).frame, "x") == Mean(16.0, pytest.approx(5.0), 2)
+    assert mean_of(Results(one).frame, "x", Results(other).frame) == Mean(1.5, pytest.approx(0.5), 2)
+    assert mean_of(Results(one[:2]).frame, "x") == Mean(11.0, pytest.approx(1.0), 2)
     with pytest.raises(MitsimError, match="nothing was measured of x"):
-        difference(Table(tuple(one[:2])), Table(tuple(other[2:])), "x")
+        mean_of(Results(one[:2]).frame, "x", Results(other[2:]).frame)
 
 
 def test_a_claim_of_parts_and_of_places() -> None:

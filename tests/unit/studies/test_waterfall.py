@@ -17,8 +17,8 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.pages import Mean, Table
 from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
+from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Results, Scope, Setup
-from mitsim.studies.framework.legacy import UNDECIDED
 from mitsim.studies.framework.studio import Studio
 from mitsim.studies.waterfall_study import (
     ALONE,
