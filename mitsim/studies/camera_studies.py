@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import pairwise
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,31 +71,17 @@ DISTANCE = Study(
         stated("At 750 um, uniform light gives 16.9 to 19 dB", 16.9, 19.0, mask_distance="0.75", patterns="uniform"),
         stated("At 750 um, 49 dots give 30 to 30.5 dB", 30.0, 30.5, mask_distance="0.75", patterns="dots:7"),
         Gain(
-            claim=f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
+            f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
+            {"mask_distance": "0.75", "patterns": "dots:5"},
+            {"mask_distance": "2.0", "patterns": "uniform"},
             paper="comparable",
-            one={"mask_distance": "0.75", "patterns": "dots:5"},
-            other={"mask_distance": "2.0", "patterns": "uniform"},
             at_least=-_COMPARABLE_DB,
             at_most=_COMPARABLE_DB,
         ),
     ),
     panels=(
-        Lines(
-            file="psnr_{exposure}.png",
-            title="PSNR by the mask's distance, exposure {exposure}",
-            each="exposure",
-            x="mask_distance",
-            x_label="sensor to mask [mm]",
-            log=True,
-        ),
-        Images(
-            file="images_{patterns}.png",
-            title=f"{{patterns}}, exposure {EQUAL_FRAME}",
-            each="patterns",
-            where={"exposure": EQUAL_FRAME, "patterns": _SHOWN},
-            across="mask_distance",
-            names={f"{distance}": f"{distance:g} mm" for distance in DISTANCES_MM},
-        ),
+        Lines("mask_distance", "sensor to mask [mm]", each="exposure", title="PSNR by the mask's distance", log=True),
+        Images("mask_distance", each="patterns", where={"exposure": EQUAL_FRAME, "patterns": _SHOWN}, names="{} mm"),
     ),
 )
 
@@ -127,42 +114,31 @@ BINNING = Study(
     measure=_binning_measure,
     claims=(
         Gain(
-            claim="49 dots are stable down to 64 x 64 pixels (3 dB lost at most)",
+            "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)",
+            {"binning": _FINE},
+            {"binning": _COARSE},
+            where="dots:7",
             paper="stable",
-            one={"patterns": "dots:7", "binning": _FINE},
-            other={"patterns": "dots:7", "binning": _COARSE},
+            at_least=-inf,
             at_most=_STABLE_DB,
         ),
         Gain(
-            claim="Uniform light degrades with fewer pixels",
+            "Uniform light degrades with fewer pixels",
+            {"binning": _FINE},
+            {"binning": _COARSE},
+            where="uniform",
             paper="degrades",
-            one={"patterns": "uniform", "binning": _FINE},
-            other={"patterns": "uniform", "binning": _COARSE},
-            at_least=0.0,
         ),
         Gain(
-            claim="49 dots on 64 x 64 pixels are better than uniform light on 512 x 512",
+            "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512",
+            {"patterns": "dots:7", "binning": _COARSE},
+            {"patterns": "uniform", "binning": _FINE},
             paper="better",
-            one={"patterns": "dots:7", "binning": _COARSE},
-            other={"patterns": "uniform", "binning": _FINE},
-            at_least=0.0,
         ),
     ),
     panels=(
-        Lines(
-            file="psnr.png",
-            title=f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}",
-            x="pixels",
-            x_label="rows of the sensor [pixel]",
-            log=True,
-        ),
-        Images(
-            file="images_{patterns}.png",
-            title=f"{{patterns}}, {EQUAL_PEAK}, by sensor rows",
-            each="patterns",
-            where={"patterns": _SHOWN},
-            across="pixels",
-        ),
+        Lines("pixels", "rows of the sensor [pixel]", title="PSNR by the sensor's rows, equal peak", log=True),
+        Images("pixels", each="patterns", where={"patterns": _SHOWN}, names="{} rows"),
     ),
 )
 
@@ -242,6 +218,8 @@ def _limit(rows: DataFrame) -> float:
     return limit
 
 
+_BARS = "spatial frequency on the print [line pairs/mm]"
+
 RESOLUTION = Study(
     "resolution",
     "How fine",
@@ -255,46 +233,31 @@ RESOLUTION = Study(
     measure=_resolution_measure,
     claims=(
         Judged(
-            claim="Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; "
-            f"contrast at {_FINEST})",
-            paper="rises",
+            "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
+            f"{_FINEST})",
+            _rises,
             where={"contrast": measured},
-            decide=_rises,
+            paper="rises",
         ),
         Level(
-            claim=f"49 patterns tell {_FINEST} line pairs a mm apart",
-            paper="told apart",
-            where={"patterns": "dots:7", "pairs_a_mm": lambda pairs: pairs <= _FINEST, "contrast": measured},
+            f"49 patterns tell {_FINEST} line pairs a mm apart",
             every="pairs_a_mm",
             column="contrast",
             unit="",
+            where={"patterns": "dots:7", "pairs_a_mm": lambda pairs: pairs <= _FINEST, "contrast": measured},
+            paper="told apart",
             at_least=_TOLD,
         ),
     ),
     panels=(
-        *(
-            Lines(
-                file=f"{file}.png",
-                title=title,
-                x="pairs_a_mm",
-                x_label="spatial frequency on the print [line pairs/mm]",
-                y=column,
-                y_label=f"{column} [1]",
-                ticks=False,
-            )
-            for column, file, title in (
-                ("contrast", "contrast", "Contrast of bars at their own frequency"),
-                ("transfer", "edge", "Modulation transfer by a slanted edge (ISO 12233)"),
-            )
-        ),
+        Lines("pairs_a_mm", _BARS, y="contrast", y_label="contrast of bars at their own frequency [1]", ticks=False),
+        Lines("pairs_a_mm", _BARS, y="transfer", y_label="transfer of a slanted edge [1]", file="edge", ticks=False),
         Images(
-            file="images.png",
+            "picture",
             title=f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}",
-            where={"picture": lambda name: str(name).startswith("bars")},
-            across="picture",
             down=("patterns", "model"),
+            where={"picture": lambda name: str(name).startswith("bars")},
             caption="contrast {contrast:.2f}",
-            names={f"bars {pairs:g}": f"{pairs:g}" for pairs in PAIRS_A_MM},
         ),
     ),
     note="Pixels of the image are 0.94 mm on the shipped print, so 0.533 line pairs/mm are the most that they show; "

@@ -226,10 +226,9 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     drawn["seconds.png"] = _seconds(speed, psfs)
     few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
     images = Images(
-        file="images.png",
+        "patterns",
         title=f"Images, exposure {EQUAL_FRAME}, best lambda",
         where={"part": "quality", "exposure": EQUAL_FRAME},
-        across="patterns",
         columns=few,
         down=("picture", "psf"),
         names={count: f"{count} frame{'s' if count > 1 else ''}" for count in few},

@@ -155,7 +155,7 @@ def _mended(rows: DataFrame, short: str, long: str) -> tuple[str, Holds]:
     return text, every(within(gain, low=_ROBUST_DB), bool(found[short, MAP]["flagged"].all()))
 
 
-_ALONG_COLUMNS = {"model": IDEALISED, "along": "columns"}
+_ALONG = {"model": IDEALISED, "along": "columns"}
 
 STUDY = Study(
     "depth",
@@ -166,20 +166,20 @@ STUDY = Study(
     claims=(
         _is_robust,
         Gain(
-            claim="A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
+            "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
+            {"focus": AUTO},
+            {"focus": OWN},
             where={"patterns": "dots:7", "focus": (AUTO, OWN), "depth": lambda depth: depth != CALIBRATED_MM},
             every="depth",
-            one={"focus": AUTO},
-            other={"focus": OWN},
             at_least=-_ROBUST_DB,
         ),
         *(
             Judged(
-                claim=f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to "
-                "each other",
+                f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each "
+                "other",
+                partial(_mended, short=short, long=long),
                 where={"scene": scene, "focus": (NONE, MAP)},
                 optional=True,
-                decide=partial(_mended, short=short, long=long),
             )
             for scene, (short, long) in DEEP.items()
         ),
@@ -187,47 +187,30 @@ STUDY = Study(
     panels=(
         *(
             Lines(
+                "depth",
+                "depth of the plane [mm]",
                 file=file,
                 title=title,
                 where=where,
-                x="depth",
-                x_label=x_label,
-                colour=colour,
+                colour=file,
                 facet="",
                 names=names,
             )
-            for file, title, where, x_label, colour, names in (
+            for file, title, where, names in (
+                ("baseline", "Idealised, 49 dots, by baseline", _ALONG | {"patterns": "dots:7"}, "{} mm"),
+                ("patterns", "Idealised, projector 60 mm beside the camera", _ALONG | {"baseline": 60.0}, {}),
                 (
-                    "baseline.png",
-                    "Idealised plane, 49 dots, by the distance between camera and projector",
-                    {**_ALONG_COLUMNS, "patterns": "dots:7"},
-                    "depth of the plane [mm]",
-                    "baseline",
-                    "{} mm",
-                ),
-                (
-                    "patterns.png",
-                    "Idealised plane, projector 60 mm beside the camera, by patterns",
-                    {**_ALONG_COLUMNS, "baseline": 60.0},
-                    "depth of the plane [mm]",
-                    "patterns",
-                    {},
-                ),
-                (
-                    "focus.png",
-                    "Rendered sheet, projector 60 mm beside the camera, 49 dots",
-                    {"model": RENDERED, "patterns": "dots:7", "focus": (NONE, AUTO, OWN)},
-                    "depth of the sheet [mm]",
                     "focus",
+                    "Rendered, 49 dots",
+                    {"model": RENDERED, "patterns": "dots:7", "focus": tuple(_FOCUSED)},
                     _FOCUSED,
                 ),
             )
         ),
         Images(
-            file="images.png",
+            "focus",
             title="Rendered scenes of many depths",
             where={"scene": tuple(DEEP), "focus": (NONE, MAP)},
-            across="focus",
             down=("scene", "patterns"),
             names={NONE: "one depth", MAP: "a depth for each pixel"},
         ),

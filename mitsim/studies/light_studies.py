@@ -37,7 +37,7 @@ from mitsim.studies.framework.claims import (
     within,
 )
 from mitsim.studies.framework.experiment import Axes, Found, Point, Results, Study
-from mitsim.studies.framework.panels import PSNR, Bars, Images, Lines
+from mitsim.studies.framework.panels import Bars, Images, Lines
 from mitsim.studies.framework.studio import Image, Studio, finding, measure_image
 
 if TYPE_CHECKING:
@@ -75,12 +75,6 @@ def _spectra(results: Results) -> Mapping[str, Figure]:
     return {"singular_values.png": singular_values({label(name): each for name, each in found if each is not None})}
 
 
-def _higher(claim: str, one: str, other: str) -> Gain:
-    """Return the claim that the patterns ``one`` give better images than ``other``."""
-    where = {"exposure": CONVENTIONS}
-    return Gain(claim=claim, paper="higher", where=where, one={"patterns": one}, other={"patterns": other}, at_least=0)
-
-
 PATTERNS = Study(
     "patterns",
     "Which patterns, and how many",
@@ -97,30 +91,28 @@ PATTERNS = Study(
     claims=(
         stated("One uniform pattern gives 21 to 23 dB", 21.0, 23.0, patterns="uniform"),
         stated("49 shifting dots give 34 to 35.5 dB", 34.0, 35.5, patterns="dots:7"),
-        _higher("More dots, better images (49 against 4)", "dots:7", "dots:2"),
-        _higher("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
-        _higher("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
+        *(
+            Gain(claim, better, other, where={"exposure": CONVENTIONS}, paper="higher")
+            for claim, better, other in (
+                ("More dots, better images (49 against 4)", "dots:7", "dots:2"),
+                ("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
+                ("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
+            )
+        ),
     ),
     panels=(
         Lines(
-            file="psnr_{exposure}.png",
-            title="PSNR by the number of patterns, exposure {exposure}",
+            "patterns_count",
+            "number of patterns [1]",
+            title="PSNR by the number of patterns",
             where={"exposure": CONVENTIONS},
             each="exposure",
-            x="patterns_count",
-            x_label="number of patterns [1]",
             colour="kind",
-            shared={"patterns": "uniform"},
+            shared="uniform",
             names=_KINDS,
         ),
         _spectra,
-        Images(
-            file="images.png",
-            title=f"exposure {EQUAL_FRAME}",
-            where={"exposure": EQUAL_FRAME},
-            across="patterns",
-            columns=_SHOWN,
-        ),
+        Images("patterns", columns=_SHOWN, title=f"exposure {EQUAL_FRAME}", where={"exposure": EQUAL_FRAME}),
     ),
 )
 
@@ -169,22 +161,10 @@ EXPOSURE = Study(
     points=Axes({"patterns": SHARED, "model": MODELS}),
     measure=_exposure_measure,
     claims=(
-        Gain(
-            claim="49 dots beat 49 uniform frames of the same time",
-            paper="higher",
-            one={"patterns": DOTS},
-            other={"patterns": MANY},
-            at_least=0.0,
-        ),
-        Gain(
-            claim="49 uniform frames are slightly better than one",
-            paper="slightly higher",
-            one={"patterns": MANY},
-            other={"patterns": ONE},
-            at_least=0.0,
-        ),
+        Gain("49 dots beat 49 uniform frames of the same time", DOTS, MANY, paper="higher"),
+        Gain("49 uniform frames are slightly better than one", MANY, ONE, paper="slightly higher"),
         Level(
-            claim="Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)",
+            "Without regularisation, ||x|| / ||x - x'|| is SNR / rho (49 dots)",
             paper="equal",
             where={"ser_over_law": measured},
             column="ser_over_law",
@@ -194,14 +174,14 @@ EXPOSURE = Study(
         ),
     ),
     panels=(
-        Bars(file="psnr.png", title=f"exposure {EQUAL_FRAME}", rows="patterns"),
-        Images(file="images.png", title=f"exposure {EQUAL_FRAME}", across="patterns", columns=SHARED),
+        Bars("patterns", title=f"exposure {EQUAL_FRAME}"),
+        Images("patterns", columns=SHARED, title=f"exposure {EQUAL_FRAME}"),
     ),
 )
 
 # -------- Ambient light
 
-RADIANCES = (1.17, 11.7, 117.0, 1170.0, 11700.0)
+RADIANCES = ("1.17", "11.7", "117", "1170", "11700")
 """Of the scene's lamp [W m^-2 sr^-1]: that of lamp_bench lights its sheet a hundredth as the projector does, to a
 hundred times."""
 AMBIENT_FAMILIES = ("uniform", "dots:8", "hadamard:8")
@@ -266,7 +246,7 @@ def _better_beyond(rows: DataFrame) -> tuple[str, Holds | str]:
     return f"{where}: {text}", decided
 
 
-_HADAMARD_OVER_DOTS = {"one": {"patterns": "hadamard:8"}, "other": {"patterns": "dots:8"}}
+_RATIO = "ratio", "lamp's light over the projector's [1]"
 
 AMBIENT = Study(
     "ambient",
@@ -274,8 +254,8 @@ AMBIENT = Study(
     "How much ambient light does each kind of pattern stand?",
     points=Axes(
         {"patterns": AMBIENT_FAMILIES, "model": (RENDERED,), "exposure": (EQUAL_PEAK,)},
-        scene={"lamp": tuple(f"{radiance:g}" for radiance in RADIANCES)},
-        quick={"lamp": tuple(f"{radiance:g}" for radiance in RADIANCES[::2])},
+        scene={"lamp": RADIANCES},
+        quick={"lamp": RADIANCES[::2]},
         quick_prints=1,
         default="lamp_bench",
     ),
@@ -283,54 +263,37 @@ AMBIENT = Study(
     derive=_by_lamp,
     claims=(
         Gain(
-            claim="Under strong ambient light dots keep less dynamic range than Hadamard patterns "
-            "(part of the full well)",
-            paper="0 to 0.02 against 0.06 to 0.17",
+            "Under strong ambient light dots keep less dynamic range than Hadamard patterns (part of the full well)",
+            "hadamard:8",
+            "dots:8",
             where={"strong": True},
             every="ratio",
             column="range_high",
             unit="",
-            **_HADAMARD_OVER_DOTS,
-            at_least=0.0,
+            paper="0 to 0.02 against 0.06 to 0.17",
         ),
-        Judged(claim="Hadamard patterns are better under strong ambient light", paper="better", decide=_better_beyond),
+        Judged("Hadamard patterns are better under strong ambient light", _better_beyond, paper="better"),
         Gain(
-            claim="Dots are preferred when ambient light is not strong: they take half the frames",
-            paper="preferred",
+            "Dots are preferred when ambient light is not strong: they take half the frames",
+            "dots:8",
+            "hadamard:8",
             where={"least": True},
             every="ratio",
-            **_HADAMARD_OVER_DOTS,
-            at_most=0.0,
+            paper="preferred",
         ),
     ),
     panels=(
-        *(
-            Lines(
-                file=file,
-                title=title,
-                x="ratio",
-                x_label="lamp's light over the projector's [1]",
-                y=column,
-                y_label=y_label,
-                facet="",
-                log=True,
-            )
-            for file, title, column, y_label in (
-                ("psnr.png", "PSNR by the lamp's light, exposure equal peak", "psnr_db", PSNR),
-                (
-                    "range.png",
-                    "The projector's light in bright pixels (99th percentile)",
-                    "range_high",
-                    "part of the full well [1]",
-                ),
-            )
+        Lines(*_RATIO, title="PSNR by the lamp's light, exposure equal peak", facet="", log=True),
+        Lines(
+            *_RATIO,
+            file="range",
+            title="The projector's light in bright pixels (99th percentile)",
+            y="range_high",
+            y_label="part of the full well [1]",
+            facet="",
+            log=True,
         ),
-        Images(
-            file="images.png",
-            title="Images by the lamp's light over the projector's, exposure equal peak",
-            across="ratio",
-            down=("patterns",),
-        ),
+        Images("ratio", title="Images by the lamp's light, exposure equal peak", down=("patterns",), names="{} times"),
     ),
     heads=("Paper", "", "Rendered"),
     note="The lamp's light is its part of a frame of uniform light over the projector's, on the whole sensor. From "

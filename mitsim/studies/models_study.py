@@ -154,23 +154,22 @@ STUDY = Study(
     measure=_measure,
     claims=tuple(
         Judged(
-            claim=f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
+            f"A few frames suffice for the {model} model, brightest pixel at {fraction:g} of the full well",
+            partial(_suffices, model=model),
             where={"exposure_fraction": fraction},
             optional=True,  # a quick study has one exposure
-            decide=partial(_suffices, model=model),
         )
         for fraction in _EXPOSURES
         for model in (WAVE, GEOMETRIC)
     ),
     panels=(
         Lines(
-            file="psnr.png",
+            "frames",
+            "frames of the calibration session [1]",
             title="PSNR by the frames of the calibration session",
-            x="frames",
-            x_label="frames of the calibration session [1]",
             colour="factors",
             facet="exposure_fraction",
-            names={fraction: f"brightest pixel at {fraction:g} of the full well" for fraction in _EXPOSURES},
+            names="brightest pixel at {} of the full well",
             log=True,
         ),
     ),

@@ -243,7 +243,7 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
             added = np.sum([found.parts[cause] for cause in (SENSOR, INTERREFLECTION, SATURATION)], axis=0)
             own: dict[str, Value] = {"patterns": name, "exposure": exposure, "exposure_s": seconds}
             rows.append(point.row(**own, artefacts_db=_decibels(added), **measured))
-            images[f"{name}, {exposure}"] = image
+            images[_KEPT_AS.format(**own)] = image
             if own | _DRAWN == own:
                 images |= {cause: part + _GREY for cause, part in found.parts.items()}
     return Found(tuple(rows), single_precision(images))
@@ -380,6 +380,14 @@ _LIGHT = {
 }
 """Titles and captions of the arrays of a scene with global light, from left to right."""
 
+_GLOSS_OF_DOTS = {"part": GLOSS, "patterns": "dots:7"}
+_SWEPT, _NOT_SWEPT = (
+    {**_GLOSS_OF_DOTS, "subject": tuple(SHAPES)},
+    {"part": GLOSS, "subject": lambda name: name not in SHAPES},
+)
+_KEPT_AS = "{patterns}, {exposure}"
+"""Names of the images of gloss."""
+
 STUDY = Study(
     "reflectivity",
     "Gloss and global light",
@@ -388,24 +396,24 @@ STUDY = Study(
     measure=_measure,
     claims=(
         Level(
-            claim="Gift card and metal blade come out well (artefacts of gloss, 49 dots)",
-            paper="quite good",
-            where={"part": GLOSS, "patterns": "dots:7", "subject": [name for name in SHIPPED if name != DISC]},
+            "Gift card and metal blade come out well (artefacts of gloss, 49 dots)",
+            where={**_GLOSS_OF_DOTS, "subject": [name for name in SHIPPED if name != DISC]},
             every="subject",
             column=_ARTEFACTS,
+            paper="quite good",
             at_least=_PLAIN_DB,
             optional=True,
         ),
         Judged(
-            claim="The compact disc is the worst, with severe artefacts (artefacts of gloss, 49 dots)",
+            "The compact disc is the worst, with severe artefacts (artefacts of gloss, 49 dots)",
+            _is_worst,
+            where={**_GLOSS_OF_DOTS, "subject": SHIPPED},
             paper="severe artefacts",
-            where={"part": GLOSS, "patterns": "dots:7", "subject": SHIPPED},
-            decide=_is_worst,
             optional=True,
         ),
         *(
             Level(
-                claim=f"49 dots tell global light apart in scenes {words}, and the image gains (Nayar et al. 2006)",
+                f"49 dots tell global light apart in scenes {words}, and the image gains (Nayar et al. 2006)",
                 where={"part": GLOBAL_LIGHT, "patterns": "dots:7", "depth": depth},
                 every="subject",
                 column="gain_db",
@@ -417,49 +425,45 @@ STUDY = Study(
     ),
     panels=(
         Lines(
-            file="causes_{exposure}.png",
-            title="exposure {exposure}",
-            where={"subject": tuple(SHAPES), "patterns": _DRAWN["patterns"]},
-            each="exposure",
-            x="roughness",
-            x_label="roughness, alpha of GGX [1]",
+            "roughness",
+            "roughness, alpha of GGX [1]",
+            file="causes",
             y_label="PSNR against matt paint [dB]",
+            where=_SWEPT,
+            each="exposure",
             colour={"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}},
             facet="subject",
             log=True,
         ),
         Images(
-            file="images_{subject}.png",
+            "roughness",
             title="By roughness, 49 dots, equal peak",
-            where={"subject": tuple(SHAPES), **_DRAWN},
+            where=_SWEPT | _DRAWN,
             each="subject",
-            across="roughness",
             down=("subject",),
-            array="{patterns}, {exposure}",
-            names={f"{alpha}": f"alpha {alpha}" for alpha in ROUGHNESSES},
+            array=_KEPT_AS,
+            names="alpha {}",
         ),
         Images(
-            file="images_shipped.png",
-            title="Truths and images",
-            where={"part": GLOSS, "subject": lambda name: name not in SHAPES},
-            across=("patterns", "exposure"),
+            ("patterns", "exposure"),
+            file="images_shipped",
+            where=_NOT_SWEPT,
             down=("subject",),
-            array="{patterns}, {exposure}",
+            array=_KEPT_AS,
             before={name: name for name in _TRUTHS},
         ),
         Images(
-            file="causes_shipped.png",
+            {cause: (name, f"{{{cause}_db:.1f}} dB") for cause, name in _NAMES.items()},
+            file="causes_shipped",
             title="Errors against matt paint by cause, 49 dots, equal peak: grey is no error",
-            where={"part": GLOSS, "subject": lambda name: name not in SHAPES, **_DRAWN},
-            across={cause: (name, f"{{{cause}_db:.1f}} dB") for cause, name in _NAMES.items()},
+            where=_NOT_SWEPT | _DRAWN,
             down=("subject",),
         ),
         Images(
-            file="images_{depth}.png",
-            title="Scenes {depth}, 49 dots",
+            _LIGHT,
+            title="49 dots, scenes",
             where={"part": GLOBAL_LIGHT, "patterns": "dots:7"},
             each="depth",
-            across=_LIGHT,
             down=("subject",),
             names=_DEPTHS,
         ),

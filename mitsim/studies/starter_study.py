@@ -22,16 +22,12 @@ STUDY = Study(
     measure=measure_image,
     claims=(
         Gain(
-            claim="The calibrated distance, 400 mm, is best under 49 dots",
-            where={"patterns": "dots:7"},
-            one={"sheet_z": "400"},
-            other={"sheet_z": "390"},
-            at_least=0.0,  # dB
-        ),
+            "400 mm is best under 49 dots", {"sheet_z": "400"}, {"sheet_z": "390"}, where="dots:7", at_least=0.0
+        ),  # dB
     ),
     panels=(
-        Lines(file="psnr.png", title="PSNR by distance", x="sheet_z", x_label="distance of the sheet [mm]"),
-        Images(file="images.png", title="Images by distance", across="sheet_z", down=("picture", "patterns")),
+        Lines("sheet_z", "distance of the sheet [mm]", title="PSNR by distance"),
+        Images("sheet_z", title="Images by distance", down=("picture", "patterns"), names="{} mm"),
     ),
     heads=("", "", "Rendered"),
 )

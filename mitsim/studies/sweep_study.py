@@ -100,17 +100,15 @@ def _figures(results: Results) -> Mapping[str, Figure]:
     """Draw the images, and each measure over the first knob with numbers, a curve for each setting of the others."""
     (first, *others), names = _knobs(results), _named(results)
     title = f"Images by {' and '.join(axis_of(results.scope.setup, knob)[0] for knob in (first, *others))}"
-    panels: list[Panel] = [
-        Images(file="images.png", title=title, across=first, down=("picture", *others), names=names | {None: ""})
-    ]
+    panels: list[Panel] = [Images(first, title=title, down=("picture", *others), names=names | {None: ""})]
     numeric = [knob for knob in (first, *others) if all(map(_is_number, distinct(results.frame, knob)))]
     for name in results.scope.measures if numeric else ():
         column, axis = MEASURES[name]
         panels.append(
             Lines(
-                file=f"{name}.png",
-                x=numeric[0],
-                x_label=": ".join(axis_of(results.scope.setup, numeric[0])),
+                numeric[0],
+                ": ".join(axis_of(results.scope.setup, numeric[0])),
+                file=name,
                 y=column,
                 y_label=axis,
                 colour=[knob for knob in (first, *others) if knob != numeric[0]],
@@ -123,7 +121,7 @@ def _figures(results: Results) -> Mapping[str, Figure]:
 
 def _settings(results: Results, with_knob: bool = True) -> dict[str, DataFrame]:
     """Return the rows of each setting by its name."""
-    parts = Panel(file="", names=_named(results, with_knob)).parts(results.frame, _knobs(results))
+    parts = Panel(names=_named(results, with_knob)).parts(results.frame, _knobs(results))
     return {name: rows for name, (rows, _) in parts.items()}
 
 

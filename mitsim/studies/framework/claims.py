@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError
@@ -31,15 +31,16 @@ CONFIDENCE = 0.95
 """Confidence of an interval, as for the stated uncertainty of images."""
 Holds = bool | None
 """True, False, or None for a claim that is not decided."""
-Where = Mapping[str, Any]
-"""Values by column that choose rows: a value, a sequence of allowed values, or a function that accepts a value."""
+Where = Mapping[str, Any] | str
+"""Values by column that choose rows: a value, a sequence of allowed values, or a function that accepts a value; a text
+is the value of the column patterns."""
 
 # -------- Rows in, means with their standard errors out
 
 
 def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
     """Return the rows that have the values ``where`` names; a column that the table lacks has the value None."""
-    for name, value in where.items():
+    for name, value in _chosen(where).items():
         column: Any = rows[name] if name in rows else rows.index.to_series().map(lambda _: None)
         if callable(value):
             kept = column.map(lambda each, accept=value: bool(accept(each)))
@@ -49,6 +50,10 @@ def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
             kept = column.isna() if value is None else column == value
         rows = rows[kept.astype(bool)]
     return rows
+
+
+def _chosen(where: Where) -> Mapping[str, Any]:
+    return {"patterns": where} if isinstance(where, str) else where
 
 
 def measured(value: Any) -> bool:
@@ -163,7 +168,7 @@ _SHOWN = 4
 """Number of values that the figures of a claim list; of more values they state the one that decides."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Statement:
     """A claim as a study declares it.
 
@@ -182,6 +187,7 @@ class Statement:
     """
 
     claim: str
+    _: KW_ONLY
     paper: str = ""
     where: Where = field(default_factory=dict)
     each: str = ""
@@ -253,7 +259,7 @@ class Statement:
         return f"{text}{more}", every(*(holds for _, holds, _ in found.values()))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Level(Statement):
     """A claim that the mean of a column lies in a range.
 
@@ -265,6 +271,7 @@ class Level(Statement):
         ends of the range.
     """
 
+    _: KW_ONLY
     column: str = "psnr_db"
     unit: str = "dB"
     at_least: float = -math.inf
@@ -277,7 +284,7 @@ class Level(Statement):
         return text, within(mean, self.at_least, self.at_most), _margin(mean, self.at_least, self.at_most)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Gain(Statement):
     """A claim that some images exceed others by an amount in a range, compared print by print.
 
@@ -288,20 +295,21 @@ class Gain(Statement):
     column, other_column, unit
         what is compared, its column in ``other`` if it has another name, and its unit.
     at_least, at_most
-        range of the gain of ``one`` over ``other``.
+        range of the gain of ``one`` over ``other``; by default it is above 0.
     """
 
     one: Where
     other: Where
+    _: KW_ONLY
     column: str = "psnr_db"
     other_column: str = ""
     unit: str = "dB"
-    at_least: float = -math.inf
+    at_least: float = 0.0
     at_most: float = math.inf
 
     @property
     def _compared(self) -> frozenset[str]:
-        return frozenset({*self.one, *self.other})
+        return frozenset({*_chosen(self.one), *_chosen(self.other)})
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
         """Return both means and the gain, whether it lies in the range, and its margin."""
@@ -313,7 +321,7 @@ class Gain(Statement):
         return text, within(gain, self.at_least, self.at_most), _margin(gain, self.at_least, self.at_most)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Judged(Statement):
     """A claim that a function decides: from the rows of one model and exposure to figures and whether it holds, or the
     words of its verdict."""
@@ -340,7 +348,7 @@ def stated(claim: str, low: float, high: float, **where: Any) -> Level:
         rows that the claim is about.
     """
     paper = f"{low:g} to {high:g} dB"
-    return Level(claim=claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)
+    return Level(claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)
 
 
 def with_unit(mean: Mean, unit: str, sign: str = "") -> str:

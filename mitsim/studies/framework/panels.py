@@ -7,7 +7,7 @@ come from :func:`mitsim.studies.framework.claims.mean_of`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import pairwise, product
 from string import Formatter
 from typing import TYPE_CHECKING, Any
@@ -29,27 +29,28 @@ Columns = str | Sequence[str] | Mapping[str, str]
 """A column whose values are told apart, several whose combinations are, or names by column whose numbers are shown
 beside each other."""
 Names = Mapping[Any, str] | str
-"""Names by value, or by (column, value); or a template such as "{} mm"."""
+"""Names by value, or by (column, value); or a template for numbers such as "{} mm"."""
 PSNR = "PSNR [dB]"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Panel:
     """A figure of a study.
 
     Attributes
     ----------
     file, title
-        name of the file, and what stands above; both may contain {column} of ``each``.
+        name of the file without its ending, by default that of the measure or images, and what stands above.
     where
         rows that are shown.
     each
-        column: there is a figure for each of its values.
+        column: there is a figure for each of its values, which file and title end with.
     names
         names of values in the legend, beside rows and above columns.
     """
 
-    file: str
+    _: KW_ONLY
+    file: str = ""
     title: str = ""
     where: Where = field(default_factory=dict)
     each: str = ""
@@ -59,13 +60,20 @@ class Panel:
         """Return the figures by file name; a panel without rows has none."""
         rows = choose_rows(results.frame, self.where)
         drawn: dict[str, Figure | None] = {}
-        for value in distinct(rows, self.each) if self.each else ():
-            one = replace(self, title=self.title.format(**{self.each: self.name(self.each, value)}), each="")
-            name = self.file.format(**{self.each: str(value).replace(" ", "_").replace(":", "")})
-            drawn[name] = one.figure(results, choose_rows(rows, {self.each: value}))
-        if not self.each:
-            drawn[self.file] = self.figure(results, rows)
+        for value in distinct(rows, self.each) if self.each else [""]:
+            shown = f"exposure {value}" if self.each == "exposure" else self.name(self.each, value)
+            one = replace(self, title=", ".join(filter(None, (self.title, shown))))
+            name = (
+                "_".join(filter(None, (self.file or self.default_file, str(value)))).replace(" ", "_").replace(":", "")
+            )
+            own = choose_rows(rows, {self.each: value} if self.each else {})
+            drawn[f"{name}.png"] = one.figure(results, own)
         return {name: figure for name, figure in drawn.items() if figure is not None}
+
+    @property
+    def default_file(self) -> str:
+        """Name of the file of a panel that states none."""
+        return "images"
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return one figure of some ``rows``; None if they have nothing to show."""
@@ -73,8 +81,8 @@ class Panel:
 
     def name(self, column: str, value: Any) -> str:
         """Return the name of a ``value`` of a ``column``."""
-        if isinstance(self.names, str) and value is not None:
-            return self.names.format(f"{float(value):g}" if _is_number(value) else value)
+        if isinstance(self.names, str) and _is_number(value):
+            return self.names.format(f"{float(value):g}")
         for key in ((column, value), value):
             if not isinstance(self.names, str) and key in self.names:
                 return self.names[key]
@@ -115,7 +123,7 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Lines(Panel):
     """Means of a column over another with bars of one standard error, a curve for each colour, facets below each other.
 
@@ -135,6 +143,7 @@ class Lines(Panel):
 
     x: str
     x_label: str
+    _: KW_ONLY
     y: str = "psnr_db"
     y_label: str = PSNR
     colour: Columns = "patterns"
@@ -142,6 +151,11 @@ class Lines(Panel):
     shared: Where | None = None
     log: bool = False
     ticks: bool = True
+
+    @property
+    def default_file(self) -> str:
+        """Name of the measure."""
+        return self.y.removesuffix("_db")
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return the figure; None without rows."""
@@ -168,7 +182,7 @@ class Lines(Panel):
         return {float(value): mean_of(choose_rows(rows, {self.x: value}), column) for value in distinct(rows, self.x)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Bars(Panel):
     """Means of a column as horizontal bars with one standard error, a group for each row, a bar for each colour.
 
@@ -183,10 +197,16 @@ class Bars(Panel):
     """
 
     rows: Columns
+    _: KW_ONLY
     colour: Columns = "model"
     x: str = "psnr_db"
     x_label: str = PSNR
     ordered: bool = False
+
+    @property
+    def default_file(self) -> str:
+        """Name of the measure."""
+        return self.x.removesuffix("_db")
 
     def figure(self, results: Results, rows: DataFrame) -> Figure | None:
         """Return the figure; None without rows."""
@@ -212,7 +232,7 @@ _MOST_SHOWN = 6
 """Images along either side of a grid: more would be too small to compare on a page."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Images(Panel):
     """A grid of images with their truths and a caption below each; rows with a missing image are left out.
 
@@ -232,6 +252,7 @@ class Images(Panel):
     """
 
     across: str | Sequence[str] | Mapping[str, tuple[str, str]]
+    _: KW_ONLY
     columns: Sequence[Any] | None = None
     down: Sequence[str] = ("picture", "model")
     array: str = IMAGE

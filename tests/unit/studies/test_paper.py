@@ -88,7 +88,7 @@ def test_verdicts(peak: str, frame: str, verdict: str) -> None:
     holds = {"+": True, "-": False, "?": None}
     signs = {(model, name): holds[sign] for name, two in (("peak", peak), ("frame", frame))
              for model, sign in zip(MODELS, two, strict=True)}  # fmt: skip
-    claim = Judged(claim="", decide=lambda rows: ("", signs[rows["model"].iloc[0], rows["exposure"].iloc[0]]))
+    claim = Judged("", lambda rows: ("", signs[rows["model"].iloc[0], rows["exposure"].iloc[0]]))
     assert judged(claim, **{f"{model}__{name}": 0.0 for model, name in signs}).verdict == verdict
 
 
@@ -98,8 +98,8 @@ def test_images_are_those_of_their_rows() -> None:
     rows = [{"point": f"{name}{number}", "kind": name, "number": number} for name in "ab" for number in (1, 2)]
     arrays = {(str(row["point"]), IMAGE): np.full((2, 2), index) for index, row in enumerate(rows)}
     del arrays["b1", IMAGE]
-    grid = Images(file="x.png", across="number", columns=(2, 1), down=("kind",), caption="number {number}")
-    cells = grid.draw(Results(rows, arrays))["x.png"].axes
+    grid = Images("number", columns=(2, 1), down=("kind",), caption="number {number}")
+    cells = grid.draw(Results(rows, arrays))["images.png"].axes
     assert [axes.get_ylabel() for axes in cells] == ["a", ""]
     assert [(float(axes.images[0].get_array()[0, 0]), axes.get_xlabel()) for axes in cells] == [
         (lightness(np.array(1.0)), "number 2"), (0, "number 1")

@@ -46,10 +46,6 @@ STUDY = Study(
     "How large are squares?",
     points=points,
     measure=measure,
-    claims=(Judged(claim="Two squared is four", paper="4", where={"number": 2}, decide=at_four),),
-    panels=(
-        Lines(
-            file="squares.png", x="number", x_label="number [1]", y="square", y_label="square [1]", colour="", facet=""
-        ),
-    ),
+    claims=(Judged("Two squared is four", at_four, paper="4", where={"number": 2}),),
+    panels=(Lines("number", "number [1]", file="squares", y="square", y_label="square [1]", colour="", facet=""),),
 )
