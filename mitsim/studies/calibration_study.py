@@ -41,7 +41,7 @@ from mitsim.studies import error_budget
 from mitsim.studies.ablation import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import LossRow
-from mitsim.studies.framework.findings import Part
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
 _FORMED = frozenset({"diffraction", "mask-thickness", "black-level"})

@@ -55,7 +55,7 @@ from mitsim.report.lit_scene import (
 )
 from mitsim.report.pages import Mean
 from mitsim.studies.ablation import reform
-from mitsim.studies.framework.findings import Part
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
 MASKS: tuple[CameraMask, ...] = ("separable", "flatcam")

@@ -17,7 +17,6 @@ from mitsim.studies.framework.experiment import (
     KNOBS,
     MEASURES,
     NO_SCENE,
-    PageTable,
     Point,
     Results,
     Scope,
@@ -27,6 +26,7 @@ from mitsim.studies.framework.experiment import (
     group_by_setup,
     number_of,
 )
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.panels import Images, Lines, Panel
 from mitsim.studies.framework.studio import measure_image
 
@@ -137,7 +137,7 @@ def _message(results: Results) -> str:
     return f"PSNR is highest at {best} ({levels[best]:.1f} dB), lowest at {worst} ({levels[worst]:.1f} dB)"
 
 
-def _tables(results: Results) -> Sequence[PageTable]:
+def _tables(results: Results) -> Sequence[Part]:
     """Return each measure at each setting, and how many images of it are flagged."""
     rows = []
     for name, own in _settings(results, with_knob=False).items():
@@ -148,7 +148,7 @@ def _tables(results: Results) -> Sequence[PageTable]:
     # Each axis ends with its unit.
     units = {name: axis[axis.rindex("[") :] for name, (_, axis) in MEASURES.items()}
     heads = names, *(f"{name.replace('_', '-')} {units[name]}" for name in results.scope.measures), "flagged"
-    return [PageTable("Measures by setting", heads, tuple(rows))]
+    return [Part("Measures by setting", "", heads, tuple(rows))]
 
 
 def _mean_text(rows: DataFrame, column: str) -> str:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from mitsim.core.arrays import FloatArray
     from mitsim.report.pages import Table, Value
     from mitsim.studies.framework.claims import Statement
+    from mitsim.studies.framework.page import Part
     from mitsim.studies.framework.panels import Panel
 
 # -------- Where a study measures: setups, points, axes
@@ -303,16 +304,6 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class PageTable:
-    """A table on a study's page: a ``title`` with units, ``headings`` (the first column has names, the others numbers)
-    and ``rows`` of text."""
-
-    title: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
 class Study:
     """A study of many points.
 
@@ -358,7 +349,7 @@ class Study:
     claims: Sequence[Statement | Callable[[Results], Sequence[Claim]]] = ()
     panels: Sequence[Panel | Callable[[Results], Mapping[str, Figure]]] = ()
     derive: Callable[[Results], Results] | None = None
-    tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
+    tables: Callable[[Results], Sequence[Part]] = lambda results: ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from mitsim.report.pages import Mean, Table
 from mitsim.studies.framework.claims import mean_of
-from mitsim.studies.framework.experiment import HEADS, Claim, Found, PageTable, Point, Results, Scope
+from mitsim.studies.framework.experiment import HEADS, Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.page import Part
 
 
 def sample_mean(rows: Table, column: str) -> Mean:
@@ -42,7 +43,7 @@ class Experiment:
     measure: Callable[[Any, Point], Found]
     claims: Callable[[Results], Sequence[Claim]]
     figures: Callable[[Results], Mapping[str, Figure]]
-    tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
+    tables: Callable[[Results], Sequence[Part]] = lambda results: ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS

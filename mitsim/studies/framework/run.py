@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatch
 from functools import partial
 from itertools import groupby
@@ -21,14 +21,14 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_output, check_plain, output_folder, read_json, whole_file, write_json, write_text
 from mitsim.core.job import Job
 from mitsim.studies import ALL, PAPER, STUDIES
-from mitsim.studies.framework.experiment import Found, Point, Results, no_such_study
+from mitsim.studies.framework.experiment import HEADS, Claim, Found, Point, Results, no_such_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.api.bench import Bench
     from mitsim.report.pages import Table
-    from mitsim.studies.framework.findings import Part
+    from mitsim.studies.framework.page import Part, Section
 
 
 DPI = 150
@@ -92,15 +92,59 @@ class Findings:
         return ()
 
 
-class InFolder:
-    """What a study came to, for programs and notebooks: ``rows`` of its table, and the folder ``output``."""
+@dataclass(frozen=True)
+class StudyResult:
+    """Result of a study, for the command line, programs and notebooks.
 
-    rows: tuple[Any, ...]
+    Attributes
+    ----------
+    study, output
+        name, and the folder that holds the study.
+    rows
+        rows of its table.
+    warnings
+        reasons why it may not be trusted.
+    findings, scene, patterns
+        of a study of one bench: findings, and the scene and patterns that they are of; None: of none.
+    points, missing, seconds
+        of a study of many points: measured points, those of other parts that are missing, and the time of measuring.
+    claims, figures, section
+        of a whole study of many points: judged claims, files of figures, and its section of a page.
+    """
+
+    study: str
     output: str
+    rows: tuple[Any, ...] = field(default=(), repr=False)
+    warnings: tuple[str, ...] = ()
+    findings: Findings | None = None
+    scene: str | None = None
+    patterns: str | None = None
+    points: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    claims: tuple[Claim, ...] = ()
+    figures: tuple[str, ...] = ()
+    section: Section | None = field(default=None, repr=False)
+
+    def payload(self) -> dict[str, Any]:
+        """Return the result as JSON has it."""
+        if self.findings is not None:
+            return {**self.findings.payload(), "scene": self.scene, "patterns": self.patterns, "output": self.output}
+        names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
+        return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
 
     def lines(self) -> list[str]:
-        """For people."""
-        raise NotImplementedError
+        """Return the result as text."""
+        if self.findings is not None:
+            return [f"JSON and plots: {self.output}", *self.findings.lines()]
+        if self.missing:
+            return [
+                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
+                "Join all parts with: mitsim study merge PART... -o FOLDER",
+            ]
+        heads = self.section.heads if self.section else HEADS
+        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
     def to_pandas(self) -> Any:
         """Return the rows as a ``pandas.DataFrame``."""
@@ -120,32 +164,6 @@ class InFolder:
             f'<img style="max-width:100%" src="{data_uri(each.read_bytes())}">' for each in self.pictures.values()
         )
         return card(f"Study in {self.output}", {}, self.lines()) + "".join(figures)
-
-
-@dataclass(frozen=True)
-class StudyResult(InFolder):
-    """Findings, of which scene and patterns they are (None: of none), the folder ``output`` that holds them, and the
-    ``rows`` of their table."""
-
-    findings: Findings
-    scene: str | None
-    patterns: str | None
-    output: str
-    rows: tuple[Any, ...] = field(default=(), repr=False)
-
-    def payload(self) -> dict[str, Any]:
-        """What the command line reports."""
-        where = {"scene": self.scene, "patterns": self.patterns, "output": self.output}
-        return {**self.findings.payload(), **where}
-
-    def lines(self) -> list[str]:
-        """For people."""
-        return [f"JSON and plots: {self.output}", *self.findings.lines()]
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Of the findings."""
-        return self.findings.warnings
 
 
 def run_study(
@@ -173,13 +191,14 @@ def run_study(
     with study_folder(output, name) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
-        result = StudyResult(findings, scene, patterns, str(folder), tuple(findings.records()))
+        warnings = tuple(findings.warnings)
+        result = StudyResult(name, str(folder), tuple(findings.records()), warnings, findings, scene, patterns)
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = write_figures(folder, findings.figures())
         if findings.title:
             from mitsim.report.pages import page_figure
-            from mitsim.studies.framework.findings import build_findings
+            from mitsim.studies.framework.page import build_findings
 
             scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
             where = f"{scene_name} {request.seed}."

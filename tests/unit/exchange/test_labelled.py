@@ -108,7 +108,7 @@ def test_a_studys_rows_are_a_table(tmp_path: Path) -> None:
 
     findings: Any = Toy()
     rows = ({"x": 1, "psnr_db": 20.5}, {"x": 2, "psnr_db": 21.5})
-    found = StudyResult(findings, None, None, str(tmp_path), rows)
+    found = StudyResult("toy", str(tmp_path), rows, findings=findings)
     (tmp_path / "toy.png").write_bytes(b"\x89PNG")
     assert found.pictures == {"toy.png": tmp_path / "toy.png"} and "It is 1." in found._repr_html_()
     assert found.to_pandas().equals(pandas.DataFrame([*rows]))

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +135,7 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     ]
     results = Results(rows, scope=scope)
     assert not experiment.draw(results)
-    section = Section.of(experiment, "sweep", scope, (), {}, results)
+    section = Section.of(experiment, "sweep", (), {}, results)
     page = build_page([section], tmp_path / "sweep.html", section.title).read_text()
     reported = (
         "mitsim study sweep photograph --over mask=separable,flatcam --measure psnr,misfit --patterns dots:4 --seed 3"
@@ -142,8 +143,8 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     assert section.command == reported and "Sweep of mask" in page and "Zheng" not in page
     assert "PSNR is highest at mask separable (31.2 dB), lowest at mask flatcam (20.0 dB)" in page
     assert "1 of 2 images are flagged" in page
-    (table,) = section.tables
-    assert table.headings == ("mask", "psnr [dB]", "misfit [1]", "flagged")
+    (table,) = section.parts
+    assert table.head == ("mask", "psnr [dB]", "misfit [1]", "flagged")
     assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))
 
 
@@ -152,7 +153,7 @@ def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
     experiment = find_experiment("reflectivity")
     point: Point = experiment.points(WHOLE)[0]
     results = Results([{"point": point.key}])
-    assert "good to 0.003 " in Section.of(experiment, "reflectivity", WHOLE, (), {}, results).count
+    assert "good to 0.003 " in Section.of(experiment, "reflectivity", (), {}, replace(results, scope=WHOLE)).count
 
 
 def test_figures_of_gloss_have_each_image_under_its_title() -> None:
