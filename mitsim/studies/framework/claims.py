@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import FAMILIES
-from mitsim.report import IDEALISED, MODELS, RENDERED, in_text
+from mitsim.report import IDEALISED, RENDERED, in_text
 from mitsim.report.pages import Mean, round_to_error
 from mitsim.studies.framework.experiment import Claim, Results
 
@@ -182,6 +182,8 @@ class Statement:
         column: there is a claim for each of its values.
     every
         column: the claim must hold for each of its values.
+    models
+        column of the models, and its two values, whose figures take the places of the idealised and rendered ones.
     optional
         True to leave the claim out where no row of it was measured, for example on a user's own scene.
     """
@@ -193,6 +195,7 @@ class Statement:
     each: str = ""
     every: str = ""
     optional: bool = False
+    models: tuple[str, str, str] = ("model", IDEALISED, RENDERED)
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
         """Return figures, whether the claim holds for some ``rows``, and the margin inside the range's nearest end."""
@@ -219,16 +222,15 @@ class Statement:
         return frozenset()
 
     def _judge(self, rows: DataFrame, claim: str) -> Claim:
-        known, exposures = (
-            [] if column in self._compared else distinct(rows, column) for column in ("model", "exposure")
-        )
-        models, exposures = [model for model in MODELS if model in known] or [RENDERED], exposures or [None]
+        column, *both = self.models
+        known, exposures = ([] if each in self._compared else distinct(rows, each) for each in (column, "exposure"))
+        models, exposures = [model for model in both if model in known] or both[1:], exposures or [None]
         found = {}
         for model in models:
-            own = choose_rows(rows, {"model": model} if model in known else {})
+            own = choose_rows(rows, {column: model} if model in known else {})
             for each in exposures:
                 found[model, each] = self._found(own if each is None else choose_rows(own, {"exposure": each}))
-        figures = dict.fromkeys((IDEALISED, RENDERED), "") | {
+        figures = dict.fromkeys(both, "") | {
             model: "; ".join(
                 found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
                 for each in exposures
@@ -242,7 +244,7 @@ class Statement:
             rest = [f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None]
             decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
         words = [holds for _, holds in found.values() if isinstance(holds, str)]
-        return Claim(claim, self.paper, figures[IDEALISED], figures[RENDERED], words[0] if words else decided)
+        return Claim(claim, self.paper, figures[both[0]], figures[both[1]], words[0] if words else decided)
 
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:
         if not self.every:

@@ -17,7 +17,7 @@ from functools import cache, cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mitsim.bench.request import Request
 from mitsim.core.environment import DEFAULT_VARIANT
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
 
     from mitsim.core.arrays import FloatArray
     from mitsim.report.pages import Table, Value
-    from mitsim.studies.framework.claims import Statement
-    from mitsim.studies.framework.page import Part
-    from mitsim.studies.framework.panels import Panel
 
 # -------- Where a study measures: setups, points, axes
 
@@ -303,6 +300,20 @@ class Claim:
         return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
 
 
+class Judges(Protocol):
+    """A claim as a study declares it (:mod:`mitsim.studies.framework.claims`)."""
+
+    def judge(self, results: Results) -> list[Claim]:
+        """Return the judged claims."""
+
+
+class Draws(Protocol):
+    """A figure as a study declares it (:mod:`mitsim.studies.framework.panels`)."""
+
+    def draw(self, results: Results) -> dict[str, Figure]:
+        """Return figures by file name."""
+
+
 @dataclass(frozen=True)
 class Study:
     """A study of many points.
@@ -322,7 +333,7 @@ class Study:
     derive
         from all results to results with more columns, for columns that need more than one point; None adds none.
     tables
-        from all results to tables of the page; all numbers are in the study's CSV and JSON as well.
+        from all results to parts of the page (:class:`mitsim.studies.framework.page.Part`).
     message
         from all results to the page's first sentence; an empty one is replaced by the number of claims that hold.
     about
@@ -346,10 +357,10 @@ class Study:
     question: str
     points: Callable[[Scope], Sequence[Point]]
     measure: Callable[[Any, Point], Found]
-    claims: Sequence[Statement | Callable[[Results], Sequence[Claim]]] = ()
-    panels: Sequence[Panel | Callable[[Results], Mapping[str, Figure]]] = ()
+    claims: Sequence[Judges | Callable[[Results], Sequence[Claim]]] = ()
+    panels: Sequence[Draws | Callable[[Results], Mapping[str, Figure]]] = ()
     derive: Callable[[Results], Results] | None = None
-    tables: Callable[[Results], Sequence[Part]] = lambda results: ()
+    tables: Callable[[Results], Sequence[Any]] = lambda results: ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS
