@@ -35,7 +35,7 @@ from mitsim.reconstruct.estimate_factors import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import plots
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.pages import Mean, Table, with_error
+from mitsim.report.pages import Mean, with_error
 from mitsim.report.plots import bars
 from mitsim.studies import error_budget
 from mitsim.studies.ablation import ablations, reform
@@ -532,12 +532,12 @@ class CalibrationFindings(Findings):
             tuple(rows),
         )
 
-    def tables(self) -> dict[str, Table]:
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
         """By file name."""
         return {
-            "singular.csv": Table(tuple(asdict(row) for row in self.singular)),
-            "causes.csv": Table(tuple(asdict(row) for row in self.causes)),
-            "losses.csv": Table(tuple(asdict(row) for row in self.losses)),
+            "singular.csv": [asdict(row) for row in self.singular],
+            "causes.csv": [asdict(row) for row in self.causes],
+            "losses.csv": [asdict(row) for row in self.losses],
         }
 
 

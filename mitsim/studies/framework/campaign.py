@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from mitsim.bench.apparatus import check_scene, open_apparatus
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, cut
-from mitsim.core.files import read_json, sweep, write_json, write_text
+from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
@@ -40,6 +40,7 @@ from mitsim.studies.framework.run import (
     check_study_folder,
     study_folder,
     write_figures,
+    write_table,
 )
 
 if TYPE_CHECKING:
@@ -262,7 +263,7 @@ class _Campaign:
             return result
         results = replace(store.results(self.points), scope=self.scope)
         claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
-        write_text(folder / f"{experiment.name}.csv", results.frame.to_csv(index=False))
+        write_table(folder / f"{experiment.name}.csv", results.rows)
         section = Section.of(experiment, self.study, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", section.title)
         rows, named = tuple(map(dict, results.rows)), tuple(figures)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError
@@ -66,7 +66,13 @@ def distinct(rows: DataFrame, column: str) -> list[Any]:
     return list(rows[column].dropna().drop_duplicates()) if column in rows else []
 
 
-def mean_of(rows: DataFrame, column: str = "psnr_db", minus: DataFrame | None = None, minus_column: str = "") -> Mean:
+def mean_of(
+    rows: DataFrame,
+    column: str = "psnr_db",
+    minus: DataFrame | None = None,
+    minus_column: str = "",
+    error_column: str = "",
+) -> Mean:
     """Return the mean of a column with its standard error, over prints, or over seeds where there is one print.
 
     Parameters
@@ -76,6 +82,8 @@ def mean_of(rows: DataFrame, column: str = "psnr_db", minus: DataFrame | None = 
     minus, minus_column
         rows of the same prints and seeds, whose values are subtracted print by print, and their column if it has
         another name.
+    error_column
+        column of an error that all rows share, which is added to that of the mean in quadrature.
 
     Raises
     ------
@@ -88,7 +96,11 @@ def mean_of(rows: DataFrame, column: str = "psnr_db", minus: DataFrame | None = 
     level = _means_by(rows, by, column)
     if minus is not None:
         level = (level - _means_by(minus, by, minus_column or column)).dropna()
-    return Mean.of_numbers(level.tolist(), column)
+    mean = Mean.of_numbers(level.tolist(), column)
+    if not error_column:
+        return mean
+    own = 0.0 if math.isnan(mean.error) else mean.error
+    return mean._replace(error=math.hypot(own, mean_of(rows, error_column).value))
 
 
 def _keys(rows: DataFrame, by: str) -> Series[Any]:
@@ -298,6 +310,9 @@ class Gain(Statement):
         what is compared, its column in ``other`` if it has another name, and its unit.
     at_least, at_most
         range of the gain of ``one`` over ``other``; by default it is above 0.
+    apart, other_error
+        True to state ``other`` under the first head and ``one`` under the second; and the column of an error of
+        ``other`` beside that of its mean.
     """
 
     one: Where
@@ -308,10 +323,22 @@ class Gain(Statement):
     unit: str = "dB"
     at_least: float = 0.0
     at_most: float = math.inf
+    apart: bool = False
+    other_error: str = ""
 
     @property
     def _compared(self) -> frozenset[str]:
         return frozenset({*_chosen(self.one), *_chosen(self.other)})
+
+    def _judge(self, rows: DataFrame, claim: str) -> Claim:
+        judged = super()._judge(rows, claim)
+        if not self.apart:
+            return judged
+        one, other = choose_rows(rows, self.one), choose_rows(rows, self.other)
+        before = mean_of(other, self.other_column or self.column, error_column=self.other_error)
+        return replace(
+            judged, idealised=with_unit(before, self.unit), rendered=with_unit(mean_of(one, self.column), self.unit)
+        )
 
     def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
         """Return both means and the gain, whether it lies in the range, and its margin."""

@@ -47,6 +47,8 @@ class Panel:
         column: there is a figure for each of its values, which file and title end with.
     names
         names of values in the legend, beside rows and above columns.
+    errors
+        columns of errors that all rows share, by the column of numbers that they belong to.
     """
 
     _: KW_ONLY
@@ -55,6 +57,7 @@ class Panel:
     where: Where = field(default_factory=dict)
     each: str = ""
     names: Names = field(default_factory=dict)
+    errors: Mapping[str, str] = field(default_factory=dict)
 
     def draw(self, results: Results) -> dict[str, Figure]:
         """Return the figures by file name; a panel without rows has none."""
@@ -179,7 +182,10 @@ class Lines(Panel):
         if column not in rows:
             return {}
         rows = rows[to_numeric(rows[column], errors="coerce").notna()]
-        return {float(value): mean_of(choose_rows(rows, {self.x: value}), column) for value in distinct(rows, self.x)}
+        return {
+            float(value): mean_of(choose_rows(rows, {self.x: value}), column, error_column=self.errors.get(column, ""))
+            for value in distinct(rows, self.x)
+        }
 
 
 @dataclass(frozen=True)
@@ -214,14 +220,16 @@ class Bars(Panel):
 
         if rows.empty:
             return None
-        groups = {
-            group: {
-                bar: mean_of(line, other or column or self.x)
-                for bar, (line, other) in self.parts(own, self.colour).items()
-                if (other or column or self.x) in line and line[other or column or self.x].notna().any()
+        groups: dict[str, dict[str, Mean]] = {}
+        for group, (own, column) in self.parts(rows, self.rows).items():
+            parts = (
+                (bar, line, other or column or self.x) for bar, (line, other) in self.parts(own, self.colour).items()
+            )
+            groups[group] = {
+                bar: mean_of(line, shown, error_column=self.errors.get(shown, ""))
+                for bar, line, shown in parts
+                if shown in line and line[shown].notna().any()
             }
-            for group, (own, column) in self.parts(rows, self.rows).items()
-        }
         groups = {group: bars for group, bars in groups.items() if bars}
         if self.ordered:
             groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.api.bench import Bench
-    from mitsim.report.pages import Table
     from mitsim.studies.framework.page import Part, Section
 
 
@@ -45,6 +44,13 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
         with whole_file(folder / file) as part:
             figure.savefig(part, dpi=DPI, format="png")
     return drawn
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError when it cannot be written."""
+    from pandas import DataFrame
+
+    write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
 
 
 class Findings:
@@ -65,8 +71,8 @@ class Findings:
         """By file name."""
         raise NotImplementedError
 
-    def tables(self) -> Mapping[str, Table]:
-        """By file name."""
+    def tables(self) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        """Return rows of tables by file name."""
         return {}
 
     def parts(self) -> Sequence[Part]:
@@ -76,7 +82,7 @@ class Findings:
     def records(self) -> list[dict[str, Any]]:
         """What was measured, a dictionary a row: the first table, or the first list of such in the JSON."""
         for table in self.tables().values():
-            return [dict(row) for row in table.rows]
+            return [dict(row) for row in table]
         lists = (value for value in self.payload().values() if isinstance(value, list | tuple))
         found = ([dict(row) for row in each if isinstance(row, Mapping)] for each in lists)
         return next((rows for rows in found if rows), [])
@@ -207,7 +213,7 @@ def run_study(
             page = build_findings(name, titles, where, findings.parts(), pictures, result.warnings)
             write_text(folder / f"{name}.html", page)
         for file, table in findings.tables().items():
-            table.write(folder / file)
+            write_table(folder / file, table)
         return result
 
 
