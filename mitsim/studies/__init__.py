@@ -5,14 +5,14 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("accuracy", "calibration", "diffraction", "transfer", "twin")
+STUDIES = ("accuracy", "calibration", "transfer", "twin")
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.run.Findings`."""
 OF_NO_SCENE = ("transfer", "twin")
 """Those whose bench is None."""
 OF_CAPTURES = ("transfer", "twin")
 """Those of real captures (`--data`)."""
-EXPOSED = ("calibration", "diffraction")
+EXPOSED = ("calibration",)
 """Those whose frames fill a part of the camera's full well."""
 PAPER = (
     "patterns",
@@ -38,6 +38,7 @@ SHARED = {
 }
 """Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
 GONE = {
+    "diffraction": "calibration SCENE",
     "regularisation": "sweep SCENE --over method=tikhonov,tv",
     "separation": "reflectivity",
 }

@@ -10,7 +10,7 @@ image that is solved, and what of it is not explained (:mod:`mitsim.studies.erro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -34,7 +34,7 @@ from mitsim.light.light import SampledLight
 from mitsim.reconstruct.estimate_factors import Estimate, decibels
 from mitsim.reconstruct.factors import Factors
 from mitsim.report import plots
-from mitsim.report.lit_scene import LitScene
+from mitsim.report.lit_scene import LINE, IdealCamera, LitScene, ShadowRow, lights, point_profiles, shadow_row
 from mitsim.report.pages import Mean, with_error
 from mitsim.report.plots import bars
 from mitsim.studies import error_budget
@@ -87,7 +87,22 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     stand = DriftStand(scene, _factors(lit, noisy), recipe, family, request.seed)
     rows, refused = error_budget.losses(stand, lit, _factors(lit, clean))
     explained = sum(row.squared_error for row in rows if row.of != error_budget.UNEXPLAINED)
-    return replace(found, image=_image(stand, explained), losses=tuple(rows), not_predicted=tuple(refused))
+    shadows, profiles = compare_shadows(bench)
+    left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
+    geometric = replace(stand, factors=replace(stand.factors, left=left, right=right))
+    image = _image(stand, explained) | {"geometric_psnr_db": geometric.before_db}
+    return replace(
+        found, image=image, losses=tuple(rows), not_predicted=tuple(refused), shadows=shadows, profiles=profiles
+    )
+
+
+def compare_shadows(bench: Bench) -> tuple[tuple[ShadowRow, ...], dict[str, FloatArray]]:
+    """Return the shadow of the mask of a ``bench`` in each light against the geometric one, and a point's shadows down
+    the rows of the sensor [1] by light, with the rows' places [mm]."""
+    cameras = {name: IdealCamera(bench, bench.geometry.mask, spectrum) for name, spectrum in lights(bench).items()}
+    profiles = {_PLACES: np.asarray(bench.geometry.centres(0)), **point_profiles(bench)}
+    del profiles[LINE]  # it coincides with that of the projector's lines, to the width of a plotted line
+    return tuple(shadow_row(name, cameras) for name in cameras), profiles
 
 
 def _factors(lit: LitSession, estimate: Estimate) -> Factors:
@@ -307,6 +322,10 @@ _ERROR_SOURCES = {
     "cells": "light that changes inside projector pixels",
 }
 """Causes of what is not separable, in words; others have names that say it."""
+_PLACES = "places"
+"""Name of the places of pixels among profiles of shadows."""
+_PROFILE_MM = 0.7
+"""Half of the range of a point's shadow that is shown: a dozen mask features, whose fringes can be seen."""
 _NO_DRIFT = " The recipe has no table [drift]: calibration/drift.toml is one that has."
 _SAID_DB = 0.005
 """Loss from which it is told in text: less is 0.00 there."""
@@ -376,6 +395,9 @@ class CalibrationFindings(Findings):
         what each source of noise, the scene's light and each drift costs it, and what is not explained.
     not_predicted
         drifts whose cost is not, each with the reason.
+    shadows, profiles
+        the mask's shadow in each light against its geometric one; a point's shadow by light, with the places of the
+        sensor's rows.
     """
 
     entries: tuple[EntryRow, ...]
@@ -387,6 +409,8 @@ class CalibrationFindings(Findings):
     image: dict[str, Any] = field(default_factory=dict)
     losses: tuple[LossRow, ...] = ()
     not_predicted: tuple[str, ...] = ()
+    shadows: tuple[ShadowRow, ...] = ()
+    profiles: dict[str, FloatArray] = field(default_factory=dict)
     title: ClassVar[str] = "What limits a calibration session and its image"
 
     def payload(self) -> dict[str, Any]:
@@ -401,6 +425,7 @@ class CalibrationFindings(Findings):
             "image": self.image,
             "losses": [asdict(row) for row in self.losses],
             "not_predicted": self.not_predicted,
+            "shadows": [asdict(row) for row in self.shadows],
             "warnings": self.warnings,
         }
 
@@ -447,6 +472,8 @@ class CalibrationFindings(Findings):
                 rated[_WOULD if row.of == error_budget.DRIFT else _HAS][row.name] = Mean(row.lost_db, row.error_db, 1)
         if any(rated.values()):
             found["losses.png"] = bars(rated, "PSNR lost [dB]")
+        if self.profiles:
+            found["shadow.png"] = shadow_profiles(self.profiles, _PROFILE_MM)
         return found
 
     def parts(self) -> Sequence[Part]:
@@ -485,7 +512,25 @@ class CalibrationFindings(Findings):
                 tuple(causes),
                 ("causes.png",),
             ),
+            *([self._shadows_part()] if self.shadows else []),
         ]
+
+    def _shadows_part(self) -> Part:
+        rows = [
+            (row.light, *(f"{100 * each:.1f}" for each in (row.point_source, row.scene_pixel)),
+             *(f"{each:.1e}" for each in (row.separability, row.separability_centred)))
+            for row in self.shadows
+        ]  # fmt: skip
+        return Part(
+            "Diffraction at the mask",
+            f"Factors of the mask's geometric shadow, as if light did not diffract, give the image a PSNR of "
+            f"{self.image['geometric_psnr_db']:.1f} dB in place of {self.image['psnr_db']:.1f} dB. The mask's shadow "
+            "in each light against the geometric one, of a point and of a pixel of the scene; and what one separable "
+            "term leaves of it, of frames as they are and centred.",
+            ("Light", "Point [%]", "Pixel [%]", "Not separable [1]", "The same, centred [1]"),
+            tuple(rows),
+            ("shadow.png",),
+        )
 
     def _losses_part(self) -> Part:
         whole, image = sum(row.squared_error for row in self.losses) or np.nan, self.image
@@ -557,3 +602,21 @@ def _verdict(row: LossRow) -> str:
 
 def _cause(row: ErrorSourceRow) -> str:
     return _ERROR_SOURCES.get(row.cause, row.cause.replace("-", " "))
+
+
+def shadow_profiles(profiles: Mapping[str, FloatArray], reach_mm: float) -> Figure:
+    """Draw a point's shadows in the middle of the sensor.
+
+    Parameters
+    ----------
+    profiles, reach_mm
+        (pixels,) relative irradiance by light, and the pixels' places [mm]; half of the range that is shown.
+    """
+    figure, axes = plots.figure_of(0.4 * plots.WIDTH)
+    places = profiles[_PLACES]
+    inside = np.abs(places - places.mean()) <= reach_mm
+    for index, (name, values) in enumerate((name, values) for name, values in profiles.items() if name != _PLACES):
+        axes.plot(places[inside], values[inside], lw=1.8, label=name, **plots.line_style(index))
+    plots.label_axes(axes, "position on the sensor [mm]", "irradiance, open sensor = 1 [1]")
+    axes.legend(fontsize=plots.FONT - 1, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure

@@ -59,8 +59,9 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
         (
             "weather",
             (),
-            "there is no such study; use accuracy, calibration, diffraction, transfer, twin, patterns",
+            "there is no such study; use accuracy, calibration, transfer, twin, patterns",
         ),
+        ("diffraction", (), "use `mitsim study calibration SCENE`"),
         ("separation", (), "is part of another study now; use `mitsim study reflectivity`"),
         ("regularisation", (), "use `mitsim study sweep SCENE --over method=tikhonov,tv`"),
         ("sweep", ("--over", "method=mcmc"), "--over method=mcmc: use tikhonov"),

@@ -222,6 +222,8 @@ def test_all_sources_together_are_what_the_image_is_off(
     assert reported["capture", largest] > 0.7 * sum(reported.values()) and reported["session", "rendering"] > 0
     assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
     assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values()) + left)) and not found.warnings
+    assert found.image["geometric_psnr_db"] < found.image["psnr_db"] - 2, "the mask diffracts"
+    assert found.parts()[-1].title == "Diffraction at the mask" and "shadow.png" in found.figures()
 
 
 def print_of_squares(pixels: float) -> FloatArray:
