@@ -42,7 +42,7 @@ from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expo
 from mitsim.studies.framework.claims import Holds, Judged, stated, within
 from mitsim.studies.framework.experiment import QUICK_IMAGES, SIDE, Found, Point, Scope, Study, picture
 from mitsim.studies.framework.panels import Images, Lines
-from mitsim.studies.framework.studio import Studio, image_arrays, reason_of
+from mitsim.studies.framework.studio import Studio, flags_of, image_arrays
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -116,8 +116,8 @@ def _measure(studio: Studio, point: Point) -> Found:
         for exposure in EXPOSURES:
             shots = take(whole, bench.family(f"dots:{k}"), truth, bench.sensor, exposure, seed)
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
-            stated: dict[str, Value] = {"flagged": bool(reason := reason_of(solution.status)), "reason": reason}
-            rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **stated))
+            flags = flags_of(solution.status)
+            rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **flags))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
                 arrays = image_arrays(solution.image, truth)
     return Found(tuple(rows), arrays)

@@ -61,7 +61,7 @@ from mitsim.studies.framework.experiment import (
     number_of,
 )
 from mitsim.studies.framework.panels import Bars, Images, Lines
-from mitsim.studies.framework.studio import Studio, reason_of, single_precision
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -189,11 +189,10 @@ class DriftStand:
         return self._before.image
 
     @property
-    def reason(self) -> str:
-        """Return why the image without a drift is flagged, by its solution, its light or its factors; empty if not."""
+    def flags(self) -> dict[str, Value]:
+        """Return why the image without a drift is flagged, by its solution, its light or its factors."""
         others = (*self.lit.light.warnings, *self.lit.light.unreached, *self.factors.warnings)
-        words = (text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in others)
-        return "; ".join(filter(None, (reason_of(self._before.status), *words)))
+        return flags_of(self._before.status, others=others)
 
     @property
     def before_db(self) -> float:
@@ -552,7 +551,7 @@ def _measure(studio: Studio, point: Point) -> Found:
         "lost_db": found.lost_db, "lost_auto_db": found.lost_auto_db,
         "predicted_before_db": found.predicted_before_db, "predicted_db": found.predicted_db,
         "predicted_lost_db": found.predicted_lost_db, "predicted_error_db": found.predicted_error_db,
-        "flagged": bool(known.reason), "reason": known.reason,
+        **known.flags,
     }  # fmt: skip
     shown = {IMAGE: found.image, _BEFORE: known.image, TRUTH: lit.truth}
     return Found((point.row(**measured),), single_precision(shown))

@@ -46,7 +46,7 @@ from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.studies.framework.claims import CONFIRMED, Gain, stated
 from mitsim.studies.framework.experiment import QUICK_IMAGES, Axes, Claim, Found, Point, Results, Study
 from mitsim.studies.framework.panels import Images, Lines
-from mitsim.studies.framework.studio import Image, Studio, image_arrays, reason_of
+from mitsim.studies.framework.studio import Image, Studio, flags_of, image_arrays
 
 REACH = 15.0
 """Features that the mask moves either way."""
@@ -95,8 +95,8 @@ def _moving(studio: Studio, point: Point, lit: LitScene) -> dict[str, Image]:
     for exposure in EXPOSURES:
         seconds = mask.seconds(rows, columns, exposure)
         found = mask.solve(rows, columns, seconds)
-        quality, reason = lit.quality(found.image), reason_of(found.status)
-        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, bool(reason), reason=reason)
+        quality, flags = lit.quality(found.image), flags_of(found.status)
+        images[exposure] = Image(found.image, quality, found.lam, point["frames"], seconds, flags)
     return images
 
 

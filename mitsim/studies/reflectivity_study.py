@@ -53,7 +53,7 @@ from mitsim.sensor.moments import frame_moments
 from mitsim.studies.framework.claims import Holds, Judged, Level, choose_rows, distinct, every, mean_of, within
 from mitsim.studies.framework.experiment import Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Images, Lines
-from mitsim.studies.framework.studio import Studio, reason_of, single_precision
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -236,9 +236,9 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
         times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected_frames(RENDERED, family))
         for exposure, seconds in zip(EXPOSURES, times, strict=True):
             found = split(frames, twin, seconds)
-            image, reason = found.solution.image, reason_of(found.solution.status)
+            image = found.solution.image
             measured: dict[str, Value] = {"psnr_db": psnr(image, lit.truth), "psnr_matt_db": psnr(image, twin.truth)}
-            measured |= {"flagged": bool(reason), "reason": reason}
+            measured |= flags_of(found.solution.status)
             measured |= {f"{cause}_db": _decibels(part) for cause, part in found.parts.items()}
             added = np.sum([found.parts[cause] for cause in (SENSOR, INTERREFLECTION, SATURATION)], axis=0)
             own: dict[str, Value] = {"patterns": name, "exposure": exposure, "exposure_s": seconds}

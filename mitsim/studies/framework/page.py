@@ -155,14 +155,14 @@ def _images_first(file: str) -> bool:
     return not file.startswith("images")
 
 
+_IMAGE = "point", "psnr_db", "exposure", "model", "picture", "condition", "method", "weight", "lux", "draw"
+"""Columns whose values together are of one image."""
+
+
 def flag_warnings(name: str, results: Results) -> tuple[str, ...]:
     """Return a warning of how many images of the study ``name`` are flagged, and why; nothing if none is."""
     # An image may have many rows, such as a transfer function's.
-    rows = {
-        (row.get("point"), row.get("exposure"), row.get("psnr_db")): row
-        for row in results.rows
-        if row.get("flagged") is not None
-    }
+    rows = {tuple(map(row.get, _IMAGE)): row for row in results.rows if row.get("flagged") is not None}
     found = [str(row.get("reason") or "") for row in rows.values() if row["flagged"]]
     if not found:
         return ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -49,12 +49,10 @@ class Image:
         (n, n) reflectance, against the truth, and lambda.
     shots, exposure_s
         frames, and seconds of each.
-    flagged
-        whether its run or the solver warned.
+    flags
+        columns of :func:`flags_of`.
     trust
         where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
-    reason
-        of a flagged image: what it is flagged for.
     seconds
         time of the solution of rendered frames.
     """
@@ -64,9 +62,8 @@ class Image:
     lam: float
     shots: int
     exposure_s: float
-    flagged: bool
+    flags: Mapping[str, Value]
     trust: Mapping[str, float | None] = field(default_factory=dict)
-    reason: str = ""
     seconds: float | None = None
 
     @classmethod
@@ -83,9 +80,8 @@ class Image:
             as for :meth:`mitsim.report.lit_scene.Unexposed.solve`.
         """
         solution = frames.solve(seconds, lam, binning)
-        quality, reason = frames.lit.quality(solution.image), reason_of(solution.status)
-        shots = len(frames.family.shots)
-        return cls(solution.image, quality, solution.lam, shots, seconds, bool(reason), reason=reason)
+        quality, shots = frames.lit.quality(solution.image), len(frames.family.shots)
+        return cls(solution.image, quality, solution.lam, shots, seconds, flags_of(solution.status))
 
     def row(self) -> dict[str, Value]:
         """As a table has it."""
@@ -95,18 +91,26 @@ class Image:
             "lambda": self.lam,
             "shots": self.shots,
             "exposure_s": self.exposure_s,
-            "flagged": self.flagged,
-            "reason": self.reason,
+            **self.flags,
             **self.trust,
         }
 
 
-def reason_of(status: Status, misfit: Misfit | None = None) -> str:
-    """Return why an image of this ``status`` and ``misfit`` is flagged, reasons separated by "; "; empty if it is
-    not."""
+def flags_of(*statuses: Status, misfit: Misfit | None = None, others: Iterable[str] = ()) -> dict[str, Value]:
+    """Return the columns `flagged` and `reason` of an image, which every study's table has.
+
+    Parameters
+    ----------
+    statuses, misfit
+        of the solution, or of the solution of each line.
+    others
+        warnings of what the image was made of.
+    """
     cause = f", {misfit.reason}" if misfit and misfit.flagged and misfit.cause else ""
-    own = () if status.verdict.good else (f"{status.verdict.value}{cause}",)
-    return "; ".join((*own, *(text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in status.flags)))
+    reasons = [f"{each.verdict.value}{cause}" for each in statuses if not each.verdict.good]
+    flags = [text for each in statuses for text in each.flags]
+    reasons += [text.partition(". ")[0].rstrip(".").replace("; ", ", ") for text in (*flags, *others)]
+    return {"flagged": bool(reasons), "reason": "; ".join(dict.fromkeys(reasons))}
 
 
 def _made_once(place: Path, make: Callable[[Path], object]) -> Path:
@@ -231,8 +235,8 @@ class Studio:
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
             return Image.of(frames, frames.seconds(exposure))
-        seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
-        shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
+        exposure_s = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
+        shots = expose(frames.lit.light, patterns, seed=seed, exposure=exposure_s)
         found = reconstruct(shots, self.factors(setup, seed), focus=focus, method=method)
         misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
@@ -241,9 +245,9 @@ class Studio:
             "uncertainty": None if uncertainty is None else float(np.sqrt(np.square(uncertainty).mean())),
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
-        reason = reason_of(found.status, misfit)
-        seconds_ = sum(found.seconds.values())
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, not found.ok, trust, reason, seconds_)
+        flags = flags_of(found.status, misfit=misfit)
+        seconds = sum(found.seconds.values())
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, flags, trust, seconds)
 
     def _plan(self, setup: Setup) -> Plan:
         """That of a ``setup``, made by this studio or by another that was first: one in a file is as one in memory."""

@@ -113,11 +113,11 @@ def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
     rows = [
         {"point": "a", "flagged": True, "reason": "misfit, likely cause: depth; The capture was flagged: dim", **same},
         *[{"point": "b", "flagged": True, "reason": "misfit, likely cause: depth", **same}] * 5,
-        {"point": "c", "flagged": False, "reason": "", **same},
+        *({"point": "c", "method": method, "flagged": False, "reason": "", **same} for method in "ab"),
         {"point": "d", "square": 1.0},
     ]
     (text,) = flag_warnings("toy", Results(rows))
-    assert text.startswith("2 of 3 images are flagged") and "toy.csv" in text
+    assert text.startswith("2 of 4 images are flagged") and "toy.csv" in text
     assert text.endswith(f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim.")
     assert not flag_warnings("toy", Results(rows[-2:]))
 

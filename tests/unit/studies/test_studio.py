@@ -67,7 +67,7 @@ def test_a_rendered_image_is_what_a_user_gets(studio: Studio, setup: Setup) -> N
     shots = bench.light(accuracy=1e-2).expose("dots:4", seed=3)
     own = ms.reconstruct(shots, bench.calibrate(3))
     assert np.array_equal(found.image, own.image) and found.lam == own.lam
-    assert found.shots == 16 and found.exposure_s == shots.exposure_s and found.flagged == (not own.ok)
+    assert found.shots == 16 and found.exposure_s == shots.exposure_s and found.flags["flagged"] == (not own.ok)
     assert found.quality.psnr_db == pytest.approx(ms.psnr(own.image, shots.truth))
 
 
