@@ -29,7 +29,7 @@ PAPER = (
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""
-EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "models", "sweep")
+EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "sweep")
 """Studies of many points: their modules have a ``STUDY``. ``learned`` is not on the page of all: it takes hours,
 and torch, which may be missing."""
 SHARED = {
@@ -38,7 +38,7 @@ SHARED = {
 }
 """Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
 GONE = {
-    "diffraction": "calibration SCENE",
+    **dict.fromkeys(("diffraction", "models"), "calibration SCENE"),
     "regularisation": "sweep SCENE --over method=tikhonov,tv",
     "separation": "reflectivity",
 }

@@ -61,6 +61,7 @@ def test_parts_merge_on_the_command_line(study: Callable[..., Any], tmp_path: Pa
             (),
             "there is no such study; use accuracy, calibration, transfer, twin, patterns",
         ),
+        ("models", (), "use `mitsim study calibration SCENE`"),
         ("diffraction", (), "use `mitsim study calibration SCENE`"),
         ("separation", (), "is part of another study now; use `mitsim study reflectivity`"),
         ("regularisation", (), "use `mitsim study sweep SCENE --over method=tikhonov,tv`"),

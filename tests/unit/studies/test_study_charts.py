@@ -23,7 +23,7 @@ from tests.unit.report.test_charts import curve
 
 STUDIES = (
     "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient",
-    "convolutional", "depth", "drift", "models", "waterfall", "sweep",
+    "convolutional", "depth", "drift", "waterfall", "sweep",
 )  # fmt: skip
 KNOBS = ("sheet_z", ("390", "400", "410")), ("patterns", ("dots:4", "dots:7"))
 OTHERS = "spectrum", "without the drift"
@@ -70,7 +70,6 @@ def rows_of(point: Point, rng: np.random.Generator) -> Iterator[dict[str, Value]
     measured["kind"] = kind
     measured["patterns_count"] = int(size) ** 2 if size.isdecimal() else 1
     measured["pixels"] = 512 // int(own.get("binning", 1) or 1)
-    measured |= {"frames": int(rng.integers(2, 512))} if "factors" in own else {}
     measured |= {"pairs_a_mm": float(rng.uniform(0.1, 0.6))} if "bars" in str(point.setup.picture) or kind else {}
     for model, exposure in product(MODELS, (EQUAL_PEAK, EQUAL_FRAME)):
         more = {"model": model, "exposure": exposure}
@@ -80,9 +79,7 @@ def rows_of(point: Point, rng: np.random.Generator) -> Iterator[dict[str, Value]
 
 def invented(name: str) -> Results:
     """Results of the study ``name``, quick, whose images are noise."""
-    scope = replace(
-        SCOPE, sweep=KNOBS if name == "sweep" else (), pictures=(None,) if name == "models" else QUICK_IMAGES
-    )
+    scope = replace(SCOPE, sweep=KNOBS if name == "sweep" else (), pictures=QUICK_IMAGES)
     rng, experiment = np.random.default_rng(1), find(name)
     points = experiment.points(scope)
     rows = [row for point in points for row in rows_of(point, rng)]

@@ -154,13 +154,6 @@ def lit(**gains: float) -> list[Row]:
     ]
 
 
-def fitted(value: float) -> list[Row]:
-    case = {"exposure_fraction": 0.8}
-    rest = [rows(20, factors="geometric", frames=2, **case), rows(20, factors="measured", frames=258, **case)]
-    build = gain("psnr_db", {"factors": "wave", "frames": 2}, {"factors": "measured", "frames": 2048}, **case)
-    return beside(build, *rest)(value)
-
-
 def drifted(value: float) -> list[Row]:
     case = {"kind": "power", "unit": "1", "amount": 0.1, "model": RENDERED, "predicted_error_db": 0.0}
     predicted = {name: offset for name, offset in zip("abc", PRINTS_DB, strict=True)}
@@ -254,7 +247,6 @@ BORDERS = [
     ("ambient", 1, lamps, 0.0, math.inf),
     ("ambient", 2, lamps, -math.inf, 0.0),
     ("reflectivity", 2, lambda value: [*glossy(), *lit(corner=value, cookie_bag=9.0)], 0.0, math.inf),
-    ("models", 0, fitted, -0.5, math.inf),
     ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
     ("waterfall", 1, lambda value: fallen(gained=value), 0.0, math.inf),
@@ -291,7 +283,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
 def test_every_study_of_the_paper_is_held() -> None:
     from mitsim.studies import PAPER
 
-    assert {study for study, *_ in BORDERS} == set(PAPER) | {"models", "drift"}
+    assert {study for study, *_ in BORDERS} == set(PAPER) | {"drift"}
 
 
 def test_an_interval_decides_where_no_border_lies_in_it() -> None:
