@@ -13,12 +13,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from mitsim.api.bench import Bench
+from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimate, estimates
@@ -55,6 +56,7 @@ from mitsim.studies.error_budget import LossRow
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
+AnyBench = TypeVar("AnyBench", bound=Apparatus)
 OFF_MM = {"mask_distance": 0.05, "mask_offset_row": 0.037, "mask_offset_column": -0.021}
 """Differences of a camera and its plan: as of a mask that is glued on by hand, under a microscope."""
 _MODEL_FRAMES = (2, 16)
@@ -118,7 +120,7 @@ def measure(bench: Bench, request: Request, job: Job, recipe: SessionRecipe | No
     )
 
 
-def as_built(bench: Bench) -> Bench:
+def as_built(bench: AnyBench) -> AnyBench:
     """Return a ``bench`` whose mask is off its place by :data:`OFF_MM`."""
     camera = bench.geometry
     changed = camera.model_copy(update={name: getattr(camera, name) + off for name, off in OFF_MM.items()})

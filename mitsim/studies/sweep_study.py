@@ -45,7 +45,7 @@ def _points(scope: Scope) -> Sequence[Point]:
             setup = _setup(scope.setup, setting).with_print(picture)
             fixed: dict[str, Value] = {"patterns": scope.patterns, "exposure": EQUAL_PEAK, "seed": scope.seeds[0]}
             knobs: dict[str, Value] = {name: setting.get(name, other) for name, other in fixed.items()}
-            light = {name: setting[name] for name in ("accuracy", "method") if name in setting}
+            light: dict[str, Value] = {name: setting[name] for name in ("accuracy", "method") if name in setting}
             found.append(Point.of(setup, model=RENDERED, **{**knobs, "seed": int(str(knobs["seed"])), **light}))
     return group_by_setup(found)
 

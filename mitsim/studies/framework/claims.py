@@ -237,7 +237,7 @@ class Statement:
         column, *both = self.models
         known, exposures = ([] if each in self._compared else distinct(rows, each) for each in (column, "exposure"))
         models, exposures = [model for model in both if model in known] or both[1:], exposures or [None]
-        found = {}
+        found: dict[tuple[str, Any], tuple[str, Any]] = {}
         for model in models:
             own = choose_rows(rows, {column: model} if model in known else {})
             for each in exposures:
@@ -255,7 +255,7 @@ class Statement:
             holding = [model for model, holds in by_model.items() if holds]
             rest = [f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None]
             decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
-        words = [holds for _, holds in found.values() if isinstance(holds, str)]
+        words: list[str] = [holds for _, holds in found.values() if isinstance(holds, str)]
         return Claim(claim, self.paper, figures[both[0]], figures[both[1]], words[0] if words else decided)
 
     def _found(self, rows: DataFrame) -> tuple[str, Holds]:

@@ -305,10 +305,9 @@ def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption:
         image = results.array(row, array.format(**row))
         if image is not None:
             known = all(measured(row.get(name)) for _, name, kind, _ in Formatter().parse(caption) if kind and name)
-            text = (caption.format(**row) if known else "") + "\nflagged" * (
-                bool(caption) and row.get("flagged") is True
-            )
-            return [(image, results.array(row, TRUTH) if array == IMAGE else None, text)]
+            text = caption.format(**row) if known else ""
+            flag = "\nflagged" if caption and row.get("flagged") is True else ""
+            return [(image, results.array(row, TRUTH) if array == IMAGE else None, text + flag)]
     return []
 
 
