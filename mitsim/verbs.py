@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from mitsim.core.arrays import FloatArray
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.emva_results import Characterisation
-    from mitsim.studies.framework.campaign import CampaignResult
     from mitsim.studies.framework.experiment import Scope
     from mitsim.studies.framework.run import StudyResult
 
@@ -252,7 +251,7 @@ def study(
     patterns: str | None = None,
     job: Job | None = None,
     **options: Any,
-) -> StudyResult | CampaignResult:
+) -> StudyResult:
     """An experiment with figures, CSV and JSON in a folder.
 
     Parameters
@@ -273,7 +272,7 @@ def study(
 
     Returns
     -------
-    StudyResult or CampaignResult
+    StudyResult
         with ``rows``, a list of dict; ``to_pandas()``; ``pictures``, paths by name; ``lines()``, what it comes to.
 
     Raises
@@ -291,7 +290,7 @@ def study(
     return prepare_study(name, scene, output, patterns, job, **options)()
 
 
-Study = Callable[[], "StudyResult | CampaignResult"]
+Study = Callable[[], "StudyResult"]
 """One that only has to be measured: what it is asked for was checked."""
 
 

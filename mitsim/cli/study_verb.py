@@ -27,7 +27,7 @@ class Points:
     scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS")
     over: list[str] | None = option(
         None,
-        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy; FIRST:LAST:COUNT or "
+        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy, method; FIRST:LAST:COUNT or "
         "VALUE,VALUE; may be given again",
         metavar="NAME=VALUES",
         rich_help_panel=WHAT,

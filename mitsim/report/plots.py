@@ -255,6 +255,34 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
     return figure
 
 
+def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = "") -> Figure:
+    """Draw horizontal bars with one standard error: a group for each name, a bar for each kind, its number behind it.
+
+    Parameters
+    ----------
+    groups
+        means by kind, by the groups' names, the first on top; a group may lack kinds.
+    x, title
+        name of the axis with its unit, and title.
+    """
+    kinds = list(dict.fromkeys(kind for bars in groups.values() for kind in bars))
+    figure, axes = figure_of(0.9 + max(0.75 * len(kinds), 1.0) * _rows_height(groups), _BARS)
+    height, places = 0.8 / len(kinds), np.arange(len(groups))[::-1]
+    for index, kind in enumerate(kinds):
+        own = [(place, bars[kind]) for place, bars in zip(places, groups.values(), strict=True) if kind in bars]
+        rows = np.array([place + (len(kinds) / 2 - 0.5 - index) * height for place, _ in own])
+        values, errors = (np.array([getattr(mean, part) for _, mean in own]) for part in ("value", "error"))
+        colour = (PALE, BLUE, ORANGE, GREEN)[index % 4] if len(kinds) > 1 else BLUE
+        drawn = axes.barh(rows, values, 0.92 * height, xerr=_bar_errors(errors), color=colour, capsize=3, label=kind)
+        axes.bar_label(drawn, [scientific(float(value)) for value in values], fontsize=FONT - 2, padding=3)
+    _name_rows(axes, list(groups)[::-1])
+    if title:
+        figure.suptitle(fill(title, TITLE_LETTERS + 10), fontsize=FONT)
+    axes.margins(x=0.14)
+    label_axes(axes, x, "", grid="x")
+    return figure
+
+
 def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
     """A bar for each row, the first on top, that its parts make up in their order.
 

@@ -5,14 +5,14 @@ This file has their names alone. The study NAME is the module ``mitsim.studies.N
 
 from __future__ import annotations
 
-STUDIES = ("accuracy", "calibration", "diffraction", "transfer", "twin")
+STUDIES = ("accuracy", "calibration", "transfer", "twin")
 """Studies of one bench: the function ``measure`` of their module takes (bench, request, job) and gives
 :class:`mitsim.studies.framework.run.Findings`."""
 OF_NO_SCENE = ("transfer", "twin")
 """Those whose bench is None."""
 OF_CAPTURES = ("transfer", "twin")
 """Those of real captures (`--data`)."""
-EXPOSED = ("calibration", "diffraction")
+EXPOSED = ("calibration",)
 """Those whose frames fill a part of the camera's full well."""
 PAPER = (
     "patterns",
@@ -23,22 +23,25 @@ PAPER = (
     "resolution",
     "ambient",
     "reflectivity",
-    "regularisation",
     "convolutional",
     "depth",
-    "separation",
     "waterfall",
 )
 """Studies of the paper's experiments, and of what lies beyond them, which `mitsim study all` puts on one page in this
 order."""
-EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "models", "sweep")
-"""Studies of many points: their modules have an ``EXPERIMENT``. ``learned`` is not on the page of all: it takes hours,
+EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "sweep")
+"""Studies of many points: their modules have a ``STUDY``. ``learned`` is not on the page of all: it takes hours,
 and torch, which may be missing."""
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient"), "light_studies"),
-    **dict.fromkeys(("reflectivity", "separation"), "scene_studies"),
 }
-"""Modules of several studies of many points, whose ``EXPERIMENTS`` have each by its name."""
+"""Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
+GONE = {
+    **dict.fromkeys(("diffraction", "models"), "calibration SCENE"),
+    "regularisation": "sweep SCENE --over method=tikhonov,tv",
+    "separation": "reflectivity",
+}
+"""Names of studies that became part of others, and the arguments of `mitsim study` that replace them."""
 ALL = "all"
 """What the study of all experiments of the paper is called."""

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from matplotlib.figure import Figure
 
 from mitsim.report.plots import FONT, Cost, costs, error_bars, stacked_bars
-from mitsim.studies.framework.findings import Part
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 
 SOLVER = "python benchmarks/solver.py --forms"

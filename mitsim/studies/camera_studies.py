@@ -1,4 +1,4 @@
-"""Studies of the paper by what the camera is: the mask's distance, the sensor's pixels, and how fine it sees.
+"""Studies of the paper on the camera: the mask's distance, the sensor's pixels, and the resolution.
 
 *distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow; mean
 PSNR of eight test images by the number of dots.
@@ -17,178 +17,145 @@ from it, four bins a pixel, and the spectrum of the derivative is the modulation
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
+from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.pages import Table, Value
-from mitsim.report.plots import curves
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds, image_arrays, measure_image
-from mitsim.studies.framework.experiment import PRINT_MM, Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Image, Studio
+from mitsim.studies.framework.claims import (
+    Gain,
+    Holds,
+    Judged,
+    Level,
+    choose_rows,
+    distinct,
+    mean_of,
+    measured,
+    stated,
+    value_name,
+    within,
+)
+from mitsim.studies.framework.experiment import PRINT_MM, Axes, Found, Point, Study
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Image, Studio, finding, image_arrays, measure_image
 
-# -------- How far the mask is from the sensor
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+# -------- The distance of the mask
 
 DISTANCES_MM = (0.5, 0.75, 1.0, 2.0, 4.0, 8.0)
 """The paper's four; features of 60 um have a Fresnel number of 3.2 at 2 mm and of 0.8 at 8 mm."""
-_FEW_MM = (0.75, 2.0)  # the two that the paper gives decibels of
-_FAMILIES = ("uniform", "dots:5", "dots:7")
-_SHOWN = ("uniform", "dots:7")
-"""Of both these and the next study: families, and those whose images are shown."""
-_NEAR_UNIFORM, _NEAR_DOTS = (16.9, 19.0), (30.0, 30.5)
-"""Decibels in the paper's figure 5, mask at 750 um."""
+_FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
+"""Families of this study and the next, and those whose images are shown."""
 _COMPARABLE_DB = 1.0
 """A difference that may be seen: a fifth of the squared error."""
 
-
-def _distance_points(scope: Scope) -> Sequence[Point]:
-    return Point.grid(
-        [
-            scope.setup.with_parameters(mask_distance=distance).with_print(name)
-            for distance in scope.choose(DISTANCES_MM, _FEW_MM)
-            for name in scope.pictures
-        ],
-        "model patterns exposure seed",
-        seed=scope.seeds,
-        patterns=_FAMILIES,
-        exposure=(EQUAL_PEAK, EQUAL_FRAME),
-        model=MODELS,
-    )
-
-
-def _distance_claims(results: Results) -> Sequence[Claim]:
-    near = results.table.where(mask_distance="0.75")
-    return [
-        claims.psnr_claim(
-            near.where(patterns="uniform"), "At 750 um, uniform light gives 16.9 to 19 dB", _NEAR_UNIFORM
-        ),
-        claims.psnr_claim(near.where(patterns="dots:7"), "At 750 um, 49 dots give 30 to 30.5 dB", _NEAR_DOTS),
-        claims.gain_claim(
-            results.table,
-            f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
-            "comparable",
-            ({"mask_distance": "0.75", "patterns": "dots:5"}, {"mask_distance": "2.0", "patterns": "uniform"}),
-            "{one} against {other} dB: {gain:+} dB",
-            (-_COMPARABLE_DB, _COMPARABLE_DB),
-        ),
-    ]
-
-
-def _distance_figures(results: Results) -> Mapping[str, Figure]:
-    table, title = results.table, "PSNR by the mask's distance"
-    drawn = dict(claims.by_exposure(table, claims.by_patterns, "mask_distance", "sensor to mask [mm]", title, log=True))
-    distances = table.distinct("mask_distance")
-    names, title = [f"{float(each):g} mm" for each in distances], f"{{}}, exposure {EQUAL_FRAME}"
-    shown = table.where(exposure=EQUAL_FRAME)
-    return drawn | claims.family_images(results, shown, _SHOWN, "mask_distance", distances, title, names)
-
-
-DISTANCE = Experiment(
+DISTANCE = Study(
     "distance",
     "How far the mask is from the sensor",
     "What does a thin camera cost, and how much of it do patterns give back?",
-    _distance_points, partial(measure_image, shown=_SHOWN), _distance_claims, _distance_figures,
-)  # fmt: skip
+    points=Axes(
+        {"patterns": _FAMILIES, "exposure": (EQUAL_PEAK, EQUAL_FRAME), "model": MODELS},
+        scene={"mask_distance": DISTANCES_MM},
+        quick={"mask_distance": (0.75, 2.0)},  # the two that the paper gives decibels of
+    ),
+    measure=partial(measure_image, shown=_SHOWN),
+    claims=(
+        stated("At 750 um, uniform light gives 16.9 to 19 dB", 16.9, 19.0, mask_distance="0.75", patterns="uniform"),
+        stated("At 750 um, 49 dots give 30 to 30.5 dB", 30.0, 30.5, mask_distance="0.75", patterns="dots:7"),
+        Gain(
+            f"25 dots at 750 um are comparable to uniform light at 2000 um (within {_COMPARABLE_DB:g} dB)",
+            {"mask_distance": "0.75", "patterns": "dots:5"},
+            {"mask_distance": "2.0", "patterns": "uniform"},
+            paper="comparable",
+            at_least=-_COMPARABLE_DB,
+            at_most=_COMPARABLE_DB,
+        ),
+    ),
+    panels=(
+        Lines("mask_distance", "sensor to mask [mm]", each="exposure", title="PSNR by the mask's distance", log=True),
+        Images("mask_distance", each="patterns", where={"exposure": EQUAL_FRAME, "patterns": _SHOWN}, names="{} mm"),
+    ),
+)
 
-
-# -------- How many sensor pixels
+# -------- The number of sensor pixels
 
 BINNINGS = (1, 2, 4, 8)
 """Pixels a side that are averaged: the paper's 512 to 64 pixels a side."""
 _FINE, _COARSE = BINNINGS[0], BINNINGS[-1]
 _STABLE_DB = 3.0
-"""What an image may lose and still be called stable: half of its squared error is then as before."""
-
-
-def _binning_points(scope: Scope) -> Sequence[Point]:
-    return Point.grid(
-        map(scope.setup.with_print, scope.pictures),
-        "model patterns binning seed",
-        seed=scope.seeds,
-        patterns=scope.choose(_FAMILIES, _SHOWN),
-        binning=scope.choose(BINNINGS, (_FINE, _COARSE)),
-        model=MODELS,
-    )
+"""Loss of an image that is still called stable: half of its squared error is then as before."""
 
 
 def _binning_measure(studio: Studio, point: Point) -> Found:
     binning = int(point["binning"])
     frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
-    # With fewer data than unknowns noise cannot be told, nor lambda chosen by it.
+    # With fewer data than unknowns the noise can't be estimated, so the best lambda stands in for the automatic one.
     image = Image.of(frames, frames.seconds(EQUAL_PEAK), "best", binning)
     pixels = frames.lit.bench.geometry.frame_shape[0] // binning
-    return claims.finding(
-        studio, point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row()
-    )
+    return finding(studio, point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 
-def _binning_claims(results: Results) -> Sequence[Claim]:
-    few, few_coarse, many, many_coarse = (
-        dict[str, Value](patterns=family, binning=binning) for family in _SHOWN for binning in (_FINE, _COARSE)
-    )
-    lost, table = "{one} to {other} dB: {gain} dB lost", results.table
-    stable = "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)"
-    better = "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512"
-    return [
-        claims.gain_claim(table, stable, "stable", (many, many_coarse), lost, (-math.inf, _STABLE_DB)),
-        claims.gain_claim(table, "Uniform light degrades with fewer pixels", "degrades", (few, few_coarse), lost),
-        claims.gain_claim(table, better, "better", (many_coarse, few)),
-    ]
-
-
-def _binning_figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
-    shown = claims.panels(claims.by_patterns(table), "pixels")
-    title = f"PSNR by the sensor's rows, exposure {EQUAL_PEAK}"
-    drawn = {"psnr.png": curves(shown, "rows of the sensor [pixel]", log=True, title=title)}
-    pixels = table.distinct("pixels")
-    names, title = [f"{each} rows" for each in pixels], f"{{}}, {EQUAL_PEAK}, by sensor rows"
-    return drawn | claims.family_images(results, table, _SHOWN, "pixels", pixels, title, names)
-
-
-BINNING = Experiment(
+BINNING = Study(
     "binning",
     "How many sensor pixels",
     "What is left where the sensor has fewer pixels than the image, with one frame and with 49?",
-    _binning_points, _binning_measure, _binning_claims, _binning_figures,
-)  # fmt: skip
+    points=Axes(
+        {"patterns": _FAMILIES, "binning": BINNINGS, "model": MODELS},
+        quick={"patterns": _SHOWN, "binning": (_FINE, _COARSE)},
+    ),
+    measure=_binning_measure,
+    claims=(
+        Gain(
+            "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)",
+            {"binning": _FINE},
+            {"binning": _COARSE},
+            where="dots:7",
+            paper="stable",
+            at_least=-inf,
+            at_most=_STABLE_DB,
+        ),
+        Gain(
+            "Uniform light degrades with fewer pixels",
+            {"binning": _FINE},
+            {"binning": _COARSE},
+            where="uniform",
+            paper="degrades",
+        ),
+        Gain(
+            "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512",
+            {"patterns": "dots:7", "binning": _COARSE},
+            {"patterns": "uniform", "binning": _FINE},
+            paper="better",
+        ),
+    ),
+    panels=(
+        Lines("pixels", "rows of the sensor [pixel]", title="PSNR by the sensor's rows, equal peak", log=True),
+        Images("pixels", each="patterns", where={"patterns": _SHOWN}, names="{} rows"),
+    ),
+)
 
-
-# -------- How fine
+# -------- The resolution
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
-"""The paper's groups 20 to 5, and one that no pixel of 0.9375 mm can tell."""
+"""The paper's groups 20 to 5, and one that pixels of 0.9375 mm can't resolve."""
 RESOLVING = ("uniform", "dots:3", "dots:4", "dots:7")
 _TOLD = 0.1
-"""Contrast below which bars are not told apart: what the eye needs of a print."""
+"""Contrast above which bars are resolved: what the eye needs of a print."""
 _SEEN, _BESIDE = slice(16, -16), slice(8, -8)
-"""Pixels that are looked at: the margin is beside the bars of the sheet's other half, or beyond the print."""
+"""Pixels that are evaluated: the margin is beside the bars of the sheet's other half, or beyond the print."""
 _FINEST = 0.52  # the paper's group 5
 _SHOWN_CYCLES = 0.35
 """Cycles a pixel up to which the truth must show bars: pixels that average over them leave 0.8 of their contrast."""
 _SHOWS = 0.4
 """Contrast that the truth must have of such bars: half of what print and pixels leave."""
-
-
-def _resolution_points(scope: Scope) -> Sequence[Point]:
-    pairs = scope.choose(PAIRS_A_MM, (0.13, 0.26, 0.52))
-    return Point.grid(
-        map(scope.setup.with_print, [f"bars {each:g}" for each in pairs] + ["edge"]),
-        "model patterns exposure seed",
-        seed=scope.repeats,
-        patterns=scope.choose(RESOLVING, ("uniform", "dots:7")),
-        model=MODELS,
-        exposure=(EQUAL_FRAME,),
-    )
 
 
 def _resolution_measure(studio: Studio, point: Point) -> Found:
@@ -229,83 +196,74 @@ def _contrast(image: FloatArray, cycles: float) -> float:
     return float(np.mean([modulation(*half, cycles) for half in _halves(image)]))
 
 
-def _resolution_claims(results: Results) -> Sequence[Claim]:
-    table = results.table
-
-    def rises(rows: Table) -> tuple[str, Holds]:
-        limits = {name: _limit(of_family) for name, of_family in claims.by_patterns(rows).items()}
-        fine = claims.by_patterns(rows.where(pairs_a_mm=_FINEST))
-        kept = {name: claims.sample_mean(of_family, "contrast").value for name, of_family in fine.items()}
-        text = ", ".join(f"{name[:1].lower()}{name[1:]} {limits[name]:g} ({kept[name]:.2f})" for name in limits)
-        gains = [
-            claims.within(claims.difference(more, fewer, "contrast"), low=0) for fewer, more in pairwise(fine.values())
-        ]
-        families = list(fine.values())
-        gain = claims.within(claims.difference(families[-1], families[0], "contrast"), low=0)
-        return text, False if False in gains else gain
-
-    def apart(rows: Table) -> tuple[str, Holds]:
-        dots = rows.where(patterns="dots:7")
-        seen = {
-            pairs: claims.sample_mean(dots.where(pairs_a_mm=pairs), "contrast")
-            for pairs in _bars(dots)
-            if pairs <= _FINEST
-        }
-        return f"contrast {seen[_FINEST].value:.2f}", claims.every(
-            *(claims.within(each, low=_TOLD) for each in seen.values())
-        )
-
-    resolution = (
-        f"Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
-        f"{_FINEST})"
+def _rises(rows: DataFrame) -> tuple[str, Holds]:
+    """Compare the contrast of the finest bars from fewer to more patterns, in the order of the table."""
+    families = {name: choose_rows(rows, {"patterns": name}) for name in distinct(rows, "patterns")}
+    fine = [choose_rows(own, {"pairs_a_mm": _FINEST}) for own in families.values()]
+    text = ", ".join(
+        f"{value_name('patterns', name)} {_limit(own):g} ({mean_of(finest, 'contrast').value:.2f})"
+        for (name, own), finest in zip(families.items(), fine, strict=True)
     )
-    return [
-        claims.judge_claim(table, resolution, "rises", rises),
-        claims.judge_claim(table, f"49 patterns tell {_FINEST} line pairs a mm apart", "told apart", apart),
-    ]
+    gains = [within(mean_of(more, "contrast", fewer), low=0) for fewer, more in pairwise(fine)]
+    return text, False if False in gains else within(mean_of(fine[-1], "contrast", fine[0]), low=0)
 
 
-def _limit(rows: Table) -> float:
-    """Finest bars up to which all are told apart; 0 for none."""
+def _limit(rows: DataFrame) -> float:
+    """Return the finest bars up to which all are resolved; 0 for none."""
     limit = 0.0
-    for pairs in _bars(rows):
-        if claims.sample_mean(rows.where(pairs_a_mm=pairs), "contrast").value < _TOLD:
+    for pairs in sorted(distinct(rows, "pairs_a_mm")):
+        if mean_of(choose_rows(rows, {"pairs_a_mm": pairs}), "contrast").value < _TOLD:
             break
         limit = pairs
     return limit
 
 
-def _bars(rows: Table) -> list[float]:
-    """Line pairs a mm of all bars that a contrast was measured of."""
-    return sorted(rows.means("contrast", "pairs_a_mm"))
+_BARS = "spatial frequency on the print [line pairs/mm]"
 
-
-def _resolution_figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn, lines = results.table, {}, claims.by_patterns(results.table)
-    for column, file, title in (
-        ("contrast", "contrast", "Contrast of bars at their own frequency"),
-        ("transfer", "edge", "Modulation transfer by a slanted edge (ISO 12233)"),
-    ):
-        axis = "spatial frequency on the print [line pairs/mm]"
-        shown = claims.panels(lines, "pairs_a_mm", column)
-        drawn[f"{file}.png"] = curves(shown, axis, f"{column} [1]", ticks=False, title=title)
-    names = [name for name in table.distinct("picture") if name.startswith("bars")]
-    both = {f"{name}, {model}": rows.where(model=model) for name, rows in lines.items() for model in MODELS}
-    grid = claims.image_rows(results, both, "picture", names, "contrast {contrast:.2f}")
-    title = f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}"
-    drawn["images.png"] = claims.grid_with_truths(grid, [name.replace("bars ", "") for name in names], title)
-    return drawn
-
-
-RESOLUTION = Experiment(
+RESOLUTION = Study(
     "resolution",
     "How fine",
     "Which bars are told apart, and how much contrast does an edge keep?",
-    _resolution_points, _resolution_measure, _resolution_claims, _resolution_figures,
+    points=Axes(
+        {"patterns": RESOLVING, "model": MODELS, "exposure": (EQUAL_FRAME,)},
+        quick={"patterns": _SHOWN, "picture": ("bars 0.13", "bars 0.26", "bars 0.52", "edge")},
+        prints=(*(f"bars {pairs:g}" for pairs in PAIRS_A_MM), "edge"),
+        repeats=True,
+    ),
+    measure=_resolution_measure,
+    claims=(
+        Judged(
+            "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
+            f"{_FINEST})",
+            _rises,
+            where={"contrast": measured},
+            paper="rises",
+        ),
+        Level(
+            f"49 patterns tell {_FINEST} line pairs a mm apart",
+            every="pairs_a_mm",
+            column="contrast",
+            unit="",
+            where={"patterns": "dots:7", "pairs_a_mm": lambda pairs: pairs <= _FINEST, "contrast": measured},
+            paper="told apart",
+            at_least=_TOLD,
+        ),
+    ),
+    panels=(
+        Lines("pairs_a_mm", _BARS, y="contrast", y_label="contrast of bars at their own frequency [1]", ticks=False),
+        Lines("pairs_a_mm", _BARS, y="transfer", y_label="transfer of a slanted edge [1]", file="edge", ticks=False),
+        Images(
+            "picture",
+            title=f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}",
+            down=("patterns", "model"),
+            where={"picture": lambda name: str(name).startswith("bars")},
+            caption="contrast {contrast:.2f}",
+        ),
+    ),
     note="Pixels of the image are 0.94 mm on the shipped print, so 0.533 line pairs/mm are the most that they show; "
     "bars just below beat with them. Bars lie along the sensor's rows and columns and the edge does not, and lambda "
     "is chosen for each image: the two need not agree.",
-)  # fmt: skip
+)
 
 
 # -------- Images of bars and of a slanted edge in, how much contrast is left by spatial frequency out
@@ -386,4 +344,4 @@ def _centroid(weights: FloatArray, places: FloatArray) -> float:
     return float((squares * places).sum() / squares.sum())
 
 
-EXPERIMENTS = {each.name: each for each in (DISTANCE, BINNING, RESOLUTION)}
+STUDIES = {each.name: each for each in (DISTANCE, BINNING, RESOLUTION)}

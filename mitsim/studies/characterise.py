@@ -29,7 +29,7 @@ from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
 from mitsim.studies.emva_plots import figures_of
 from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
 from mitsim.studies.flat_frames import read_again, read_sets, remarks
-from mitsim.studies.framework.findings import build_findings
+from mitsim.studies.framework.page import build_findings
 from mitsim.studies.framework.run import study_folder, write_figures
 
 CAMERA_FILE = "camera.toml"

@@ -47,8 +47,10 @@ from mitsim.report.plots import (
     label_axes,
 )
 from mitsim.studies import lit_lines
-from mitsim.studies.framework.claims import difference, every, sample_mean, verdict, within
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, PageTable, Point, Results, Scope, Setup
+from mitsim.studies.framework.claims import every, verdict, within
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, Setup
+from mitsim.studies.framework.legacy import Experiment, difference, sample_mean
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.studio import Studio, flags_of
 
 # -------- Beside daylight of any brightness
@@ -203,7 +205,7 @@ def ladder_figure(rows: Table) -> Figure:
     return curves(panels, "D65 on the chart [lx]", "mean Delta E 2000 of 24 patches [1]", log=True)
 
 
-def ladder_tables(rows: Table) -> tuple[PageTable, PageTable]:
+def ladder_tables(rows: Table) -> tuple[Part, Part]:
     """Mean Delta E by illuminance, and what keeps the goal; ``rows`` of :data:`BY_LUX`."""
     families = [str(patterns) for patterns in rows.distinct("patterns")]
     pairs = list(product(families, METHODS))
@@ -225,16 +227,16 @@ def ladder_tables(rows: Table) -> tuple[PageTable, PageTable]:
 
     count = len(rows.where(method=MARKOV).distinct("draw"))
     return (
-        PageTable(
+        Part(
             "Mean Delta E 2000 of 24 patches by the illuminance of D65 on the chart: mean and standard error of "
-            f"{count} exposures, less a frame of as many shots as patterns",
+            f"{count} exposures, less a frame of as many shots as patterns", "",
             ("D65 [lx]", *(f"{label(family)}, {method}" for family, method in pairs)),
             tuple((f"{lux:g}", *(cell(lux, *pair) for pair in pairs)) for lux in rows.distinct("lux")),
         ),
-        PageTable(
+        Part(
             f"What keeps the mean Delta E at most {GOAL:g} above the floor: D65 [lx] with one exposure a pattern; in "
             "more light repeats of all exposures, or times the laser power (the same as a filter that lets through "
-            "one over that part of D65), by the least noise without bias",
+            "one over that part of D65), by the least noise without bias", "",
             ("Patterns", f"Most [lx], {MARKOV}", f"Most [lx], {LEAST}",
              *(f"{lux:g} lx: repeats; power" for lux in chosen)),
             tuple(map(needs, families)),
@@ -467,7 +469,7 @@ def _images(results: Results) -> Figure:
     return image_grid({OWN: cells}, [label(family) for family in FAMILIES])
 
 
-def _tables(results: Results) -> Sequence[PageTable]:
+def _tables(results: Results) -> Sequence[Part]:
     """Delta E of each patch by what found it, and its mean by way and patterns."""
     table, own = results.table, results.table.where(way=OWN)
     names = [str(name) for name in own.distinct("patch")]
@@ -483,8 +485,9 @@ def _tables(results: Results) -> Sequence[PageTable]:
 
     labels = tuple(map(label, FAMILIES))
     return (
-        PageTable(
+        Part(
             "Mean Delta E 2000 of 24 patches, and PSNR of all lines, by the way to see colour",
+            "",
             ("Way", *labels),
             tuple(
                 (str(way), *(cell(way, family) for family in FAMILIES))
@@ -493,9 +496,10 @@ def _tables(results: Results) -> Sequence[PageTable]:
             ),
         ),
         *ladder_tables(table.where(way=BY_LUX)),
-        PageTable(
+        Part(
             f"Delta E 2000 of each patch to its spectrum in D65, {OWN}: the floor (no camera), the truth (no noise), "
             "and what is reconstructed",
+            "",
             ("Patch", "Floor", "Truth", *labels),
             (row(f"mean of {len(names)}"), *(row(name, patch=name) for name in names)),
         ),

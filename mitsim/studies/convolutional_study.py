@@ -14,12 +14,12 @@ Systems"), with the noise and the exposure conventions of :mod:`mitsim.report.li
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.acquire.reference import rendered_psf
 from mitsim.api.bench import Bench
@@ -37,23 +37,15 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import curves
+from mitsim.report.pages import Mean, Value
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import (
-    QUICK_IMAGES,
-    SIDE,
-    Claim,
-    Experiment,
-    Found,
-    Point,
-    Results,
-    Scope,
-    picture,
-)
-from mitsim.studies.framework.studio import Studio, flags_of
+from mitsim.studies.framework.claims import Holds, Judged, stated, within
+from mitsim.studies.framework.experiment import QUICK_IMAGES, SIDE, Found, Point, Scope, Study, picture
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Studio, flags_of, image_arrays
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MEASURED, TRACED = "measured", "rendered"
 PERIODS = (1, 2, 3, 4, 5, 7)
@@ -64,13 +56,10 @@ _N = 128
 """Pixels a side of the images of test pictures, as the paper's."""
 _REDUCE, _SHAPE, _PITCH_MM = 4, (300, 400), 4 * 5.86e-3
 """The public picture, 1200 x 1600, in pixels of four; the traced one has the same, as large as IMX249's."""
-_UNIFORM_DB, _DOTS_DB = (19.0, 24.6), (38.5, 44.5)
-"""In the paper's figure 12."""
 _GOAL = 10.0
 """Times that the direct solver is to be faster."""
 _MAGNITUDE = 5.0
 """Times from which one speaks of an order of magnitude."""
-Judge = Callable[[str], tuple[str, Holds]]
 
 
 # ---- What is measured with ----
@@ -127,140 +116,116 @@ def _measure(studio: Studio, point: Point) -> Found:
         for exposure in EXPOSURES:
             shots = take(whole, bench.family(f"dots:{k}"), truth, bench.sensor, exposure, seed)
             solution, psnr_db = best_image(Classes(whole, k), shots, truth)
-            stated = flags_of(solution.status)
-            rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **stated))
+            flags = flags_of(solution.status)
+            rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=shots.exposure_s, **flags))
             if point.setup.picture in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
-                arrays = claims.image_arrays(solution.image, truth)
+                arrays = image_arrays(solution.image, truth)
     return Found(tuple(rows), arrays)
 
 
-# ---- Claims of the paper ----
+# ---- Claims of the paper, figures ----
 
 
-def _claims(results: Results) -> Sequence[Claim]:
-    quality, races = results.table.where(part="quality"), results.table.where(part="speed")
-    dots = Table(tuple(row for row in races.rows if row["patterns"] != 1))
-    speed = races.where(sensor=WHOLE)
-
-    def times(rows: Table, column: str, over: str, least: float) -> Judge:
-        def judge(psf: str) -> tuple[str, Holds]:
-            found = np.divide(rows.numbers(column, psf=psf), rows.numbers(over, psf=psf))
-            ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (found.min(), found.max()))
-            # Seconds vary by factors; numbers of patterns stand for repeats.
-            ratio = Mean.of_numbers(list(np.log(found)), f"{column} over {over}")
-            return f"{' to '.join(ends)} times as long", claims.within(ratio, low=float(np.log(least)))
-
-        return judge
-
-    def directly(claim: str, sensor: str) -> list[Claim]:
-        rows = dots.where(sensor=sensor)
-        return (
-            [_judge(rows, claim, "no closed form", times(rows, "iterative_s", "direct_s", _GOAL))] if rows.rows else []
-        )
-
-    return [
-        _psnr_claim(quality.where(patterns=1), "Uniform light", _UNIFORM_DB),
-        _psnr_claim(quality.where(patterns=49), "49 dots", _DOTS_DB),
-        _judge(
-            speed, "Iterations take an order of magnitude longer than the separable closed form", "10 times as long",
-            times(speed, "iterative_s", "separable_s", _MAGNITUDE),
-        ),
-        *directly("Dots can be solved directly, and iterations to equal error take ten times as long", WHOLE),
-        *directly("The same where the sensor ends at the picture's edge, prepared once", CROPPED),
-        _judge(
-            speed, "Even so, it takes longer than the separable closed form", "",
-            times(speed, "direct_s", "separable_s", 1.0),
-        ),
-    ]  # fmt: skip
+def _times(rows: DataFrame, column: str, over: str, least: float) -> tuple[str, Holds]:
+    """Judge whether a ``column`` of seconds is so many times another at least; patterns stand for repeats."""
+    times = rows[column].astype(float) / rows[over].astype(float)
+    ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (times.min(), times.max()))
+    # Seconds vary by factors.
+    ratio = Mean.of_numbers(np.log(times).tolist(), f"{column} over {over}")
+    return f"{' to '.join(ends)} times as long", within(ratio, low=float(np.log(least)))
 
 
-def _psnr_claim(rows: Table, name: str, band: tuple[float, float]) -> Claim:
-    """A claim of PSNR within a ``band`` [dB] of what is called ``name``, at each way of exposing."""
-    means = {
-        (psf, exposure): claims.sample_mean(rows.where(psf=psf, exposure=exposure), "psnr_db")
-        for psf in rows.distinct("psf")
-        for exposure in EXPOSURES
-    }
-    at = {
-        exposure: claims.every(*(claims.near(mean, band) for (_, each), mean in means.items() if each == exposure))
-        for exposure in EXPOSURES
-    }
-
-    def judgements(psf: str) -> tuple[str, Holds]:
-        return "; ".join(f"{exposure}: {means[psf, exposure]} dB" for exposure in EXPOSURES), None
-
-    claim = _judge(rows, f"{name}: {band[0]:g} to {band[1]:g} dB", f"{band[0]:g} to {band[1]:g} dB", judgements)
-    return replace(claim, verdict=claims.verdict_at(at))
+def _is_dots(patterns: int) -> bool:
+    return patterns != 1
 
 
-def _judge(rows: Table, claim: str, paper: str, judge: Judge) -> Claim:
-    """A claim judged with each point spread function in ``rows``; that of the measured one stands under "idealised"."""
-    judgements = {psf: judge(psf) for psf in rows.distinct("psf")}
-    texts = {psf: f"{psf} PSF: {text}" for psf, (text, _) in judgements.items()}
-    holds = claims.verdict(claims.every(*(each for _, each in judgements.values())))
-    return Claim(claim, paper, texts.get(MEASURED, ""), texts[TRACED], holds)
+_MODELS = ("psf", MEASURED, TRACED)
+_QUALITY = {"part": "quality", "exposure": EXPOSURES}
+_SPEED = {"part": "speed", "sensor": WHOLE}
+_FRAMES = "number of frames [1]"
 
-
-# ---- Figures and the experiment ----
-
-
-def _figures(results: Results) -> Mapping[str, Figure]:
-    quality, speed = results.table.where(part="quality"), results.table.where(part="speed")
-    psfs = quality.distinct("psf")
-    drawn = {}
-    for exposure in EXPOSURES:
-        rows = quality.where(exposure=exposure)
-        lines = {f"{psf} point spread function": rows.where(psf=psf).means("psnr_db", "patterns") for psf in psfs}
-        drawn[f"psnr_{exposure.replace(' ', '_')}.png"] = curves(
-            {"": lines},
-            "number of frames [1]",
-            log=True,
-            title=f"PSNR by the number of frames, exposure {exposure}, best lambda",
-        )
-    drawn["seconds.png"] = _seconds(speed, psfs)
-    few = [each for each in quality.distinct("patterns") if each in (1, 9, 49)]
-    by_scene = {
-        f"{name or 'scene'}, {psf}": quality.where(psf=psf, picture=name, exposure=EQUAL_FRAME)
-        for psf in psfs
-        for name in (*QUICK_IMAGES, None)
-    }
-    title = f"Images, exposure {EQUAL_FRAME}, best lambda"
-    columns = [f"{count} frame{'s' if count > 1 else ''}" for count in few]
-    return drawn | claims.images("images.png", results, by_scene, "patterns", few, title, columns)
-
-
-def _seconds(speed: Table, psfs: Sequence[str]) -> Figure:
-    """CPU seconds of both solvers and of a separable camera's, by the number of dots."""
-    panels = {}
-    for psf in psfs:
-        rows = speed.where(psf=psf, sensor=WHOLE)
-        names = {"iterative": "iterative_s", "direct": "direct_s", "separable camera": "separable_s"}
-        panels[f"{psf} point spread function"] = {
-            name: rows.means(column, "patterns") for name, column in names.items()
-        }
-    figure = curves(
-        panels,
-        "number of frames [1]",
-        "processor time [s]",
-        log=True,
-        title="Time of the solvers by the number of frames, at equal error",
-    )
-    for axes in figure.axes:
-        axes.set_yscale("log")
-    return figure
-
-
-EXPERIMENT = Experiment(
+STUDY = Study(
     "convolutional",
     "A diffuser for a mask",
     "What do dots bring to a DiffuserCam, and is there no direct solution?",
-    _points, _measure, _claims, _figures,
+    points=_points,
+    measure=_measure,
+    claims=(
+        replace(stated("Uniform light: 19 to 24.6 dB", 19.0, 24.6, part="quality", patterns=1), models=_MODELS),
+        replace(stated("49 dots: 38.5 to 44.5 dB", 38.5, 44.5, part="quality", patterns=49), models=_MODELS),
+        *(
+            Judged(
+                claim,
+                partial(_times, column=column, over=over, least=least),
+                where=where,
+                paper=paper,
+                models=_MODELS,
+                optional=where["sensor"] == CROPPED,  # a quick study has none
+            )
+            for claim, paper, where, column, over, least in (
+                (
+                    "Iterations take an order of magnitude longer than the separable closed form",
+                    "10 times as long",
+                    _SPEED,
+                    "iterative_s",
+                    "separable_s",
+                    _MAGNITUDE,
+                ),
+                (
+                    "Dots can be solved directly, and iterations to equal error take ten times as long",
+                    "no closed form",
+                    {**_SPEED, "patterns": _is_dots},
+                    "iterative_s",
+                    "direct_s",
+                    _GOAL,
+                ),
+                (
+                    "The same where the sensor ends at the picture's edge, prepared once",
+                    "no closed form",
+                    {**_SPEED, "patterns": _is_dots, "sensor": CROPPED},
+                    "iterative_s",
+                    "direct_s",
+                    _GOAL,
+                ),
+                ("Even so, it takes longer than the separable closed form", "", _SPEED, "direct_s", "separable_s", 1.0),
+            )
+        ),
+    ),
+    panels=(
+        Lines(
+            "patterns",
+            _FRAMES,
+            title="PSNR, best lambda",
+            where=_QUALITY,
+            each="exposure",
+            colour="psf",
+            facet="",
+            log=True,
+        ),
+        Lines(
+            "patterns",
+            _FRAMES,
+            file="seconds",
+            title="Time of the solvers by the number of frames, at equal error",
+            y_label="processor time [s]",
+            where=_SPEED,
+            colour={"iterative_s": "iterative", "direct_s": "direct", "separable_s": "separable camera"},
+            facet="psf",
+            log=True,
+        ),
+        Images(
+            "patterns",
+            title=f"Images by the number of frames, exposure {EQUAL_FRAME}, best lambda",
+            where={"part": "quality", "exposure": EQUAL_FRAME, "patterns": (1, 9, 49)},
+            down=("picture", "psf"),
+        ),
+    ),
+    heads=("Paper", "Measured", "Rendered"),
     note="A frame is the scene convolved with the camera's point spread function (PSF), that of a rendered diffuser "
-    "and, with -D psf=FILE, a measured one besides, which then stands under Idealised; no light of a scene is "
-    "traced. The sensor gets all light. Best lambda: that of the highest PSNR. Times are processor seconds on one "
-    "thread.",
+    "and, with -D psf=FILE, a measured one besides; no light of a scene is traced. The sensor gets all light. Best "
+    "lambda: that of the highest PSNR. Times are processor seconds on one thread.",
     traced=False,
-)  # fmt: skip
+)
 
 
 # ---- Noisy frames behind a diffuser ----

@@ -10,18 +10,31 @@ depths, whose depth is found for each projector pixel.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-
-from matplotlib.figure import Figure
+from functools import partial
+from typing import TYPE_CHECKING
 
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED, label
 from mitsim.report.lit_scene import Plane
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import curves
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope, group_by_setup
-from mitsim.studies.framework.studio import Image, Studio
+from mitsim.report.pages import Mean
+from mitsim.studies.framework.claims import (
+    Gain,
+    Holds,
+    Judged,
+    choose_rows,
+    distinct,
+    every,
+    mean_of,
+    verdict,
+    within,
+)
+from mitsim.studies.framework.experiment import Claim, Found, Point, Results, Scope, Study, group_by_setup
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Image, Studio, finding
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 CALIBRATED_MM = 400.0
 """The paper's distance."""
@@ -92,108 +105,114 @@ def _measure(studio: Studio, point: Point) -> Found:
         focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
         # Frames of the sheet elsewhere, factors of the bench as it was aligned.
         image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
-    return claims.finding(studio, point, image.image, scene=setup.scene, **image.row())
+    return finding(studio, point, image.image, scene=setup.scene, **image.row())
 
 
-def _claims(results: Results) -> Sequence[Claim]:
-    table = results.table
-    near = min(abs(depth - CALIBRATED_MM) for depth in table.distinct("depth") if depth != CALIBRATED_MM)
-    small = max(near, _SMALL_MM)
+def _loss(rows: DataFrame, small: float) -> Mean:
+    """Return the loss at the worse of both depths that are ``small`` mm beside the calibrated one."""
+    there = choose_rows(rows, {"depth": CALIBRATED_MM})
+    beside = (choose_rows(rows, {"depth": CALIBRATED_MM + side * small}) for side in (-1, 1))
+    return max((mean_of(there, "psnr_db", each) for each in beside if len(each)), key=lambda loss: loss.value)
 
-    def worse_loss(rows: Table) -> Mean:
-        """At the worse of both depths."""
-        there = rows.where(depth=CALIBRATED_MM)
-        beside = [depth for depth in rows.distinct("depth") if abs(depth - CALIBRATED_MM) == small]
-        losses = (claims.difference(there, rows.where(depth=depth), "psnr_db") for depth in beside)
-        return max(losses, key=lambda loss: loss.value)
 
-    ideal = table.where(model=IDEALISED, patterns="dots:7", along="columns")
-    losses = {baseline: worse_loss(ideal.where(baseline=baseline)) for baseline in ideal.distinct("baseline")}
-    rendered = worse_loss(table.where(model=RENDERED, patterns="dots:7", focus=NONE))
-    holds = {baseline: claims.within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
+def _is_robust(results: Results) -> list[Claim]:
+    """Judge the loss a little beside the calibrated depth, at each distance between camera and projector."""
+    table = choose_rows(results.frame, {"patterns": "dots:7"})
+    small = max(
+        _SMALL_MM, min(abs(depth - CALIBRATED_MM) for depth in distinct(table, "depth") if depth != CALIBRATED_MM)
+    )
+    ideal = choose_rows(table, {"model": IDEALISED, "along": "columns"})
+    losses = {each: _loss(choose_rows(ideal, {"baseline": each}), small) for each in distinct(ideal, "baseline")}
+    rendered = _loss(choose_rows(table, {"model": RENDERED, "focus": NONE}), small)
+    holds = {baseline: within(loss, high=_ROBUST_DB) for baseline, loss in losses.items()}
     robust = [baseline for baseline, each in holds.items() if each]
-    by_baseline = ", ".join(f"{loss} dB at {baseline:g} mm" for baseline, loss in losses.items())
-    everywhere = claims.every(claims.within(rendered, high=_ROBUST_DB), *holds.values())
+    everywhere = every(within(rendered, high=_ROBUST_DB), *holds.values())
     apart = f"at most {max(robust):g} mm apart" if any(robust) else "co-located"
     only = f"confirmed only if camera and projector are {apart}"
-    found = [
+    return [
         Claim(
-            f"Robust to small variations in depth: 49 dots, {small:g} mm beside the calibrated distance", "robust",
-            f"lost by baseline: {by_baseline}", f"lost at 60 mm: {rendered} dB",
-            only if everywhere is False and robust else claims.verdict(everywhere),
+            f"Robust to small variations in depth: 49 dots, {small:g} mm beside the calibrated distance",
+            "robust",
+            f"lost by baseline: {', '.join(f'{loss} dB at {each:g} mm' for each, loss in losses.items())}",
+            f"lost at 60 mm: {rendered} dB",
+            only if everywhere is False and robust else verdict(everywhere),
         )
-    ]  # fmt: skip
-    own, auto = (table.where(focus=focus, patterns="dots:7") for focus in (OWN, AUTO))
-    gains = {
-        depth: claims.difference(auto.where(depth=depth), own.where(depth=depth), "psnr_db")
-        for depth in own.distinct("depth")
-    }
-    worst = min(gains.values(), key=lambda gain: gain.value)
-    which = f"worst of {len(gains)} depths" if len(gains) > 1 else f"{min(gains):g} mm"
-    found.append(
-        Claim(
-            "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
-            "", "", f"{worst:+} dB at {which}",
-            claims.verdict(claims.every(*(claims.within(gain, low=-_ROBUST_DB) for gain in gains.values()))),
-        )
-    )  # fmt: skip
-    return [*found, *(_map_claim(table.where(scene=scene), scene) for scene in DEEP if len(table.where(scene=scene)))]
+    ]
 
 
-def _map_claim(rows: Table, scene: str) -> Claim:
-    short, long = DEEP[scene]
-    by_case = {
-        (family, focus): rows.where(patterns=family, focus=focus) for family in (short, long) for focus in (NONE, MAP)
+def _mended(rows: DataFrame, short: str, long: str) -> tuple[str, Holds]:
+    """Judge whether a map of depths mends images under the ``long`` family and is flagged under the ``short`` one."""
+    found = {
+        (family, focus): choose_rows(rows, {"patterns": family, "focus": focus})
+        for family in (short, long)
+        for focus in (NONE, MAP)
     }
-    means = {case: claims.sample_mean(each, "psnr_db") for case, each in by_case.items()}
-    flagged = all(row["flagged"] for row in rows.where(patterns=short, focus=MAP).rows)
-    gains = "; ".join(
-        f"{label(name)} {means[name, NONE]} dB, with depths {means[name, MAP]} dB" for name in (short, long)
+    text = "; ".join(
+        f"{label(name)} {mean_of(found[name, NONE])} dB, with depths {mean_of(found[name, MAP])} dB"
+        for name in (short, long)
     )
-    gain = claims.difference(by_case[long, MAP], by_case[long, NONE], "psnr_db")
-    better = claims.every(claims.within(gain, low=_ROBUST_DB), flagged)
-    return Claim(
-        f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each other",
-        "", "", gains, claims.verdict(better),
-    )  # fmt: skip
+    gain = mean_of(found[long, MAP], "psnr_db", found[long, NONE])
+    return text, every(within(gain, low=_ROBUST_DB), bool(found[short, MAP]["flagged"].all()))
 
 
-def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
-    ideal, rendered = table.where(model=IDEALISED), table.where(model=RENDERED)
-    by_baseline = {
-        f"{baseline:g} mm": ideal.where(patterns="dots:7", along="columns", baseline=baseline).means("psnr_db", "depth")
-        for baseline in ideal.distinct("baseline")
-    }
-    axis = "depth of the plane [mm]"
-    title = "Idealised plane, 49 dots, by the distance between camera and projector"
-    drawn = {"baseline.png": curves({"": by_baseline}, axis, title=title)}
-    own = {
-        name: rows.where(along="columns", baseline=60.0).means("psnr_db", "depth")
-        for name, rows in claims.by_patterns(ideal).items()
-    }
-    title = "Idealised plane, projector 60 mm beside the camera, by patterns"
-    drawn["patterns.png"] = curves({"": own}, axis, title=title)
-    focus = {
-        _FOCUSED[name]: rendered.where(patterns="dots:7", focus=name).means("psnr_db", "depth")
-        for name in (NONE, AUTO, OWN)
-    }
-    drawn["focus.png"] = curves(
-        {"": focus}, "depth of the sheet [mm]", title="Rendered sheet, projector 60 mm beside the camera, 49 dots"
-    )
-    lines = {
-        f"{scene}, {label(family)}": table.where(scene=scene, patterns=family)
-        for scene in DEEP
-        for family in DEEP[scene]
-    }
-    shown: list[Value] = [NONE, MAP]
-    titles = ["one depth", "a depth for each pixel"]
-    return drawn | claims.images("images.png", results, lines, "focus", shown, "Rendered scenes of many depths", titles)
+_ALONG = {"model": IDEALISED, "along": "columns"}
 
-
-EXPERIMENT = Experiment(
+STUDY = Study(
     "depth",
     "Depth",
     "What does a scene beside the calibrated distance cost, and what is left once its depth is found?",
-    _points, _measure, _claims, _figures,
-)  # fmt: skip
+    points=_points,
+    measure=_measure,
+    claims=(
+        _is_robust,
+        Gain(
+            "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
+            {"focus": AUTO},
+            {"focus": OWN},
+            where={"patterns": "dots:7", "focus": (AUTO, OWN), "depth": lambda depth: depth != CALIBRATED_MM},
+            every="depth",
+            at_least=-_ROBUST_DB,
+        ),
+        *(
+            Judged(
+                f"A depth for each pixel (--focus map) mends {scene}, and is flagged where dots are too near to each "
+                "other",
+                partial(_mended, short=short, long=long),
+                where={"scene": scene, "focus": (NONE, MAP)},
+                optional=True,
+            )
+            for scene, (short, long) in DEEP.items()
+        ),
+    ),
+    panels=(
+        *(
+            Lines(
+                "depth",
+                "depth of the plane [mm]",
+                file=file,
+                title=title,
+                where=where,
+                colour=file,
+                facet="",
+                names=names,
+            )
+            for file, title, where, names in (
+                ("baseline", "Idealised, 49 dots, by baseline", _ALONG | {"patterns": "dots:7"}, "{} mm"),
+                ("patterns", "Idealised, projector 60 mm beside the camera", _ALONG | {"baseline": 60.0}, {}),
+                (
+                    "focus",
+                    "Rendered, 49 dots",
+                    {"model": RENDERED, "patterns": "dots:7", "focus": tuple(_FOCUSED)},
+                    _FOCUSED,
+                ),
+            )
+        ),
+        Images(
+            "focus",
+            title="Rendered scenes of many depths",
+            where={"scene": tuple(DEEP), "focus": (NONE, MAP)},
+            down=("scene", "patterns"),
+            names={NONE: "one depth", MAP: "a depth for each pixel"},
+        ),
+    ),
+)

@@ -18,9 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.acquire.capture import trace_request
 from mitsim.acquire.drifting import DriftedExposer, drift_mask, drift_projector, levels, warmer
@@ -43,26 +43,28 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import curves, pair_chart
+from mitsim.report.pages import Value
 from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
 from mitsim.sensor.specimen import specimen
-from mitsim.studies.framework.claims import Cell, difference, grid_with_truths, single_precision, verdict, within
+from mitsim.studies.framework.claims import Gain, choose_rows, distinct, mean_of
 from mitsim.studies.framework.experiment import (
     IMAGE,
     TEST_IMAGES,
     TRUTH,
-    Claim,
-    Experiment,
     Found,
     Point,
     Results,
     Scope,
     Setup,
+    Study,
     group_by_setup,
     number_of,
 )
-from mitsim.studies.framework.studio import Studio, flags_of
+from mitsim.studies.framework.panels import Bars, Images, Lines
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 from mitsim.studies.perturbation import Changed, Expected, Gains, LinearImage, Noise
 
 AMBIENT, SESSION = "ambient frame", "session"
@@ -476,10 +478,10 @@ _RIPPLES = "power_ripple", "lamp_ripple"
 """Kinds that a rolling shutter sees by its line time."""
 _LAMP_SCENE, _LAMP = "lamp_bench", "11.7"
 """Scene with a lamp beside the projector, a tenth as bright on the sheet, for what lamps do where no scene is given."""
-_LINES = ("measured", "predicted")
+_LINES = {"lost_db": "measured", "predicted_lost_db": "predicted"}
+_LOST = "PSNR lost [dB]"
+_ERRORS = {"predicted_lost_db": "predicted_error_db"}
 _BEFORE = "without the drift"
-_ARRAYS = {_BEFORE: "before_db", IMAGE: "after_db"}
-"""Images that are kept, and columns of their PSNR."""
 _SHOWN = 4
 """Kinds whose images are shown, those that cost the most: images that lose less than a decibel look alike."""
 AGREE_DB = 0.5
@@ -571,79 +573,88 @@ def _move_projector(lit: LitScene, drift: Drift) -> LitScene:
     return LitScene(trace_request(drift_projector(lit.bench, drift), lit.light.plan))
 
 
-def _first_amounts(table: Table) -> Mapping[str, Table]:
-    """Rows of each kind at its first amount, by kind, amount and unit."""
-    found = {}
-    for kind in table.distinct("kind"):
-        rows = table.where(kind=kind)
-        amount = rows.rows[0]["amount"]
-        name = f"{DRIFT_WORDS[kind]}, {amount_in_words(str(kind), rows.numbers('amount')[0])}"
-        found[name] = rows.where(amount=amount)
-    return found
+def _by_kind(results: Results) -> Results:
+    """Return results whose rows name kind and amount (``what``) and tell the ``first`` amount of each kind."""
+    first: dict[Value, Value] = {}
+    for row in results.rows:
+        first.setdefault(row["kind"], row["amount"])
+    rows = []
+    for row in results.rows:
+        kind, amount = str(row["kind"]), float(str(row["amount"]))
+        what = f"{DRIFT_WORDS[kind]}, {amount_in_words(kind, amount)}"
+        rows.append({**row, "what": what, "first": row["amount"] == first[row["kind"]]})
+    return replace(results, rows=rows)
 
 
-def _both(rows: Table) -> tuple[Mean, Mean]:
-    """Measured and predicted loss of some ``rows``, the latter's error with what the model leaves out."""
-    measured, predicted = rows.mean("lost_db"), rows.mean("predicted_lost_db")
-    error = math.hypot(rows.mean("predicted_error_db").value, np.nan_to_num(predicted.error))
-    return measured, predicted._replace(error=error)
-
-
-def _claims(results: Results) -> Sequence[Claim]:
-    return [
-        Claim(
-            f"{name}: loss predicted within {AGREE_DB:g} dB", "", f"{_text(predicted)} dB lost",
-            f"{_text(measured)} dB lost",
-            verdict(within(difference(rows, rows, "lost_db", "predicted_lost_db"), -AGREE_DB, AGREE_DB)),
+def _by_amount(results: Results) -> dict[str, Figure]:
+    """Draw the loss over the amount for each kind with several amounts."""
+    drawn: dict[str, Figure] = {}
+    for kind, unit in {row["kind"]: row["unit"] for row in results.rows if not row["first"]}.items():
+        label = f"{DRIFT_WORDS[str(kind)]} [{unit}]"
+        panel = Lines(
+            "amount",
+            label,
+            file=str(kind),
+            y_label=_LOST,
+            where={"kind": kind},
+            colour=_LINES,
+            facet="",
+            errors=_ERRORS,
         )
-        for name, rows in _first_amounts(results.table).items()
-        for measured, predicted in (_both(rows),)
-    ]  # fmt: skip
-
-
-def _text(mean: Mean) -> str:
-    known = not math.isnan(mean.error)
-    return f"{mean.value:.2f} \N{PLUS-MINUS SIGN} {mean.error:.2f}" if known else f"{mean.value:.2f}"
-
-
-def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
-    drawn = {
-        "losses.png": pair_chart(
-            {name: _both(rows) for name, rows in _first_amounts(table).items()}, _LINES, "PSNR lost [dB]"
-        )
-    }
-    for kind in table.distinct("kind"):
-        rows = table.where(kind=kind)
-        if len(rows.distinct("amount")) > 1:
-            both = {amount: _both(rows.where(amount=amount)) for amount in rows.distinct("amount")}
-            lines = {name: {amount: pair[index] for amount, pair in both.items()} for index, name in enumerate(_LINES)}
-            drawn[f"{kind}.png"] = curves(
-                {"": lines}, f"{DRIFT_WORDS[kind]} [{rows.rows[0]['unit']}]", "PSNR lost [dB]"
-            )
-    return drawn | _images(results)
+        drawn |= panel.draw(results)
+    return drawn
 
 
 def _images(results: Results) -> dict[str, Figure]:
-    """Of the kinds that cost the most, the first seed's image without the drift and with it, beside the truth."""
-    grid: dict[str, list[Cell]] = {}
-    dearest = sorted(_first_amounts(results.table).items(), key=lambda item: -item[1].mean("lost_db").value)
-    for name, rows in dearest[:_SHOWN]:
-        row = rows.rows[0]
-        truth = results.array(row, TRUTH)
-        kept = ((results.array(row, array), row.get(column)) for array, column in _ARRAYS.items())
-        cells = [(image, truth, f"{level:.1f} dB") for image, level in kept if image is not None]
-        if len(cells) == len(_ARRAYS):
-            grid[name] = cells
-    title = "Images of the kinds that cost the most"
-    return {"images.png": grid_with_truths(grid, [_BEFORE, "with it"], title)} if grid else {}
+    """Draw the images of the kinds that cost the most, dearest first."""
+    first = choose_rows(results.frame, {"first": True})
+    lost = {what: mean_of(choose_rows(first, {"what": what}), "lost_db").value for what in distinct(first, "what")}
+    dearest = sorted(lost, key=lambda what: -lost[what])[:_SHOWN]
+    panel = Images(
+        {_BEFORE: (_BEFORE, "{before_db:.1f} dB"), IMAGE: ("with it", "{after_db:.1f} dB")},
+        title="Images of the kinds that cost the most",
+        before={TRUTH: "truth"},
+        down=("what",),
+    )
+    return panel.draw(replace(results, rows=[row for what in dearest for row in results.rows if row["what"] == what]))
 
 
-EXPERIMENT = Experiment(
+STUDY = Study(
     "drift",
     "What drifts between calibration and capture",
     "How many decibels does each kind of drift cost, and do closed forms say so?",
-    _points, _measure, _claims, _figures,
+    points=_points,
+    measure=_measure,
+    derive=_by_kind,
+    claims=(
+        Gain(
+            f"{{what}}: loss predicted within {AGREE_DB:g} dB",
+            {},
+            {},
+            where={"first": True},
+            each="what",
+            column="lost_db",
+            other_column="predicted_lost_db",
+            other_error="predicted_error_db",
+            unit="dB lost",
+            at_least=-AGREE_DB,
+            at_most=AGREE_DB,
+            apart=True,
+        ),
+    ),
+    panels=(
+        Bars(
+            "what",
+            file="losses",
+            where={"first": True},
+            colour=_LINES,
+            x_label=_LOST,
+            ordered=True,
+            errors=_ERRORS,
+        ),
+        _by_amount,
+        _images,
+    ),
     about="PSNR that an image loses when one thing moves after the calibration. Measured: frames after the drift, "
     "solved with the factors and lambda from before it, against the same noise without the drift; one standard error "
     "over sessions and noise. Predicted: closed forms of these factors, the truth and the mean noise; no frame is "
@@ -651,4 +662,4 @@ EXPERIMENT = Experiment(
     "detail inside projector pixels.",
     heads=("", "Predicted", "Measured"),
     solved=True,
-)  # fmt: skip
+)

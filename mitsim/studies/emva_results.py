@@ -16,7 +16,7 @@ from mitsim.sensor.found_camera import FoundCamera
 from mitsim.sensor.specimen import mean_dark_current
 from mitsim.studies.emva_frames import Frames
 from mitsim.studies.emva_options import capacity_of
-from mitsim.studies.framework.findings import Part, text_table
+from mitsim.studies.framework.page import Part, text_table
 
 UNITS: Mapping[str, tuple[str, str]] = {
     "system_gain": ("K", "DN/e-"),

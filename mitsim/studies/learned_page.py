@@ -13,7 +13,8 @@ from mitsim.reconstruct.request import TIKHONOV
 from mitsim.report import IDEALISED, RENDERED, in_text, label
 from mitsim.report.pages import DASH, Mean
 from mitsim.report.plots import image_grid, pair_chart
-from mitsim.studies.framework.experiment import QUICK_IMAGES, PageTable, Results
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Results
+from mitsim.studies.framework.page import Part
 from mitsim.studies.learned_cells import ELSEWHERE, PICTURES
 from mitsim.studies.learned_claims import MISFIT, Gain, Kind, Matrix, count_failures, mean_mismatch
 from mitsim.studies.learned_scores import AUTOMATIC, BEST, WEIGHTS
@@ -22,14 +23,14 @@ TRUTH = "truth"
 """Among the arrays of a classical point: what images are compared with."""
 
 
-def tables(results: Results) -> Sequence[PageTable]:
+def tables(results: Results) -> Sequence[Part]:
     """PSNR and gain for each family of patterns; flags, detail, and costs; of all ``results``."""
     matrix = Matrix(results.table)
     found = [make(matrix, patterns) for patterns in matrix.patterns for make in (_psnr_table, _gain_table)]
     return [*found, _flag_table(matrix), _misfit_table(matrix), _detail_table(matrix), _cost_table(matrix)]
 
 
-def _psnr_table(matrix: Matrix, patterns: str) -> PageTable:
+def _psnr_table(matrix: Matrix, patterns: str) -> Part:
     rows = []
     for weight in WEIGHTS:
         by_condition = [matrix.classical[patterns, name, weight] for name in matrix.conditions]
@@ -40,10 +41,10 @@ def _psnr_table(matrix: Matrix, patterns: str) -> PageTable:
     for kind in (kind for kind in matrix.kinds if kind.patterns == patterns):
         rows.append((str(kind), *(str(matrix.level(kind, name).prints) for name in matrix.conditions)))
     title = f"{label(patterns)}: mean PSNR [dB] by what is tested on, with its standard error over prints"
-    return PageTable(title, ("image (training set)", *matrix.conditions), tuple(rows))
+    return Part(title, "", ("image (training set)", *matrix.conditions), tuple(rows))
 
 
-def _gain_table(matrix: Matrix, patterns: str) -> PageTable:
+def _gain_table(matrix: Matrix, patterns: str) -> Part:
     rows = [
         (str(kind), *(_gain_text(matrix.gain(kind, name)) for name in matrix.conditions))
         for kind in matrix.kinds
@@ -53,7 +54,7 @@ def _gain_table(matrix: Matrix, patterns: str) -> PageTable:
         f"{label(patterns)}: gain over the best classical image of each print [dB], with its standard error over "
         "prints, and behind the comma that over trainings"
     )
-    return PageTable(title, ("network (training set)", *matrix.conditions), tuple(rows))
+    return Part(title, "", ("network (training set)", *matrix.conditions), tuple(rows))
 
 
 def _gain_text(gain: Gain) -> str:
@@ -67,7 +68,7 @@ def _numbers(rows: Iterable[Mapping[str, object]], column: str) -> list[float]:
     return [float(value) for row in rows if isinstance(value := row.get(column), (int, float))]
 
 
-def _flag_table(matrix: Matrix) -> PageTable:
+def _flag_table(matrix: Matrix) -> Part:
     rows = []
     for kind in matrix.kinds:
         shares = []
@@ -82,24 +83,24 @@ def _flag_table(matrix: Matrix) -> PageTable:
         "know; and of images 3 dB below the best classical one of a calibrated bench, and of others, how many misfit "
         "flags"
     )
-    return PageTable(title, ("network", *matrix.conditions, "failed", "others"), tuple(rows))
+    return Part(title, "", ("network", *matrix.conditions, "failed", "others"), tuple(rows))
 
 
 _FLAGS = MISFIT, ("flag_noise", "flag_camera")
 """Columns of a network's row."""
 
 
-def _misfit_table(matrix: Matrix) -> PageTable:
+def _misfit_table(matrix: Matrix) -> Part:
     rows = [
         (label(patterns), *(_mean(matrix.classical[patterns, name, BEST], "unexplained", "{:.1e}") for name in
                             matrix.conditions))
         for patterns in matrix.patterns
     ]  # fmt: skip
     title = f"Part of the frames that no image gives, beyond the sensor's noise, rms [1]; flagged above {UNEXPLAINED:g}"
-    return PageTable(title, ("patterns", *matrix.conditions), tuple(rows))
+    return Part(title, "", ("patterns", *matrix.conditions), tuple(rows))
 
 
-def _detail_table(matrix: Matrix) -> PageTable:
+def _detail_table(matrix: Matrix) -> Part:
     """Of rendered frames, where nothing is amiss."""
     every = [row for rows in matrix.classical.values() for row in rows]
     cycles = sorted(set(_numbers(every, "cycles")))
@@ -119,7 +120,7 @@ def _detail_table(matrix: Matrix) -> PageTable:
         "(above an eighth of a cycle a pixel) with the truth's, and how much there is: much that does not correlate is "
         "invented"
     )
-    return PageTable(title, ("image", *heads), tuple(rows))
+    return Part(title, "", ("image", *heads), tuple(rows))
 
 
 def _bars(rows: Iterable[Mapping[str, object]], cycles: float) -> list[Mapping[str, object]]:
@@ -132,7 +133,7 @@ def _mean(rows: Iterable[Mapping[str, object]], column: str, form: str = "{:.2f}
     return form.format(sum(own) / len(own)) if own else DASH
 
 
-def _cost_table(matrix: Matrix) -> PageTable:
+def _cost_table(matrix: Matrix) -> Part:
     rows = []
     for kind in matrix.kinds:
         own = [row for name in matrix.conditions for row in matrix.rows[kind, name]]
@@ -150,7 +151,7 @@ def _cost_table(matrix: Matrix) -> PageTable:
         "What a mismatch costs: gain over the best classical image [dB], mean of all mismatches and the worst of them; "
         "processor seconds of a training, and of an image"
     )
-    return PageTable(title, ("image", "mean mismatch", "worst mismatch", "training [s]", "image [s]"), tuple(rows))
+    return Part(title, "", ("image", "mean mismatch", "worst mismatch", "training [s]", "image [s]"), tuple(rows))
 
 
 # -------- Figures

@@ -20,9 +20,9 @@ from mitsim.learn.training_request import PREPROCESSED
 from mitsim.learn.verbs import check_torch
 from mitsim.report import RENDERED
 from mitsim.report.pages import Value
-from mitsim.studies.framework.claims import single_precision
-from mitsim.studies.framework.experiment import QUICK_IMAGES, Experiment, Found, Point, Scope
-from mitsim.studies.framework.studio import Studio
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Found, Point, Scope
+from mitsim.studies.framework.legacy import Experiment
+from mitsim.studies.framework.studio import Studio, single_precision
 from mitsim.studies.learned_bench import DEPTH, PLACES, Shown
 from mitsim.studies.learned_cells import FULL, PICTURES, QUICK, Budget, Cell, School, cells
 from mitsim.studies.learned_claims import find_claims

@@ -1,4 +1,4 @@
-"""Moving the mask instead of the light: SweepCam's uniform frames at 49 places of the mask, 49 uniform frames, 49 dots.
+"""The mask moved instead of the light: SweepCam's uniform frames at 49 places of the mask, 49 uniform frames, 49 dots.
 
 Paper, section IV-D: the mask moves by -15 to +15 of its features, and there are as many frames as patterns. It does not
 say along which axes; a grid of k x k places has as many frames as dots of period k, and is taken here. A line of 49
@@ -19,13 +19,11 @@ scene's light serves all places.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
 from mitsim.bench.apparatus import Apparatus
@@ -45,11 +43,10 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
-from mitsim.report.pages import Table
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Lines, image_arrays, images
-from mitsim.studies.framework.experiment import QUICK_IMAGES, Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Image, Studio, flags_of
+from mitsim.studies.framework.claims import CONFIRMED, Gain, stated
+from mitsim.studies.framework.experiment import QUICK_IMAGES, Axes, Claim, Found, Point, Results, Study
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Image, Studio, flags_of, image_arrays
 
 REACH = 15.0
 """Features that the mask moves either way."""
@@ -63,18 +60,6 @@ _SWEPT_DB = (24.9, 26.8)
 _TELLS_DB = 0.5
 """A gain that counts: a tenth of the squared error."""
 EXPOSURES = (EQUAL_PEAK, EQUAL_FRAME)
-
-
-def _points(scope: Scope) -> Sequence[Point]:
-    sides = scope.choose((1, *GRIDS), (1, 7))
-    cases = [(UNIFORM, side) for side in sides] + [(name, side) for name in (SWEPT, DOTS) for side in sides[1:]]
-    return [
-        Point.of(scope.setup.with_print(name), model=model, patterns=method, frames=side**2, seed=seed)
-        for name in (scope.pictures[:1] if scope.quick else scope.pictures)
-        for seed in scope.seeds
-        for method, side in [*cases, (LINE, 7)]
-        for model in (MODELS if method != LINE else (IDEALISED,))
-    ]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
@@ -129,53 +114,62 @@ def _spread(count: int, feature_mm: float) -> tuple[float, ...]:
     return tuple(float(place) for place in np.linspace(-REACH, REACH, count) * feature_mm)
 
 
-def _claims(results: Results) -> Sequence[Claim]:
-    table = results.table
-    many = table.where(frames=_FRAMES)
-    line = {each: claims.sample_mean(many.where(patterns=LINE, exposure=each), "psnr_db") for each in EXPOSURES}
-    on_the_line = claims.every(*(claims.near(mean, _SWEPT_DB) for mean in line.values()))
-    on_a_line = "; ".join(f"{exposure}: {mean} dB" for exposure, mean in line.items())
-    still, swept, dots = ({"patterns": name} for name in (UNIFORM, SWEPT, DOTS))
-    counts, one = (_TELLS_DB, math.inf), table.where(patterns=UNIFORM, frames=1)
-    on_a_grid = "SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid"
-    gained = "SweepCam's 49 frames beat 49 frames through a mask that rests"
-    return [
-        claims.psnr_claim(one, "One uniform frame gives 21.3 to 22.9 dB", (21.3, 22.9)),
-        claims.psnr_claim(many.where(**swept), on_a_grid, _SWEPT_DB),
-        Claim(
-            "The same on a line along the rows", "24.9 to 26.8 dB", on_a_line, "",
-            "confirmed only idealised" if on_the_line else claims.verdict(on_the_line),
-        ),
-        claims.psnr_claim(many.where(**dots), "49 shifting dots give 34 to 35.5 dB", (34.0, 35.5)),
-        claims.gain_claim(many, "49 dots beat SweepCam's 49 frames", "higher", (dots, swept), between=counts),
-        claims.gain_claim(many, gained, "", (swept, still), between=counts),
-    ]  # fmt: skip
+def _on_a_line(results: Results) -> list[Claim]:
+    """Judge the frames along one axis, which exist in the idealised model alone."""
+    band = stated("The same on a line along the rows", *_SWEPT_DB, patterns=LINE)
+    (claim,) = band.judge(results)
+    return [replace(claim, verdict="confirmed only idealised") if claim.verdict == CONFIRMED else claim]
 
 
-def _figures(results: Results) -> Mapping[str, Figure]:
-    table = results.table
+_MANY = {"frames": _FRAMES}
 
-    def lines(rows: Table) -> Lines:
-        """By method; one uniform frame is the first of each."""
-        first = rows.where(patterns=UNIFORM, frames=1).rows
-        moved = {name: Table((*first, *rows.where(patterns=name).rows)) for name in (SWEPT, DOTS)}
-        return {UNIFORM: rows.where(patterns=UNIFORM), **moved}
-
-    drawn = dict(
-        claims.by_exposure(table, lines, "frames", "number of frames [1]", "PSNR by the number of frames", log=True)
-    )
-    names = {UNIFORM: "49 uniform", SWEPT: "SweepCam, 49", DOTS: "49 dots"}
-    shown = claims.by_print(table.where(exposure=EQUAL_FRAME, frames=_FRAMES))
-    title = f"Images of 49 frames, exposure {EQUAL_FRAME}"
-    return drawn | images("images.png", results, shown, "patterns", list(names), title, list(names.values()))
-
-
-EXPERIMENT = Experiment(
+STUDY = Study(
     "multishot",
     "The mask moved, or the light",
     "Do dots beat as many uniform frames through a mask that moves?",
-    _points, _measure, _claims, _figures,
-)  # fmt: skip
+    points=Axes(
+        {"patterns": (UNIFORM, SWEPT, DOTS, LINE), "frames": (1, *(side**2 for side in GRIDS)), "model": MODELS},
+        quick={"frames": (1, _FRAMES)},
+        quick_prints=1,
+        kept=lambda values: (
+            (values["model"] == IDEALISED and values["frames"] == _FRAMES)
+            if values["patterns"] == LINE
+            else values["frames"] != 1 or values["patterns"] == UNIFORM
+        ),
+    ),
+    measure=_measure,
+    claims=(
+        stated("One uniform frame gives 21.3 to 22.9 dB", 21.3, 22.9, patterns=UNIFORM, frames=1),
+        stated("SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", *_SWEPT_DB, patterns=SWEPT, frames=49),
+        _on_a_line,
+        stated("49 shifting dots give 34 to 35.5 dB", 34.0, 35.5, patterns=DOTS, frames=_FRAMES),
+        Gain("49 dots beat SweepCam's 49 frames", DOTS, SWEPT, where=_MANY, paper="higher", at_least=_TELLS_DB),
+        Gain(
+            "SweepCam's 49 frames beat 49 frames through a mask that rests",
+            SWEPT,
+            UNIFORM,
+            where=_MANY,
+            at_least=_TELLS_DB,
+        ),
+    ),
+    panels=(
+        Lines(
+            "frames",
+            "number of frames [1]",
+            title="PSNR by the number of frames",
+            where={"patterns": (UNIFORM, SWEPT, DOTS)},
+            each="exposure",
+            shared={"patterns": UNIFORM, "frames": 1},
+            log=True,
+        ),
+        Images(
+            "patterns",
+            title=f"Images of 49 frames, exposure {EQUAL_FRAME}",
+            where={"exposure": EQUAL_FRAME, **_MANY},
+            columns=(UNIFORM, SWEPT, DOTS),
+        ),
+    ),
+)
 
 
 # -------- A lit scene and places of its camera's mask in

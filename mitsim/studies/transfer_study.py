@@ -31,7 +31,7 @@ from mitsim.reconstruct.shifted_codes import TURNS
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.reconstruct.solvers import solve_tv
 from mitsim.report import plots
-from mitsim.studies.framework.findings import Part
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 from mitsim.studies.twin_capture import Learned, Measured, read_captures
 from mitsim.studies.twin_files import SOURCES, TwinFiles

@@ -22,7 +22,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.job import Job
 from mitsim.report import plots
-from mitsim.studies.framework.findings import Part
+from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
 from mitsim.studies.twin_capture import Learned, Measured, read_captures
 from mitsim.studies.twin_diffuser import DiffuserTwin, frequencies, radial_power, read_spread, twin_of

@@ -51,9 +51,10 @@ from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, image_grid, label_axes, panels_of
 from mitsim.studies import ablation
 from mitsim.studies.ablation import Ablation
-from mitsim.studies.framework.claims import TOLERANCE_DB, difference, single_precision, verdict, within
-from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio, flags_of
+from mitsim.studies.framework.claims import TOLERANCE_DB, verdict, within
+from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Claim, Found, Point, Results, Scope
+from mitsim.studies.framework.legacy import Experiment, difference
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
 # -------- A scene, its camera and names of effects in
 

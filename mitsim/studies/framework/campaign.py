@@ -29,21 +29,21 @@ from mitsim.core.files import read_json, sweep, write_json
 from mitsim.core.job import Job
 from mitsim.core.worker import say_note, workers
 from mitsim.studies import ALL, EXPERIMENTS, PAPER
-from mitsim.studies.framework.experiment import HEADS, Claim, Experiment, Found, Point, Scope, Setup, find_experiment
+from mitsim.studies.framework.experiment import Found, Point, Scope, Setup, Study, find_experiment
 from mitsim.studies.framework.run import (
     KEPT,
     POINTS,
-    InFolder,
     Shard,
     Store,
+    StudyResult,
     batches,
     check_study_folder,
     study_folder,
     write_figures,
+    write_table,
 )
 
 if TYPE_CHECKING:
-    from mitsim.studies.framework.page import Section
     from mitsim.studies.framework.studio import Studio
 
 # -------- A study by its name and scope in, its folder out
@@ -71,61 +71,16 @@ class Where:
         name, points
             of the experiment, and where it is measured.
         kept
-            as :attr:`mitsim.studies.framework.experiment.Experiment.kept`.
+            as :attr:`mitsim.studies.framework.experiment.Study.kept`.
         """
         if self.scheduler is not None:
             return on_cluster(name, batches(points, kept), self.scheduler)
         return in_processes(name, batches(points, kept), self.jobs or workers(), self.shared)
 
 
-@dataclass(frozen=True)
-class CampaignResult(InFolder):
-    """A study, or the part of it whose points are measured: what the command line reports.
-
-    Attributes
-    ----------
-    study, output
-        its name, and the folder that holds it.
-    points, missing, seconds
-        points that are measured, those of other parts that are not, and what measuring took.
-    rows, claims, figures
-        of a whole study: all that was measured, what becomes of the paper's claims, and files of figures.
-    section
-        of a whole study: how a page shows it.
-    warnings
-        of a whole study: how many images are flagged, and why.
-    """
-
-    study: str
-    output: str
-    points: int
-    missing: int
-    seconds: float
-    rows: tuple[Any, ...] = ()
-    claims: tuple[Claim, ...] = ()
-    figures: tuple[str, ...] = ()
-    section: Section | None = None
-    warnings: tuple[str, ...] = ()
-
-    def payload(self) -> dict[str, Any]:
-        """As JSON."""
-        return {name: value for name, value in asdict(replace(self, section=None)).items() if name != "section"}
-
-    def lines(self) -> list[str]:
-        """For people."""
-        if self.missing:
-            return [
-                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
-                "Join all parts with: mitsim study merge PART... -o FOLDER",
-            ]
-        heads = self.section.experiment.heads if self.section else HEADS
-        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
-        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
-
-
 def run_experiment(
     study: str, scope: Scope, output: Path | str, job: Job | None = None, where: Where | None = None
-) -> CampaignResult:
+) -> StudyResult:
     """Measure what is not measured yet, and put everything together.
 
     Parameters
@@ -189,7 +144,7 @@ def _check_data(points: Sequence[Point]) -> None:
             raise MitsimError(f"study: {short.reason}; {short.remedy}")
 
 
-def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> CampaignResult:
+def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
     """One study of the points of several ``parts``, folders of the same study, in the folder ``output``.
 
     Parameters
@@ -234,7 +189,7 @@ def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | Non
         return campaign.finish(folder, store, time.perf_counter() - started)
 
 
-def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignResult]) -> CampaignResult:
+def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResult]) -> StudyResult:
     """Every experiment of the paper, made by ``each`` in a folder of its own, and one page of all claims."""
     with study_folder(output, ALL) as folder:
         head = {"kind": ALL, "study": ALL, "scope": asdict(scope), "versions": versions()}
@@ -245,12 +200,12 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], CampaignR
             from mitsim.studies.framework.page import build_page
 
             build_page(sections, folder / f"{ALL}.html", "The paper's claims on rendered frames")
-        result = CampaignResult(
+        result = StudyResult(
             ALL,
             str(folder),
-            sum(one.points for one in found),
-            sum(one.missing for one in found),
-            sum(one.seconds for one in found),
+            points=sum(one.points for one in found),
+            missing=sum(one.missing for one in found),
+            seconds=sum(one.seconds for one in found),
             claims=tuple(claim for one in found for claim in one.claims),
             figures=tuple(f"{one.study}/{name}" for one in found for name in one.figures),
             warnings=tuple(f"{one.study}: {text}" for one in found for text in one.warnings),
@@ -275,7 +230,7 @@ class _Campaign:
         return cls(study, scope)
 
     @cached_property
-    def experiment(self) -> Experiment:
+    def experiment(self) -> Study:
         return find_experiment(self.study)
 
     @cached_property
@@ -298,24 +253,23 @@ class _Campaign:
             self._write(folder, status="incomplete")
             yield folder, store
 
-    def finish(self, folder: Path, store: Store, seconds: float) -> CampaignResult:
+    def finish(self, folder: Path, store: Store, seconds: float) -> StudyResult:
         """Table, claims, figures and page, where all points are there; measuring them took so many ``seconds``."""
         from mitsim.studies.framework.page import Section, build_page
 
         there, experiment = sum(store.has(point) for point in self.points), self.experiment
-        if missing := len(self.points) - there:
-            return CampaignResult(self.study, str(folder), there, missing, seconds)
+        result = StudyResult(self.study, str(folder), points=there, missing=len(self.points) - there, seconds=seconds)
+        if result.missing:
+            return result
         results = replace(store.results(self.points), scope=self.scope)
-        claims, figures = tuple(experiment.claims(results)), write_figures(folder, experiment.figures(results))
-        results.table.write(folder / f"{experiment.name}.csv")
-        section = Section.of(experiment, self.study, self.scope, claims, figures, results)
+        claims, figures = tuple(experiment.judge(results)), write_figures(folder, experiment.draw(results))
+        write_table(folder / f"{experiment.name}.csv", results.rows)
+        section = Section.of(experiment, self.study, claims, figures, results)
         build_page([section], folder / f"{experiment.name}.html", section.title)
-        rows = tuple(dict(row) for row in results.table.rows)
-        found = CampaignResult(
-            self.study, str(folder), there, 0, seconds, rows, claims, tuple(figures), section, section.warnings
-        )
-        self._write(folder, status="complete", **found.payload())
-        return found
+        rows, named = tuple(map(dict, results.rows)), tuple(figures)
+        result = replace(result, rows=rows, claims=claims, figures=named, section=section, warnings=section.warnings)
+        self._write(folder, status="complete", **result.payload())
+        return result
 
     def _write(self, folder: Path, **more: Any) -> None:
         head = {"kind": self.experiment.name, "study": self.study, "scope": asdict(self.scope), "versions": versions()}

@@ -1,90 +1,143 @@
-"""Quantities with standard errors in; what becomes of a claim out: confirmed, not confirmed, or not decided.
+"""Claims of a study: declared with thresholds, and judged from the table of results by one function.
 
-A claim is that a quantity, such as the difference of two mean PSNR, lies in a range. It holds where the quantity's
-confidence interval lies in the range, fails where the interval lies outside, and is not decided where a border of the
-range lies in the interval: more prints or more seeds would decide it. Two mean PSNR are compared by the differences of
-the images of each print (and of each seed of the noise where there is one print): prints differ by decibels, what is
-compared often by tenths.
+A claim states that a quantity, such as the difference of two mean PSNR, lies in a range. It is confirmed if the
+quantity's confidence interval lies in the range, not confirmed if the interval lies outside, and not decided if the
+interval contains a border of the range: more prints or more seeds would decide it. Two sets of images are compared by
+the differences of each print (of each seed of the noise where there is one print), because prints differ by decibels,
+and the sets often by tenths.
+
+A claim is judged for each model and exposure that were measured. It is confirmed only if it holds for all of them;
+otherwise the verdict names the exposures, or the model, for which it holds.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from matplotlib.figure import Figure
-from scipy.special import stdtrit
+from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import FAMILIES
+from mitsim.report import IDEALISED, RENDERED, in_text
+from mitsim.report.pages import Mean, round_to_error
+from mitsim.studies.framework.experiment import Claim, Results
 
-from mitsim.core.arrays import FloatArray
-from mitsim.report import EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import Curve, curves, image_grid
-from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Found, Point, Results
-from mitsim.studies.framework.studio import Studio
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 CONFIRMED, NOT_CONFIRMED, UNDECIDED = "confirmed", "not confirmed", "not decided at this size"
 CONFIDENCE = 0.95
-"""Of the interval of a quantity: chosen, as the uncertainty of images is stated."""
+"""Confidence of an interval, as for the stated uncertainty of images."""
 Holds = bool | None
-"""Whether a claim holds; None: not decided."""
-Judge = Callable[[Table], tuple[str, Holds]]
-"""From the rows of one model and exposure to what they say, and whether the claim holds for them."""
+"""True, False, or None for a claim that is not decided."""
+Where = Mapping[str, Any] | str
+"""Values by column that choose rows: a value, a sequence of allowed values, or a function that accepts a value; a text
+is the value of the column patterns."""
+
+# -------- Rows in, means with their standard errors out
 
 
-def sample_mean(rows: Table, column: str) -> Mean:
-    """Mean of a ``column`` over prints, or over seeds of the noise where there is one print; MitsimError where the
-    ``rows`` have no number."""
-    return _mean(rows, rows, column, column, lambda one, _: one)
+def choose_rows(rows: DataFrame, where: Where) -> DataFrame:
+    """Return the rows that have the values ``where`` names; a column that the table lacks has the value None."""
+    for name, value in _chosen(where).items():
+        column: Any = rows[name] if name in rows else rows.index.to_series().map(lambda _: None)
+        if callable(value):
+            kept = column.map(lambda each, accept=value: bool(accept(each)))
+        elif isinstance(value, (list, tuple, set, frozenset)):
+            kept = column.isin(list(value))
+        else:
+            kept = column.isna() if value is None else column == value
+        rows = rows[kept.astype(bool)]
+    return rows
 
 
-def difference(one: Table, other: Table, column: str, other_column: str | None = None) -> Mean:
-    """Mean of paired differences, image by image.
+def _chosen(where: Where) -> Mapping[str, Any]:
+    return {"patterns": where} if isinstance(where, str) else where
+
+
+def measured(value: Any) -> bool:
+    """Return True for a number, which chooses rows whose column was measured."""
+    return isinstance(value, (int, float)) and not math.isnan(value)
+
+
+def distinct(rows: DataFrame, column: str) -> list[Any]:
+    """Return the values of a ``column`` in the order of first use, without None."""
+    return list(rows[column].dropna().drop_duplicates()) if column in rows else []
+
+
+def mean_of(
+    rows: DataFrame,
+    column: str = "psnr_db",
+    minus: DataFrame | None = None,
+    minus_column: str = "",
+    error_column: str = "",
+) -> Mean:
+    """Return the mean of a column with its standard error, over prints, or over seeds where there is one print.
 
     Parameters
     ----------
-    one, other
-        rows of the same prints and seeds.
-    column, other_column
-        of ``one``, and of ``other`` if it has another name.
+    rows, column
+        table, and the column that is averaged.
+    minus, minus_column
+        rows of the same prints and seeds, whose values are subtracted print by print, and their column if it has
+        another name.
+    error_column
+        column of an error that all rows share, which is added to that of the mean in quadrature.
 
     Raises
     ------
     MitsimError
-        where no print, or no seed of the only one, is in both.
+        if the rows, or the rows of both tables together, have no print (or seed) with a number.
     """
-    return _mean(one, other, column, other_column or column, lambda first, second: first - second)
-
-
-def _mean(one: Table, other: Table, column: str, other_column: str, combine: Callable[[float, float], float]) -> Mean:
-    prints = {row.get("picture") for row in (*one.rows, *other.rows)}
+    tables = [rows] if minus is None else [rows, minus]
+    prints = {key for each in tables for key in _keys(each, "picture")}
     by = "picture" if len(prints) > 1 else "seed"
-    first, second = (_by(by, rows, name) for rows, name in ((one, column), (other, other_column)))
-    return Mean.of_numbers([combine(value, second[key]) for key, value in first.items() if key in second], column)
+    level = _means_by(rows, by, column)
+    if minus is not None:
+        level = (level - _means_by(minus, by, minus_column or column)).dropna()
+    mean = Mean.of_numbers(level.tolist(), column)
+    if not error_column:
+        return mean
+    own = 0.0 if math.isnan(mean.error) else mean.error
+    return mean._replace(error=math.hypot(own, mean_of(rows, error_column).value))
 
 
-def _by(by: str, rows: Table, column: str) -> dict[Value, float]:
-    """Mean of a ``column`` for each value of another."""
-    keys = dict.fromkeys(row.get(by) for row in rows.rows)
-    return {key: rows.mean(column, **{by: key}).value for key in keys if rows.numbers(column, **{by: key})}
+def _keys(rows: DataFrame, by: str) -> Series[Any]:
+    """Return the values of the column ``by`` with "" for None, because pandas does not group by None."""
+    if by not in rows:
+        return rows.index.to_series().map(lambda _: "")
+    return rows[by].where(rows[by].notna(), "")
+
+
+def _means_by(rows: DataFrame, by: str, column: str) -> Series[float]:
+    from pandas import Series, to_numeric
+
+    if column not in rows or rows.empty:
+        return Series(dtype=float)
+    return to_numeric(rows[column], errors="coerce").groupby(_keys(rows, by), sort=False).mean().dropna()
+
+
+# -------- A mean and a range in, the verdict out
 
 
 def within(quantity: Mean, low: float = -math.inf, high: float = math.inf, among: int = 1) -> Holds:
-    """Return whether a quantity lies in a range, by Student's interval; never decided of a single value.
+    """Return whether a quantity lies in a range, by Student's interval; a single value decides nothing.
 
     Parameters
     ----------
     quantity
-        mean of independent values; their number less one is the degrees of freedom.
+        mean of independent values; the degrees of freedom are their number less one.
     low, high
         ends of the range.
     among
-        number of quantities of which this one was chosen by its value. All of their intervals hold together with the
-        usual confidence (Bonferroni), and so does that of the chosen one.
+        number of quantities of which this one was chosen by its value. The intervals of all of them hold together with
+        the usual confidence (Bonferroni), and therefore that of the chosen one.
     """
     if quantity.of < 2:
         return None
+    from scipy.special import stdtrit
+
     reach = float(stdtrit(quantity.of - 1, 1 - (1 - CONFIDENCE) / 2 / among)) * quantity.error
     if low < quantity.value - reach and quantity.value + reach < high:
         return True
@@ -92,348 +145,248 @@ def within(quantity: Mean, low: float = -math.inf, high: float = math.inf, among
 
 
 def every(*holds: Holds) -> Holds:
-    """Whether all of these ``holds``: one that fails decides."""
+    """Return whether all parts of a claim hold; one part that fails decides."""
     if False in holds:
         return False
     return None if None in holds else True
 
 
 def verdict(holds: Holds) -> str:
-    """On a claim that ``holds``, does not, or is not decided."""
+    """Return the words for a claim that ``holds``, does not hold, or is not decided."""
     return UNDECIDED if holds is None else CONFIRMED if holds else NOT_CONFIRMED
 
 
 def verdict_at(places: Mapping[str, Holds]) -> str:
-    """On a claim that was judged at several ``places``, such as ways of exposing, by their names."""
+    """Return the verdict on a claim that was judged at several ``places``, such as exposures, by their names."""
     holding = [name for name, holds in places.items() if holds]
     if len(holding) in (0, len(places)):
-        # Not decided anywhere it may hold: that it fails elsewhere does not end the claim.
+        # Undecided at one place and failing at another: the claim may still hold at the first.
         return verdict(True if holding else None if None in places.values() else False)
     undecided = [name for name, holds in places.items() if holds is None]
     rest = f", {UNDECIDED} at {' and '.join(undecided)}" if undecided else ""
     return f"confirmed only at {' and '.join(holding)}{rest}"
 
 
-def judge_claim(table: Table, claim: str, paper: str, judge: Judge) -> Claim:
-    """What becomes of a claim at each way of exposing, in each model.
+def value_name(column: str, value: Any) -> str:
+    """Return the words for a ``value`` of a ``column`` in claims and figures."""
+    if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
+        return in_text(str(value))
+    return f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
 
-    Parameters
+
+# -------- Declared claims
+
+_SHOWN = 4
+"""Number of values that the figures of a claim list; of more values they state the one that decides."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A claim as a study declares it.
+
+    Attributes
     ----------
-    table
-        what was measured.
     claim, paper
-        what the paper says.
-    judge
-        from the rows of one model and exposure: what they say, and whether the claim holds for them.
+        the sentence, in which {column} is the value of ``each``, and the paper's figure.
+    where
+        rows that the claim is about.
+    each
+        column: there is a claim for each of its values.
+    every
+        column: the claim must hold for each of its values.
+    models
+        column of the models, and its two values, whose figures take the places of the idealised and rendered ones.
+    optional
+        True to leave the claim out where no row of it was measured, for example on a user's own scene.
     """
-    exposures: list[Value] = table.distinct("exposure") or [None]
-    found = {
-        (model, each): judge(table.where(model=model) if each is None else table.where(model=model, exposure=each))
-        for model in MODELS
-        for each in exposures
-    }
-    figures = {
-        model: "; ".join(
-            found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}" for each in exposures
+
+    claim: str
+    _: KW_ONLY
+    paper: str = ""
+    where: Where = field(default_factory=dict)
+    each: str = ""
+    every: str = ""
+    optional: bool = False
+    models: tuple[str, str, str] = ("model", IDEALISED, RENDERED)
+
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return figures, whether the claim holds for some ``rows``, and the margin inside the range's nearest end."""
+        raise NotImplementedError
+
+    def judge(self, results: Results) -> list[Claim]:
+        """Return the claim, or one for each value of the column ``each``, with figures and verdict."""
+        rows = choose_rows(results.frame, self.where)
+        if rows.empty:
+            if self.optional:
+                return []
+            raise MitsimError(f"study: nothing was measured of the claim {self.claim!r}")
+        if not self.each:
+            return [self._judge(rows, self.claim)]
+        return [
+            self._judge(choose_rows(rows, {self.each: value}), self.claim.format(**{self.each: shown}))
+            for value in distinct(rows, self.each)
+            for shown in (value_name(self.each, value),)
+        ]
+
+    @property
+    def _compared(self) -> frozenset[str]:
+        """Columns that choose what is compared, so that the claim isn't judged for each of their values."""
+        return frozenset()
+
+    def _judge(self, rows: DataFrame, claim: str) -> Claim:
+        column, *both = self.models
+        known, exposures = ([] if each in self._compared else distinct(rows, each) for each in (column, "exposure"))
+        models, exposures = [model for model in both if model in known] or both[1:], exposures or [None]
+        found: dict[tuple[str, Any], tuple[str, Any]] = {}
+        for model in models:
+            own = choose_rows(rows, {column: model} if model in known else {})
+            for each in exposures:
+                found[model, each] = self._found(own if each is None else choose_rows(own, {"exposure": each}))
+        figures = dict.fromkeys(both, "") | {
+            model: "; ".join(
+                found[model, each][0] if len(exposures) == 1 else f"{each}: {found[model, each][0]}"
+                for each in exposures
+            )
+            for model in models
+        }
+        decided = verdict_at({str(each): every(*(found[model, each][1] for model in models)) for each in exposures})
+        if decided in (NOT_CONFIRMED, UNDECIDED) and len(models) > 1:
+            by_model = {model: every(*(found[model, each][1] for each in exposures)) for model in models}
+            holding = [model for model, holds in by_model.items() if holds]
+            rest = [f", {other} {UNDECIDED}" for other, holds in by_model.items() if holds is None]
+            decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
+        words: list[str] = [holds for _, holds in found.values() if isinstance(holds, str)]
+        return Claim(claim, self.paper, figures[both[0]], figures[both[1]], words[0] if words else decided)
+
+    def _found(self, rows: DataFrame) -> tuple[str, Holds]:
+        if not self.every:
+            return self.found(rows)[:2]
+        found = {
+            value: self.found(choose_rows(rows, {self.every: value})) for value in sorted(distinct(rows, self.every))
+        }
+        if not found:
+            raise MitsimError(f"study: nothing was measured of the claim {self.claim!r}")
+        worst = min(found, key=lambda value: found[value][2])
+        shown = found if len(found) <= _SHOWN else {worst: found[worst]}
+        text = ", ".join(f"{value_name(self.every, value)}: {found[value][0]}" for value in shown)
+        more = f" (worst of {len(found)})" if len(found) > len(shown) else ""
+        return f"{text}{more}", every(*(holds for _, holds, _ in found.values()))
+
+
+@dataclass(frozen=True)
+class Level(Statement):
+    """A claim that the mean of a column lies in a range.
+
+    Attributes
+    ----------
+    column, unit
+        what is averaged, and its unit.
+    at_least, at_most
+        ends of the range.
+    """
+
+    _: KW_ONLY
+    column: str = "psnr_db"
+    unit: str = "dB"
+    at_least: float = -math.inf
+    at_most: float = math.inf
+
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return the mean, whether it lies in the range, and its margin."""
+        mean = mean_of(rows, self.column)
+        text = with_unit(mean, self.unit)
+        return text, within(mean, self.at_least, self.at_most), _margin(mean, self.at_least, self.at_most)
+
+
+@dataclass(frozen=True)
+class Gain(Statement):
+    """A claim that some images exceed others by an amount in a range, compared print by print.
+
+    Attributes
+    ----------
+    one, other
+        values that choose the rows of both among those of the claim.
+    column, other_column, unit
+        what is compared, its column in ``other`` if it has another name, and its unit.
+    at_least, at_most
+        range of the gain of ``one`` over ``other``; by default it is above 0.
+    apart, other_error
+        True to state ``other`` under the first head and ``one`` under the second; and the column of an error of
+        ``other`` beside that of its mean.
+    """
+
+    one: Where
+    other: Where
+    _: KW_ONLY
+    column: str = "psnr_db"
+    other_column: str = ""
+    unit: str = "dB"
+    at_least: float = 0.0
+    at_most: float = math.inf
+    apart: bool = False
+    other_error: str = ""
+
+    @property
+    def _compared(self) -> frozenset[str]:
+        return frozenset({*_chosen(self.one), *_chosen(self.other)})
+
+    def _judge(self, rows: DataFrame, claim: str) -> Claim:
+        judged = super()._judge(rows, claim)
+        if not self.apart:
+            return judged
+        one, other = choose_rows(rows, self.one), choose_rows(rows, self.other)
+        before = mean_of(other, self.other_column or self.column, error_column=self.other_error)
+        return replace(
+            judged, idealised=with_unit(before, self.unit), rendered=with_unit(mean_of(one, self.column), self.unit)
         )
-        for model in MODELS
-    }
-    decided = verdict_at({str(each): every(*(found[model, each][1] for model in MODELS)) for each in exposures})
-    if decided in (NOT_CONFIRMED, UNDECIDED):
-        models = {model: every(*(found[model, each][1] for each in exposures)) for model in MODELS}
-        holding = [model for model, holds in models.items() if holds]
-        rest = [f", {other} {UNDECIDED}" for other, holds in models.items() if holds is None]
-        decided = f"confirmed only {holding[0]}{''.join(rest)}" if holding else decided
-    return Claim(claim, paper, figures[IDEALISED], figures[RENDERED], decided)
+
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return both means and the gain, whether it lies in the range, and its margin."""
+        one, other = choose_rows(rows, self.one), choose_rows(rows, self.other)
+        other_column = self.other_column or self.column
+        gain = mean_of(one, self.column, other, other_column)
+        means = with_unit(mean_of(one, self.column), self.unit), with_unit(mean_of(other, other_column), self.unit)
+        text = f"{' against '.join(means)}, {with_unit(gain, self.unit, '+')}"
+        return text, within(gain, self.at_least, self.at_most), _margin(gain, self.at_least, self.at_most)
 
 
-# -------- What experiments of the paper share
+@dataclass(frozen=True)
+class Judged(Statement):
+    """A claim that a function decides: from the rows of one model and exposure to figures and whether it holds, or the
+    words of its verdict."""
+
+    decide: Callable[[DataFrame], tuple[str, Any]]
+
+    def found(self, rows: DataFrame) -> tuple[str, Holds, float]:
+        """Return what the function returns; there is no margin."""
+        return (*self.decide(rows), 0.0)
+
 
 TOLERANCE_DB = 2.0
-"""How far from the paper's figures ours may be: it states neither its images, nor how bright they are."""
-Lines = Mapping[str, Table]
-"""Rows of a table by what they are called in a figure."""
-Cell = tuple[FloatArray, FloatArray | None, str]
-"""Of a grid of images: the image, the truth where it was kept, and a caption."""
+"""Allowed distance from the paper's figures: it states neither its images nor how bright they are."""
 
 
-def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
-    """What a point came to, in one row.
+def stated(claim: str, low: float, high: float, **where: Any) -> Level:
+    """Return the claim of a mean PSNR in a range that the paper states, within :data:`TOLERANCE_DB`.
 
     Parameters
     ----------
-    studio, point
-        where it was measured, and what varies.
-    image
-        of it, where it is to be shown; kept for a few prints, with the truth.
-    **measured
-        columns of the row.
+    claim, low, high
+        sentence, and the paper's range [dB].
+    **where
+        rows that the claim is about.
     """
-    kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
-    arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
-    return Found((point.row(**measured),), arrays)
+    paper = f"{low:g} to {high:g} dB"
+    return Level(claim, paper=paper, where=where, at_least=low - TOLERANCE_DB, at_most=high + TOLERANCE_DB)
 
 
-def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
-    """An ``image`` and its ``truth`` as findings keep them: a page shows no more than single precision."""
-    return single_precision({IMAGE: image, TRUTH: truth})
+def with_unit(mean: Mean, unit: str, sign: str = "") -> str:
+    """Return a mean with its error and ``unit``: other units than decibels to two digits of the error."""
+    if unit == "dB":
+        return f"{mean:{sign}} dB"
+    error = "" if math.isnan(mean.error) else f" \N{PLUS-MINUS SIGN} {round_to_error(mean.error, mean.error)}"
+    return f"{'+' if sign and mean.value >= 0 else ''}{round_to_error(mean.value, mean.error)}{error} {unit}".rstrip()
 
 
-def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Named ``arrays`` as findings keep them, in single precision."""
-    return {name: array.astype("float32") for name, array in arrays.items()}
-
-
-def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
-    """The image that a user gets at a point with model, patterns, exposure and seed.
-
-    Parameters
-    ----------
-    studio, point
-        where it is made, and what varies.
-    shown
-        patterns whose images are kept; None: all.
-    """
-    values = dict(point.values)
-    patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
-    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure)
-    return finding(studio, point, image.image if shown is None or patterns in shown else None, **image.row())
-
-
-def by_patterns(table: Table) -> Lines:
-    """The rows of each pattern family in a ``table``."""
-    return {label(name): table.where(patterns=name) for name in table.distinct("patterns")}
-
-
-def panels(lines: Lines, by: str, column: str = "psnr_db") -> Mapping[str, Mapping[str, Curve]]:
-    """Means of both models side by side.
-
-    Parameters
-    ----------
-    lines
-        rows by name.
-    by, column
-        columns: along the axis, and up.
-    """
-    return {
-        model: {name: rows.where(model=model).means(column, by) for name, rows in lines.items()} for model in MODELS
-    }
-
-
-def by_print(table: Table) -> Lines:
-    """The rows of a ``table`` of each shown print in both models."""
-    return {
-        f"{print_ or 'scene'}, {model}": table.where(picture=print_, model=model)
-        for print_ in (*QUICK_IMAGES, None)
-        for model in MODELS
-    }
-
-
-def image_rows(
-    results: Results, lines: Lines, across: str, columns: Sequence[Value], caption: str = "{psnr_db:.1f} dB"
-) -> dict[str, list[Cell]]:
-    """Rows of an image grid, those of which all images were kept.
-
-    Parameters
-    ----------
-    results
-        with the images.
-    lines
-        rows of the table by the grid's.
-    across, columns
-        what varies along a row of the grid, and its values.
-    caption
-        of an image, from its row of the table.
-    """
-    grid = {}
-    for name, rows in lines.items():
-        cells = []
-        for value in columns:
-            cells += kept_images(results, rows.where(**{across: value}), caption)[:1]
-        if len(cells) == len(columns):
-            grid[name] = cells
-    return grid
-
-
-def kept_images(results: Results, rows: Table, caption: str = "{psnr_db:.1f} dB") -> list[Cell]:
-    """Those of some rows whose images were kept.
-
-    Parameters
-    ----------
-    results, rows
-        with the images, and of which rows of their table.
-    caption
-        as for :func:`image_rows`; a flagged image says so.
-    """
-    kept = ((results.array(row), row) for row in rows.rows)
-    return [
-        (image, results.array(row, TRUTH), caption.format(**row) + ("\nflagged" if row.get("flagged") else ""))
-        for image, row in kept
-        if image is not None
-    ]
-
-
-def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
-    """Images with their truths: in a column before the others where each row has but one, else in rows above those
-    that have new ones.
-
-    Parameters
-    ----------
-    grid
-        cells by the rows' names.
-    titles, title
-        of the columns, and of all.
-    """
-    truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
-    alone = {name: [(image, caption) for image, _, caption in cells] for name, cells in grid.items()}
-    if any(len(truths[name]) < len(cells) for name, cells in grid.items()):
-        return image_grid(alone, titles, title)
-    if all(np.array_equal(own[0], other) for own in truths.values() for other in own):
-        beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
-        return image_grid(beside, ["truth", *titles], title)
-    rows: dict[str, list[tuple[FloatArray, str]]] = {}
-    before: Sequence[FloatArray] = ()
-    several = any(not all(map(np.array_equal, one, other)) for one, other in pairwise(truths.values()))
-    for name, cells in alone.items():
-        if not before or not all(map(np.array_equal, before, truths[name])):
-            rows[f"truth, {name}" if name and several else "truth"] = [(truth, "") for truth in truths[name]]
-        rows[name or "image"], before = cells, truths[name]
-    return image_grid(rows, titles, title)
-
-
-def images(
-    file: str,
-    results: Results,
-    lines: Lines,
-    across: str,
-    columns: Sequence[Value],
-    title: str,
-    names: Sequence[str] | None = None,
-) -> dict[str, Figure]:
-    """A grid of images by its file's name; empty where not all images of any row were kept.
-
-    Parameters
-    ----------
-    file, title
-        of the figure.
-    results, lines, across, columns
-        as for :func:`image_rows`.
-    names
-        of the columns; None: their values.
-    """
-    grid = image_rows(results, lines, across, columns)
-    return {file: grid_with_truths(grid, names or [str(value) for value in columns], title)} if grid else {}
-
-
-def family_images(
-    results: Results,
-    table: Table,
-    families: Sequence[str],
-    across: str,
-    columns: Sequence[Value],
-    title: str,
-    names: Sequence[str] | None = None,
-) -> dict[str, Figure]:
-    """A grid of the images of each shown print in both models for each pattern family, by file name.
-
-    Parameters
-    ----------
-    results, across, columns, names
-        as for :func:`images`.
-    table, families
-        rows of the results, and which of their families have a grid.
-    title
-        of a grid; braces are its family.
-    """
-    drawn: dict[str, Figure] = {}
-    for family in families:
-        file, lines = f"images_{family.replace(':', '')}.png", by_print(table.where(patterns=family))
-        drawn |= images(file, results, lines, across, columns, title.format(label(family)), names)
-    return drawn
-
-
-def by_exposure(
-    table: Table, lines: Callable[[Table], Lines], by: str, axis: str, title: str, log: bool = False
-) -> dict[str, Figure]:
-    """PSNR in both models, a figure for each way of exposing.
-
-    Parameters
-    ----------
-    table, lines
-        what was measured, and from the rows of one exposure to rows by name.
-    by, axis
-        column along the axis, and the axis' name with its unit.
-    title, log
-        of each, but for the exposure; and whether the axis is logarithmic.
-    """
-    return {
-        f"psnr_{exposure.replace(' ', '_')}.png": curves(
-            panels(lines(table.where(exposure=exposure)), by), axis, log=log, title=f"{title}, exposure {exposure}"
-        )
-        for exposure in table.distinct("exposure")
-    }
-
-
-def psnr_claim(table: Table, claim: str, band: tuple[float, float]) -> Claim:
-    """A claim of PSNR within a band.
-
-    Parameters
-    ----------
-    table
-        rows that it is said of.
-    claim, band
-        what the paper says [dB].
-    """
-
-    def judge(rows: Table) -> tuple[str, Holds]:
-        mean = sample_mean(rows, "psnr_db")
-        return f"{mean} dB", near(mean, band)
-
-    return judge_claim(table, claim, f"{band[0]:g} to {band[1]:g} dB", judge)
-
-
-def gain_claim(
-    table: Table,
-    claim: str,
-    paper: str,
-    pair: tuple[Mapping[str, Value], Mapping[str, Value]],
-    text: str = "{gain:+} dB",
-    between: tuple[float, float] = (0.0, math.inf),
-    column: str = "psnr_db",
-) -> Claim:
-    """A claim of what some images have over others.
-
-    Parameters
-    ----------
-    table
-        rows of both.
-    claim, paper
-        what is claimed, and what the paper says.
-    pair
-        values of columns that choose the rows of the ones, and of the others.
-    text
-        what is said of them: ``one`` and ``other`` are their means, ``gain`` that of the paired differences.
-    between, column
-        range of the gain that the claim holds in, and what it is a gain of.
-    """
-
-    def judge(rows: Table) -> tuple[str, Holds]:
-        one, other = (rows.where(**chosen) for chosen in pair)
-        gain = difference(one, other, column)
-        figures = text.format(gain=gain, one=sample_mean(one, column), other=sample_mean(other, column))
-        return figures, within(gain, *between)
-
-    return judge_claim(table, claim, paper, judge)
-
-
-def near(psnr_db: Mean, band: tuple[float, float]) -> Holds:
-    """Whether a mean ``psnr_db`` is within a ``band`` of the paper's [dB], or no more than TOLERANCE_DB beside it."""
-    return within(psnr_db, band[0] - TOLERANCE_DB, band[1] + TOLERANCE_DB)
-
-
-def bars(lines: Lines, column: str = "psnr_db") -> Mapping[str, tuple[Mean, Mean]]:
-    """Means of a ``column`` in both models, by the names of ``lines``."""
-    return {
-        name: (rows.where(model=IDEALISED).mean(column), rows.where(model=RENDERED).mean(column))
-        for name, rows in lines.items()
-    }
+def _margin(mean: Mean, low: float, high: float) -> float:
+    return min(mean.value - low, high - mean.value)

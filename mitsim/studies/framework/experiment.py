@@ -1,4 +1,4 @@
-"""What a study declares: what varies, what is measured at each point, which claims and figures come of all points.
+"""The declaration of a study: axes, the measurement of one point, claims with thresholds, panels; and its results.
 
 The paper's means are over eight images, which it does not name. Those here come with scikit-image, which states their
 licences.
@@ -13,50 +13,52 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mitsim.bench.request import Request
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import read_name
 from mitsim.devices.session import Drift
+from mitsim.reconstruct.request import METHODS
 from mitsim.report import CONVENTIONS
-from mitsim.studies import ALL, EXPERIMENTS, SHARED, STUDIES
+from mitsim.studies import ALL, EXPERIMENTS, GONE, SHARED, STUDIES
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
     from mitsim.core.arrays import FloatArray
     from mitsim.report.pages import Table, Value
 
-# -------- Where a study measures: setups, whose points share light and calibration, and points
+# -------- Where a study measures: setups, points, axes
 
 _KEY_DIGITS = 16
-"""Of a point's name: two of 10^4 points have the same with a chance of 10^-11."""
+"""Digits of a point's name: two of 10^4 points have the same name with a probability of 10^-11."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What light is traced for and a camera calibrated: points that share one share its light.
+    """A scene and its devices: points of one setup share its light and its calibration.
 
     Attributes
     ----------
     scene
         scene XML, or the name of a shipped scene.
     picture
-        print that the scene's own is replaced with (:func:`picture`); None: its own.
+        print that replaces the scene's own (:func:`picture`); None keeps it.
     parameters
         (name, value) of the scene's parameters.
     camera, projector, variant, outside
         as for :func:`mitsim.open_bench`; ``outside`` is its ``allow_outside_files``.
     accuracy
-        of the light.
+        requested relative error of the light.
     """
 
     scene: str = "photograph"
@@ -69,37 +71,37 @@ class Setup:
     accuracy: float = 1e-3
 
     def with_parameters(self, **parameters: object) -> Setup:
-        """The same with other ``parameters`` of the scene."""
+        """Return a setup with other values of some scene ``parameters``."""
         new = {**dict(self.parameters), **{name: f"{value}" for name, value in parameters.items()}}
         return replace(self, parameters=tuple(sorted(new.items())))
 
     def with_print(self, picture: str | None) -> Setup:
-        """The same with another ``picture`` on its print."""
+        """Return a setup with another ``picture`` on its print."""
         return replace(self, picture=picture)
 
 
 @dataclass(frozen=True)
 class Point:
-    """One measurement of a study: its ``setup``, and the ``values`` of all else that varies, by name."""
+    """One measurement of a study: its ``setup``, and the ``values`` of everything else that varies, by name."""
 
     setup: Setup
     values: tuple[tuple[str, Value], ...]
 
     @classmethod
     def of(cls, setup: Setup, **values: Value) -> Point:
-        """Of a ``setup``, with these ``values``."""
+        """Return the point of a ``setup`` with these ``values``."""
         return cls(setup, tuple(values.items()))
 
     @classmethod
     def grid(cls, setups: Iterable[Setup], columns: str, **varied: Sequence[Value]) -> list[Point]:
-        """All combinations of what varies, the last fastest, at each of some ``setups``.
+        """Return all combinations of the ``varied`` values at each setup, the last value fastest.
 
         Parameters
         ----------
         setups, columns
-            where, and names of the values in the order in which the table has them.
+            setups, and the names of the values in the order in which the table has them.
         **varied
-            values by name; what is fixed has one.
+            values by name; a fixed one is a sequence of one.
         """
         names = columns.split()
         chosen = [dict(zip(varied, values, strict=True)) for values in product(*varied.values())]
@@ -109,80 +111,36 @@ class Point:
         return dict(self.values)[name]
 
     def row(self, **measured: Value) -> dict[str, Value]:
-        """A row of the table: all that varies, and what was ``measured``."""
+        """Return a row of the table: everything that varies, and the ``measured`` values."""
         return {"picture": self.setup.picture, **dict(self.setup.parameters), **dict(self.values), **measured}
 
     @property
     def key(self) -> str:
-        """Name of the file that keeps its findings."""
+        """Name of the file that keeps the point's findings."""
         text = json.dumps(asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:_KEY_DIGITS]
 
 
-# -------- What a study declares
-
-_PYTHON = ".py"
-"""End of the name of a study in a file."""
-IMAGE = "image"
-"""The (n, n) reflectance that a point came to, where it is kept."""
-TRUTH = "truth"
-"""What it would be without any error, kept with it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What one point came to: ``rows`` of the table, and ``arrays`` by name, such as :data:`IMAGE`, for figures."""
-
-    rows: tuple[Mapping[str, Value], ...]
-    arrays: Mapping[str, FloatArray] = field(default_factory=dict)
-
-
-KNOBS = "{knobs}"
-"""In the title of a study that sweeps: what varies."""
-HEADS = "Paper", "Idealised", "Rendered"
-"""Of the columns of a page's table of claims."""
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper, its number there, in the idealised model and rendered, and what becomes of it.
-
-    ``verdict`` is "confirmed", "confirmed only if ...", "not confirmed", or "not decided at this size"
-    (:mod:`mitsim.studies.framework.claims`); what the paper does not say, or the idealised model lacks, is empty.
-    """
-
-    claim: str
-    paper: str
-    idealised: str
-    rendered: str
-    verdict: str
-
-    def figures_text(self, heads: tuple[str, str, str]) -> str:
-        """All of its figures on a line, each by its own of the ``heads``."""
-        figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
-        return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
-
-
 @dataclass(frozen=True)
 class Scope:
-    """How much of a study is wanted, and of what.
+    """The part of a study that is measured, and the scene that it is measured on.
 
     Attributes
     ----------
     setup
-        what is studied where nothing varies.
+        scene and devices where nothing varies.
     pictures
         prints that means are taken over; (None,) where the scene keeps its own.
     seeds
-        of the noise that means are taken over.
+        seeds of the noise that means are taken over.
     quick
-        a few points, for a first look.
+        True for a few points, as a first look.
     sweep, measures
-        what `mitsim study sweep` varies, values by name, and what it shows; empty for other studies.
+        knobs of `mitsim study sweep` with their values, and the measures that it shows; empty for other studies.
     patterns
-        of a sweep that does not vary them, and of a drift.
+        patterns of a sweep that does not vary them, and of a drift.
     recipe
-        of a calibration whose drift is studied; None: the shipped one.
+        recipe of a calibration whose drift is studied; None: the shipped one.
     """
 
     setup: Setup
@@ -196,13 +154,80 @@ class Scope:
 
     @property
     def repeats(self) -> tuple[int, ...]:
-        """Seeds of what has no prints to take means over: three of a whole study, so that its means have errors."""
+        """Seeds of a study without prints to take means over: three of a whole study, so that means have errors."""
         three = (self.seeds[0] + more for more in range(3))
         return self.choose(tuple(dict.fromkeys((*self.seeds, *three))), self.seeds)
 
     def choose(self, everything: Sequence[Any], few: Sequence[Any]) -> tuple[Any, ...]:
-        """``few`` where the study is quick, otherwise ``everything``."""
+        """Return ``few`` where the study is quick, otherwise ``everything``."""
         return tuple(few if self.quick else everything)
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Points of a study on a grid: all combinations of scenes, prints, seeds and ``values``.
+
+    Attributes
+    ----------
+    values
+        values by name, such as patterns, exposure and model; the last name varies fastest.
+    scene
+        values of scene parameters by name; each combination is a setup with light of its own.
+    quick
+        values that replace those of ``values`` or ``scene`` in a quick study.
+    prints
+        pictures on the print; None: those of the scope.
+    quick_prints
+        number of prints of a quick study; None: all of the scope's.
+    repeats
+        True to take three seeds (:attr:`Scope.repeats`), for studies whose means are over seeds.
+    default
+        shipped scene that is measured where the user names none; None: that of the scope.
+    kept
+        decides which combinations are points, from their values by name; None: all.
+    """
+
+    values: Mapping[str, Sequence[Value]]
+    scene: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    quick: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    prints: Sequence[str] | None = None
+    quick_prints: int | None = None
+    repeats: bool = False
+    default: str | None = None
+    kept: Callable[[Mapping[str, Value]], bool] | None = None
+
+    def __call__(self, scope: Scope) -> list[Point]:
+        """Return the points of a ``scope``, those of one setup together."""
+        scene, values = ({name: self._values(name, all_, scope) for name, all_ in axis.items()} for axis in
+                         (self.scene, self.values))  # fmt: skip
+        prints = self._values("picture", self.prints, scope) if self.prints else scope.pictures
+        prints = scope.choose(prints, prints[: self.quick_prints])
+        parameters = [dict(zip(scene, chosen, strict=True)) for chosen in product(*scene.values())]
+        own = self.default is None or scope.pictures == (None,)
+        setup = scope.setup if own else replace(scope.setup, scene=str(self.default))
+        setups = [setup.with_parameters(**each).with_print(name) for each in parameters for name in prints]
+        varied = {"seed": scope.repeats if self.repeats else scope.seeds, **values}
+        points = Point.grid(setups, " ".join([*values, "seed"]), **varied)
+        return [point for point in points if self.kept is None or self.kept(dict(point.values))]
+
+    def _values(self, name: str, everything: Sequence[Any], scope: Scope) -> tuple[Any, ...]:
+        return scope.choose(everything, self.quick.get(name, everything))
+
+
+# -------- Results
+
+IMAGE = "image"
+"""Name of the (n, n) reflectance of a point, where it is kept."""
+TRUTH = "truth"
+"""Name of the error-free image that is kept with it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Findings of one point: ``rows`` of the table, and ``arrays`` by name, such as :data:`IMAGE`, for figures."""
+
+    rows: tuple[Mapping[str, Value], ...]
+    arrays: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,76 +236,120 @@ class Results:
 
     Attributes
     ----------
-    table
-        all points' rows; the column ``point`` has the points' keys.
+    rows
+        rows of all points as JSON has them; the column ``point`` holds the points' keys.
     arrays
-        by key of the point and name.
+        arrays by key of the point and name.
     scope
-        of the study.
+        scope of the study.
     """
 
-    table: Table
+    rows: Sequence[Mapping[str, Value]]
     arrays: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
     scope: Scope = field(default_factory=lambda: Scope(Setup(), (None,)))
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rows", tuple(getattr(self.rows, "rows", self.rows)))
+
+    @cached_property
+    def frame(self) -> DataFrame:
+        """The rows as a table, one measurement a row; the values keep the types that they have in JSON."""
+        from pandas import DataFrame  # here, because it takes half a second and processes that measure do without
+
+        return DataFrame([dict(row) for row in self.rows], dtype=object)
+
+    @property
+    def table(self) -> Table:
+        """The rows for studies that are not yet on the engine."""
+        from mitsim.report.pages import Table
+
+        return Table(tuple(self.rows))
+
     def array(self, row: Mapping[str, Value], name: str = IMAGE) -> FloatArray | None:
-        """The array ``name`` that was kept with a ``row``."""
+        """Return the array ``name`` that was kept with a ``row``."""
         return self.arrays.get((str(row.get("point")), name))
 
 
-@dataclass(frozen=True)
-class PageTable:
-    """A table on a study's page.
+# -------- What a study declares
 
-    Attributes
-    ----------
-    title
-        above it: what the numbers are, with their unit.
-    headings
-        of its columns, the first of which has names and the others numbers.
-    rows
-        as they are shown.
+_PYTHON = ".py"
+"""End of the name of a study in a file."""
+KNOBS = "{knobs}"
+"""In the title of a study that sweeps: the names of its knobs."""
+HEADS = "Paper", "Idealised", "Rendered"
+"""Heads of the columns of a page's table of claims."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A judged claim: its sentence, the paper's figure, the figures of both models, and the verdict.
+
+    ``verdict`` is "confirmed", "confirmed only ...", "not confirmed", or "not decided at this size"
+    (:mod:`mitsim.studies.framework.claims`); a figure that the paper or a model does not have is empty.
     """
 
-    title: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    claim: str
+    paper: str
+    idealised: str
+    rendered: str
+    verdict: str
+
+    def figures_text(self, heads: tuple[str, str, str]) -> str:
+        """Return all figures on a line, each under its own of the ``heads``."""
+        figures = zip((self.paper, self.idealised, self.rendered), heads, strict=True)
+        return ", ".join(f"{head.lower()} {figure}" for figure, head in figures if figure)
+
+
+class Judges(Protocol):
+    """A claim as a study declares it (:mod:`mitsim.studies.framework.claims`)."""
+
+    def judge(self, results: Results) -> list[Claim]:
+        """Return the judged claims."""
+
+
+class Draws(Protocol):
+    """A figure as a study declares it (:mod:`mitsim.studies.framework.panels`)."""
+
+    def draw(self, results: Results) -> dict[str, Figure]:
+        """Return figures by file name."""
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Study:
     """A study of many points.
 
     Attributes
     ----------
     name, title, question
-        on the command line, at the head of its page, and what it is to answer, a sentence.
+        name on the command line, head of the page, and the question that the study answers.
     points
-        from a scope to all points; those of one setup should follow each other.
+        from a scope to all points, such as :class:`Axes`; points of one setup should follow each other.
     measure
-        one point, in a :class:`mitsim.studies.framework.studio.Studio`, which keeps what neighbours share.
+        measures one point, in a :class:`mitsim.studies.framework.studio.Studio`, which keeps what neighbours share.
     claims
-        from all results.
-    figures
-        from all results, by file name; each has one message.
-    message
-        from all results, what its page says first, beside how many claims hold; empty for those alone.
-    about
-        what its figures are, for who knows nothing of it; empty for claims of the paper, which the page explains.
-    heads
-        of a claim's three figures; one without a head has no column.
+        claims with thresholds (:mod:`mitsim.studies.framework.claims`), or functions from all results to judged claims.
+    panels
+        figures (:mod:`mitsim.studies.framework.panels`), or functions from all results to figures by file name.
+    derive
+        from all results to results with more columns, for columns that need more than one point; None adds none.
     tables
-        from all results, for the page; all numbers are in the study's CSV and JSON as well.
-    traced
-        whether light is traced, to an accuracy that the page states.
+        from all results to parts of the page (:class:`mitsim.studies.framework.page.Part`).
+    message
+        from all results to the page's first sentence; an empty one is replaced by the number of claims that hold.
+    about
+        how the study was measured; empty for claims of the paper, which the page explains.
+    heads
+        heads of a claim's three figures; a figure without a head has no column.
     note
-        what the reader of its figures has to know beside their titles and axes.
-    solved
-        whether all points have patterns whose frames are solved with an automatic lambda, which needs more data than
-        unknowns: points without are refused before any is measured.
+        remarks on the figures beside their titles and axes.
+    traced
+        True if light is traced, to an accuracy that the page states.
     kept
-        whether what points share is kept in the study's folder: plans, calibrations, and what else a studio makes once.
-        A process may then measure any point, whatever its setup, and an interrupted study loses none of it.
+        True to keep plans, calibrations and other shared objects in the study's folder. Any process can then measure
+        any point, and an interrupted study loses none of them.
+    solved
+        True if all points have patterns whose frames are solved with an automatic lambda, which needs more data than
+        unknowns: points without are refused before any is measured.
     """
 
     name: str
@@ -288,9 +357,10 @@ class Experiment:
     question: str
     points: Callable[[Scope], Sequence[Point]]
     measure: Callable[[Any, Point], Found]
-    claims: Callable[[Results], Sequence[Claim]]
-    figures: Callable[[Results], Mapping[str, Figure]]
-    tables: Callable[[Results], Sequence[PageTable]] = lambda results: ()
+    claims: Sequence[Judges | Callable[[Results], Sequence[Claim]]] = ()
+    panels: Sequence[Draws | Callable[[Results], Mapping[str, Figure]]] = ()
+    derive: Callable[[Results], Results] | None = None
+    tables: Callable[[Results], Sequence[Any]] = lambda results: ()
     message: Callable[[Results], str] = lambda results: ""
     about: str = ""
     heads: tuple[str, str, str] = HEADS
@@ -299,35 +369,61 @@ class Experiment:
     kept: bool = False
     solved: bool = False
 
+    def judge(self, results: Results) -> list[Claim]:
+        """Return all claims with their figures and verdicts."""
+        results = self.derive(results) if self.derive else results
+        return [claim for each in self.claims for claim in (each(results) if callable(each) else each.judge(results))]
+
+    def draw(self, results: Results) -> dict[str, Figure]:
+        """Return all figures by file name."""
+        results = self.derive(results) if self.derive else results
+        drawn: dict[str, Figure] = {}
+        for each in self.panels:
+            drawn |= each(results) if callable(each) else each.draw(results)
+        return drawn
+
 
 def group_by_setup(points: Sequence[Point]) -> list[Point]:
-    """The ``points``, those of one setup together: they share its light."""
+    """Return the ``points`` in an order in which those of one setup follow each other, because they share its light."""
     order = {setup: index for index, setup in enumerate(dict.fromkeys(point.setup for point in points))}
     return sorted(points, key=lambda point: order[point.setup])
 
 
-def find_experiment(name: str) -> Experiment:
-    """The experiment ``name``: a shipped one, or one of the user's, a file or a module with a dot in its name.
+def find_experiment(name: str) -> Study:
+    """Return the study ``name``: a shipped one, or one of the user's, a file or a module with a dot in its name.
 
-    MitsimError for another name, with those that there are, and for a module without an ``EXPERIMENT``.
+    MitsimError for another name, with the names of all studies, and for a module without a ``STUDY``.
     """
     if not is_experiment(name) or name == ALL:
-        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+        raise no_such_study(name)
     module = name if "." in name else f"mitsim.studies.{SHARED.get(name, f'{name}_study')}"
     try:
         loaded = _load_file(module) if module.endswith(_PYTHON) else importlib.import_module(module)
-        found: Experiment = loaded.EXPERIMENTS[name] if name in SHARED else loaded.EXPERIMENT
+        found: Study = _declared(loaded)[name] if name in SHARED else _declared(loaded)
     except (ImportError, AttributeError, OSError, SyntaxError) as error:
         raise MitsimError(
-            f"study {name}: the module {module} cannot be used ({error}); it needs an EXPERIMENT, as "
+            f"study {name}: the module {module} cannot be used ({error}); it needs a STUDY, as "
             "`mitsim new study NAME` writes one"
         ) from error
     return found
 
 
+def no_such_study(name: str) -> MitsimError:
+    """Return the refusal of a ``name`` that is no study's, with the replacement of one that there was."""
+    if name in GONE:
+        return MitsimError(f"study {name}: is part of another study now; use `mitsim study {GONE[name]}`")
+    return MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+
+
+def _declared(module: Any) -> Any:
+    """Return the STUDY or the STUDIES of a ``module``, or their equivalents in studies that are not on the engine."""
+    names = [name for name in ("STUDY", "STUDIES", "EXPERIMENT", "EXPERIMENTS") if hasattr(module, name)]
+    return getattr(module, names[0] if names else "STUDY")
+
+
 @cache
 def _load_file(path: str) -> Any:
-    """The module in a file, which is run once."""
+    """Return the module in a file, which is executed once."""
     found = importlib.util.spec_from_file_location(f"mitsim_study_{Path(path).stem}", path)
     assert found is not None and found.loader is not None, "a file of Python has a loader"
     module = importlib.util.module_from_spec(found)
@@ -337,7 +433,7 @@ def _load_file(path: str) -> Any:
 
 
 def is_experiment(name: str) -> bool:
-    """Whether ``name`` is that of a study of many points."""
+    """Return True if ``name`` is that of a study of many points."""
     return name in (*EXPERIMENTS, ALL) or "." in name
 
 
@@ -350,9 +446,10 @@ MEASURES = {
     "chi_square": ("chi_square", "chi-square of a measurement, 1 where the model fits [1]"),
     "uncertainty": ("uncertainty", "standard uncertainty, rms [reflectance]"),
     "lambda": ("lambda", "lambda, weight of the regularisation [(electrons/s)²]"),
+    "seconds": ("seconds", "time of the solution [s]"),
 }
 """Column of the table and axis, by what people ask for."""
-NO_SCENE = ("patterns", "exposure", "seed", "accuracy")
+NO_SCENE = ("patterns", "exposure", "seed", "accuracy", "method")
 """What a sweep may vary besides parameters of the scene."""
 OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason", "lambda", "psnr_db", "ssim"} | {
     column for column, _ in MEASURES.values()
@@ -360,7 +457,7 @@ OTHERS = {"point", "picture", "model", "shots", "exposure_s", "flagged", "reason
 """Columns of every study's table, which are no knob."""
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
 """As Python and Mitsuba read them."""
-_LISTED = ("patterns", "exposure", "seed")
+_LISTED = ("patterns", "exposure", "seed", "method")
 """Knobs whose values are a list, whatever stands between its commas."""
 _MOST = 10_000
 """Points of one sweep: more are a typing error."""
@@ -416,6 +513,9 @@ def check_sweep(sweep: Sweep, pictures: int) -> None:
             raise MitsimError(f"--over exposure={text}: use {', '.join(CONVENTIONS)}")
     for text in knobs.get("patterns", ()):
         read_name(text)
+    for text in knobs.get("method", ()):
+        if text not in METHODS:
+            raise MitsimError(f"--over method={text}: use {', '.join(METHODS)}")
     for name, kind in (("seed", int), ("accuracy", float)):
         for text in knobs.get(name, ()):
             Request.of(**{name: number_of(name, text, kind)})

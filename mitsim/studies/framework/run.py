@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatch
 from functools import partial
 from itertools import groupby
@@ -20,15 +20,14 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_output, check_plain, output_folder, read_json, whole_file, write_json, write_text
 from mitsim.core.job import Job
-from mitsim.studies import ALL, EXPERIMENTS, PAPER, STUDIES
-from mitsim.studies.framework.experiment import Found, Point, Results
+from mitsim.studies import ALL, PAPER, STUDIES
+from mitsim.studies.framework.experiment import HEADS, Claim, Found, Point, Results, no_such_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mitsim.api.bench import Bench
-    from mitsim.report.pages import Table
-    from mitsim.studies.framework.findings import Part
+    from mitsim.studies.framework.page import Part, Section
 
 
 DPI = 150
@@ -45,6 +44,13 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Figu
         with whole_file(folder / file) as part:
             figure.savefig(part, dpi=DPI, format="png")
     return drawn
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write ``rows`` to the CSV file ``path``, all or nothing; MitsimError when it cannot be written."""
+    from pandas import DataFrame
+
+    write_text(path, DataFrame([dict(row) for row in rows], dtype=object).to_csv(index=False))
 
 
 class Findings:
@@ -65,8 +71,8 @@ class Findings:
         """By file name."""
         raise NotImplementedError
 
-    def tables(self) -> Mapping[str, Table]:
-        """By file name."""
+    def tables(self) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+        """Return rows of tables by file name."""
         return {}
 
     def parts(self) -> Sequence[Part]:
@@ -76,7 +82,7 @@ class Findings:
     def records(self) -> list[dict[str, Any]]:
         """What was measured, a dictionary a row: the first table, or the first list of such in the JSON."""
         for table in self.tables().values():
-            return [dict(row) for row in table.rows]
+            return [dict(row) for row in table]
         lists = (value for value in self.payload().values() if isinstance(value, list | tuple))
         found = ([dict(row) for row in each if isinstance(row, Mapping)] for each in lists)
         return next((rows for rows in found if rows), [])
@@ -92,22 +98,64 @@ class Findings:
         return ()
 
 
-class InFolder:
-    """What a study came to, for programs and notebooks: ``rows`` of its table, and the folder ``output``."""
+@dataclass(frozen=True)
+class StudyResult:
+    """Result of a study, for the command line, programs and notebooks.
 
-    rows: tuple[Any, ...]
+    Attributes
+    ----------
+    study, output
+        name, and the folder that holds the study.
+    rows
+        rows of its table.
+    warnings
+        reasons why it may not be trusted.
+    findings, scene, patterns
+        of a study of one bench: findings, and the scene and patterns that they are of; None: of none.
+    points, missing, seconds
+        of a study of many points: measured points, those of other parts that are missing, and the time of measuring.
+    claims, figures, section
+        of a whole study of many points: judged claims, files of figures, and its section of a page.
+    """
+
+    study: str
     output: str
+    rows: tuple[Any, ...] = field(default=(), repr=False)
+    warnings: tuple[str, ...] = ()
+    findings: Findings | None = None
+    scene: str | None = None
+    patterns: str | None = None
+    points: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    claims: tuple[Claim, ...] = ()
+    figures: tuple[str, ...] = ()
+    section: Section | None = field(default=None, repr=False)
+
+    def payload(self) -> dict[str, Any]:
+        """Return the result as JSON has it."""
+        if self.findings is not None:
+            return {**self.findings.payload(), "scene": self.scene, "patterns": self.patterns, "output": self.output}
+        names = ("study", "output", "points", "missing", "seconds", "rows", "claims", "figures", "warnings")
+        return {name: getattr(self, name) for name in names} | {"claims": [asdict(claim) for claim in self.claims]}
 
     def lines(self) -> list[str]:
-        """For people."""
-        raise NotImplementedError
+        """Return the result as text."""
+        if self.findings is not None:
+            return [f"JSON and plots: {self.output}", *self.findings.lines()]
+        if self.missing:
+            return [
+                f"{self.points} points measured, {self.missing} of other parts are missing: {self.output}",
+                "Join all parts with: mitsim study merge PART... -o FOLDER",
+            ]
+        heads = self.section.heads if self.section else HEADS
+        lines = [f"{claim.verdict}: {claim.claim} ({claim.figures_text(heads)})" for claim in self.claims]
+        return [f"{self.points} points in {self.seconds:.0f} s; table, figures and page: {self.output}", *lines]
 
     def to_pandas(self) -> Any:
-        """The rows as a ``pandas.DataFrame``; MitsimError where pandas is not installed."""
-        try:
-            import pandas
-        except ImportError:
-            raise MitsimError("pandas is not installed, which tables need; type: pip install pandas") from None
+        """Return the rows as a ``pandas.DataFrame``."""
+        import pandas
+
         return pandas.DataFrame([*self.rows])
 
     @property
@@ -122,32 +170,6 @@ class InFolder:
             f'<img style="max-width:100%" src="{data_uri(each.read_bytes())}">' for each in self.pictures.values()
         )
         return card(f"Study in {self.output}", {}, self.lines()) + "".join(figures)
-
-
-@dataclass(frozen=True)
-class StudyResult(InFolder):
-    """Findings, of which scene and patterns they are (None: of none), the folder ``output`` that holds them, and the
-    ``rows`` of their table."""
-
-    findings: Findings
-    scene: str | None
-    patterns: str | None
-    output: str
-    rows: tuple[Any, ...] = field(default=(), repr=False)
-
-    def payload(self) -> dict[str, Any]:
-        """What the command line reports."""
-        where = {"scene": self.scene, "patterns": self.patterns, "output": self.output}
-        return {**self.findings.payload(), **where}
-
-    def lines(self) -> list[str]:
-        """For people."""
-        return [f"JSON and plots: {self.output}", *self.findings.lines()]
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Of the findings."""
-        return self.findings.warnings
 
 
 def run_study(
@@ -175,13 +197,14 @@ def run_study(
     with study_folder(output, name) as folder:
         findings = measure(bench, request, job or Job())
         scene, patterns = (str(bench.loaded.path), request.patterns) if bench else (None, None)
-        result = StudyResult(findings, scene, patterns, str(folder), tuple(findings.records()))
+        warnings = tuple(findings.warnings)
+        result = StudyResult(name, str(folder), tuple(findings.records()), warnings, findings, scene, patterns)
         provenance = {"kind": name, "seed": request.seed, "versions": versions()}
         write_json(folder / f"{name}.json", {**result.payload(), **provenance})
         figures = write_figures(folder, findings.figures())
         if findings.title:
             from mitsim.report.pages import page_figure
-            from mitsim.studies.framework.findings import build_findings
+            from mitsim.studies.framework.page import build_findings
 
             scene_name = f"Scene {bench.loaded.path.parent.name}, patterns {patterns}, seed" if bench else "Seed"
             where = f"{scene_name} {request.seed}."
@@ -190,7 +213,7 @@ def run_study(
             page = build_findings(name, titles, where, findings.parts(), pictures, result.warnings)
             write_text(folder / f"{name}.html", page)
         for file, table in findings.tables().items():
-            table.write(folder / file)
+            write_table(folder / file, table)
         return result
 
 
@@ -211,7 +234,7 @@ def find_study(name: str, **settings: object) -> Callable[..., StudyResult]:
         for another name, with those that there are.
     """
     if name not in STUDIES:
-        raise MitsimError(f"study {name!r}: there is no such study; use {', '.join((*STUDIES, *EXPERIMENTS))}")
+        raise no_such_study(name)
 
     def measure(bench: Bench | None, request: Request, job: Job) -> Findings:
         """What the study finds."""
@@ -275,12 +298,10 @@ class Store:
 
     def results(self, points: Iterable[Point]) -> Results:
         """Everything found at ``points``, in their order."""
-        from mitsim.report.pages import Table
-
         found = {point.key: self.load(point) for point in points}
         rows = tuple({**row, "point": key} for key, each in found.items() for row in each.rows)
         arrays = {(key, name): array for key, each in found.items() for name, array in each.arrays.items()}
-        return Results(Table(rows), arrays)
+        return Results(rows, arrays)
 
     def _file(self, point: Point) -> Path:
         return self.folder / f"{point.key}.npz"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -25,11 +25,12 @@ from mitsim.metrics import Quality
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruct import reconstruct
+from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solution import Status
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed
 from mitsim.report.pages import Value
-from mitsim.studies.framework.experiment import Point, Setup, picture
+from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Found, Point, Setup, picture
 
 Kept = TypeVar("Kept")
 _KEY_DIGITS = 16
@@ -52,6 +53,8 @@ class Image:
         columns of :func:`flags_of`.
     trust
         where it is known: the unexplained part of the measurements, their chi-square, the image's standard uncertainty.
+    seconds
+        time of the solution of rendered frames.
     """
 
     image: FloatArray
@@ -61,6 +64,7 @@ class Image:
     exposure_s: float
     flags: Mapping[str, Value]
     trust: Mapping[str, float | None] = field(default_factory=dict)
+    seconds: float | None = None
 
     @classmethod
     def of(
@@ -209,6 +213,7 @@ class Studio:
         seed: int = 0,
         exposure: str = EQUAL_PEAK,
         focus: Literal["auto", "map"] | None = None,
+        method: str = TIKHONOV,
     ) -> Image:
         """A scene as it comes out: rendered, as a user's own frames are exposed and reconstructed.
 
@@ -224,15 +229,15 @@ class Studio:
             of the frames' noise, and of the calibration's.
         exposure
             one of :data:`mitsim.report.CONVENTIONS`, or ``DIM``.
-        focus
+        focus, method
             of rendered frames, as for :func:`mitsim.reconstruct`.
         """
         frames = self.frames(setup, model, patterns, seed)
         if model != RENDERED:
             return Image.of(frames, frames.seconds(exposure))
-        seconds = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
-        shots = expose(frames.lit.light, patterns, seed=seed, exposure=seconds)
-        found = reconstruct(shots, self.factors(setup, seed), focus=focus)
+        exposure_s = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
+        shots = expose(frames.lit.light, patterns, seed=seed, exposure=exposure_s)
+        found = reconstruct(shots, self.factors(setup, seed), focus=focus, method=method)
         misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
@@ -241,7 +246,8 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         flags = flags_of(found.status, misfit=misfit)
-        return Image(found.image, quality, found.lam, count, shots.exposure_s, flags, trust)
+        seconds = sum(found.seconds.values())
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, flags, trust, seconds)
 
     def _plan(self, setup: Setup) -> Plan:
         """That of a ``setup``, made by this studio or by another that was first: one in a file is as one in memory."""
@@ -296,3 +302,51 @@ class Studio:
         kept.move_to_end(key)
         found: Kept = kept[key]
         return found
+
+
+# -------- The measurement of one point
+
+
+def finding(studio: Studio, point: Point, image: FloatArray | None = None, **measured: Value) -> Found:
+    """Return the findings of a point in one row.
+
+    Parameters
+    ----------
+    studio, point
+        studio that measured it, and the point.
+    image
+        image of the point, if figures show it; kept for a few prints, with the truth.
+    **measured
+        columns of the row.
+    """
+    kept = image is not None and point.setup.picture in (*QUICK_IMAGES, None)
+    arrays = image_arrays(image, studio.lit_scene(point.setup).truth) if kept and image is not None else {}
+    return Found((point.row(**measured),), arrays)
+
+
+def image_arrays(image: FloatArray, truth: FloatArray) -> dict[str, FloatArray]:
+    """Return an ``image`` and its ``truth`` as findings keep them."""
+    return single_precision({IMAGE: image, TRUTH: truth})
+
+
+def single_precision(arrays: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return named ``arrays`` in single precision, because a page shows no more."""
+    return {name: array.astype("float32") for name, array in arrays.items()}
+
+
+def measure_image(studio: Studio, point: Point, shown: Collection[str] | None = None) -> Found:
+    """Return the quality of the image that a user gets at a point with model, patterns, exposure and seed.
+
+    Parameters
+    ----------
+    studio, point
+        studio that measures, and the point.
+    shown
+        patterns whose images are kept; None: all.
+    """
+    values = dict(point.values)
+    patterns, exposure = str(values["patterns"]), str(values.get("exposure", EQUAL_PEAK))
+    method = str(values.get("method", TIKHONOV))
+    image = studio.image(point.setup, str(values["model"]), patterns, int(point["seed"]), exposure, method=method)
+    measured = image.row() | ({"seconds": image.seconds} if "method" in values else {})
+    return finding(studio, point, image.image if shown is None or patterns in shown else None, **measured)

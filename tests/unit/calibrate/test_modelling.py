@@ -17,7 +17,7 @@ from mitsim.calibrate.model import fit_placement, model_of, simulate_responses
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.session import Modelling, load_recipe
-from mitsim.studies.models_study import OFF_MM, as_built
+from mitsim.studies.calibration_study import OFF_MM, as_built
 from tests.real_session import RealSession, write_list
 
 FIT = ("mask_distance", "mask_shift_row", "mask_shift_column", "mask_rotation")

@@ -17,8 +17,6 @@ from mitsim.acquire.reference import Rendered
 from mitsim.core.images import lightness, linear_light
 from mitsim.report import demo_page, plots
 from mitsim.report.pages import Mean
-from mitsim.studies import diffraction_study
-from mitsim.studies.diffraction_study import ASSUMED, SEPARABLE, QualityRow
 from tests.exchanged import made
 from tests.unit.planner.invented_pilot_result import plan as invented_plan
 
@@ -151,31 +149,6 @@ def test_no_pyplot_is_loaded() -> None:
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
-
-
-def test_quality_by_factors_shows_every_value_on_the_line_of_its_system() -> None:
-    def row(light: str, factors: str, psnr_db: float) -> QualityRow:
-        return QualityRow("idealised", "separable", light, "dots:7", factors, 49, psnr_db, 0.0, None, 0.0, 0.0, "")
-
-    rows = [row("ray", ASSUMED, 40.0), row("wave", ASSUMED, 20.0), row("wave", SEPARABLE, 41.0)]
-    figure = diffraction_study.quality_by_factors(rows, "a message")
-    axes = figure.axes[0]
-    names = [text.get_text() for text in axes.get_yticklabels()]
-    assert names == ["idealised, separable, wave", "idealised, separable, ray"]
-    assert [bar.get_width() for bar in axes.patches] == [20.0, 40.0]
-    (fitting,) = (line.get_xdata() for line in axes.lines if line.get_marker() == "D")
-    assert fitting[0] == 41.0 and np.isnan(fitting[1]), "of rays no others are tried"
-    assert "dB" in axes.get_xlabel() and figure.get_suptitle() == "a message"
-
-
-def test_shadow_profiles_show_the_middle_of_the_sensor() -> None:
-    """Of a region of interest, its middle. (Planted: the axis, which need not be on it.)"""
-    for middle in (0.0, 4.0):
-        position = [middle + place for place in (-1.0, -0.5, 0.0, 0.5, 1.0)]
-        axes = diffraction_study.shadow_profiles(position, {"rays": [1, 2, 3, 4, 5]}, 0.5, "a message").axes[0]
-        shown = [[middle - 0.5, 2.0], [middle, 3.0], [middle + 0.5, 4.0]]
-        assert axes.lines[0].get_xydata().tolist() == shown
-    assert "mm" in axes.get_xlabel() and axes.get_title() == "a message"
 
 
 def test_maps_of_errors_say_of_which_factor() -> None:

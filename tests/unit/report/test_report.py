@@ -20,7 +20,7 @@ from mitsim.report.demo_page import Trust
 from mitsim.report.pages import page_figure
 from mitsim.report.parts import stages_of
 from mitsim.studies.demo import _no_image
-from mitsim.studies.framework.findings import Part, build_findings
+from mitsim.studies.framework.page import Part, build_findings
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 N = 32

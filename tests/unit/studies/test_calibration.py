@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,19 +18,22 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
+from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.studies.calibration_study import (
     CalibrationFindings,
+    ModelRow,
     _row,
+    as_built,
     judge_session,
     measure,
     session_cost,
     singular_rows,
 )
 from mitsim.studies.error_budget import LAMBDA, REST, SCENE, SOLVER, LossRow, _of_scene, gain_without, session_rendering
-from mitsim.studies.framework.findings import build_findings
+from mitsim.studies.framework.page import build_findings
 from mitsim.studies.perturbation import Expected, Noise
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
@@ -222,6 +225,12 @@ def test_all_sources_together_are_what_the_image_is_off(
     assert reported["capture", largest] > 0.7 * sum(reported.values()) and reported["session", "rendering"] > 0
     assert found.image["predicted_psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values())))
     assert found.image["psnr_db"] == pytest.approx(-10 * np.log10(sum(reported.values()) + left)) and not found.warnings
+    assert found.image["geometric_psnr_db"] < found.image["psnr_db"] - 2, "the mask diffracts"
+    assert found.parts()[-1].title == "Diffraction at the mask" and "shadow.png" in found.figures()
+    # Responses of 16 lines do not tell the mask's distance from the projector's magnification.
+    assert {row.model for row in found.models} <= {"wave", "geometric"} and len(found.models) + sum(
+        "cannot be told apart" in text for text in found.not_predicted
+    ) == 4
 
 
 def print_of_squares(pixels: float) -> FloatArray:
@@ -314,3 +323,37 @@ def test_a_cause_has_the_part_by_which_the_squared_residual_falls_without_it() -
     assert _row("board", 0.05, 0.03).part == pytest.approx(0.04)
     assert _row("board", 0.03, 0.05).part == pytest.approx(-0.04)
     assert _row("board", 0.03, 0.03).part == 0
+
+
+@dataclass(frozen=True)
+class ToyDevices:
+    camera: CameraGeometry
+
+
+@dataclass(frozen=True)
+class ToyBench:
+    devices: ToyDevices
+
+    @property
+    def geometry(self) -> CameraGeometry:
+        return self.devices.camera
+
+
+def test_the_camera_as_built_has_its_mask_off_its_place() -> None:
+    """(Planted: rows and columns exchanged; the offset in place of what is added to it.)"""
+    camera = CameraGeometry(pixels=64, pixel_pitch=0.02, mask_distance=2.0, scene_distance=400.0, mask_offset_row=0.01)
+    built = as_built(cast(Any, ToyBench(ToyDevices(camera)))).devices.camera
+    assert built.mask_distance == pytest.approx(2.05)
+    assert (built.mask_offset_row, built.mask_offset_column) == pytest.approx((0.047, -0.021))
+
+
+def test_images_of_models_stand_beside_that_of_the_session() -> None:
+    models = (ModelRow("wave", 3, 50.04, 1e-3), ModelRow("geometric", 15, 29.1, 0.2))
+    found = CalibrationFindings((), (), (), {}, (0.1, 0.2), SPENT, IMAGE, models=models)
+    part = next(each for each in found.parts() if each.title == "How few frames suffice")
+    assert part.rows == (
+        ("wave", "3", "50.0", "1.0e-03"),
+        ("geometric", "15", "29.1", "2.0e-01"),
+        ("measured", "512", "40.0", ""),
+    )
+    assert found.payload()["models"][1]["frames"] == 15

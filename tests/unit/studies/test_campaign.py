@@ -18,10 +18,10 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.studies.framework import campaign
-from mitsim.studies.framework.campaign import CampaignResult, Where, merge, run_experiment
+from mitsim.studies.framework.campaign import Where, merge, run_experiment
 from mitsim.studies.framework.experiment import Scope, Setup
 from mitsim.studies.framework.page import build_page
-from mitsim.studies.framework.run import Shard
+from mitsim.studies.framework.run import Shard, StudyResult
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
@@ -29,8 +29,8 @@ TOY = "tests.unit.studies.toy_study"
 ROOT = Path(__file__).parents[3]
 SCOPE = Scope(Setup("photograph"), (None,))
 ALL = {f"{place}{number}" for place in "abcd" for number in (1, 2, 3)}
-Run = Callable[..., CampaignResult]
-Whole = tuple[CampaignResult, Path]
+Run = Callable[..., StudyResult]
+Whole = tuple[StudyResult, Path]
 
 
 def set_up(folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -54,7 +54,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Runs the toy study into a folder of that name; ``run.begun()`` are the points that were begun since."""
     set_up(tmp_path, monkeypatch)
 
-    def call(name: str = "out", scope: Scope = SCOPE, **where: object) -> CampaignResult:
+    def call(name: str = "out", scope: Scope = SCOPE, **where: object) -> StudyResult:
         return run_experiment(TOY, scope, tmp_path / name, where=Where(**{"jobs": 1, **where}))  # type: ignore[arg-type]
 
     yield call

@@ -18,7 +18,6 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_UNITS, Drift, load_recipe
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.pages import Table
 from mitsim.studies.drift_study import SESSION, DriftStand, Outcome, _move_projector
 from mitsim.studies.framework.experiment import Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
@@ -245,9 +244,9 @@ def test_claims_hold_predictions_against_what_was_measured() -> None:
         for seed in (0, 1)
     ]  # fmt: skip
     rows += [{**row, "kind": "exposure", "predicted_lost_db": 3.0} for row in rows[:2]]
-    experiment, results = find_experiment("drift"), Results(Table(tuple(rows)))
-    power, exposure = experiment.claims(results)
+    experiment, results = find_experiment("drift"), Results(rows)
+    power, exposure = experiment.judge(results)
     assert power.verdict == "confirmed" and exposure.verdict == "not confirmed"
     assert power.idealised == "1.45 \N{PLUS-MINUS SIGN} 0.30 dB lost"
-    assert power.rendered == "1.05 \N{PLUS-MINUS SIGN} 0.05 dB lost"
-    assert set(experiment.figures(results)) == {"losses.png", "power.png"}
+    assert power.rendered == "1.050 \N{PLUS-MINUS SIGN} 0.050 dB lost"
+    assert set(experiment.draw(results)) == {"losses.png", "power.png"}

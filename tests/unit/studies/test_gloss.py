@@ -14,7 +14,7 @@ import pytest
 from mitsim.api.bench import open_bench
 from mitsim.report import EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera, LitScene, Unexposed
-from mitsim.studies.scene_studies import (
+from mitsim.studies.reflectivity_study import (
     ERROR_SOURCES,
     INTERREFLECTION,
     PIXELS,

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import lightness
 from mitsim.report import MODELS, label
-from mitsim.report.pages import Table
+from mitsim.report.pages import Value
 from mitsim.studies import EXPERIMENTS, PAPER
 from mitsim.studies.framework.campaign import Where, run_experiment
-from mitsim.studies.framework.claims import UNDECIDED, image_rows, judge_claim, psnr_claim
+from mitsim.studies.framework.claims import UNDECIDED, Judged, Statement, stated
 from mitsim.studies.framework.experiment import (
     IMAGE,
+    Claim,
     Point,
     Results,
     Scope,
@@ -25,8 +27,9 @@ from mitsim.studies.framework.experiment import (
     values_of,
 )
 from mitsim.studies.framework.page import Section, build_page, flag_warnings
+from mitsim.studies.framework.panels import Images
 from mitsim.studies.framework.run import batches
-from mitsim.studies.scene_studies import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
+from mitsim.studies.reflectivity_study import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
@@ -44,26 +47,25 @@ def test_points_differ_and_share_light(name: str) -> None:
     assert experiment.name == name and experiment.question.endswith("?") and name in EXPERIMENTS
 
 
-def table(**means: float) -> Table:
-    """Two prints a tenth of a decibel apart of each ``model__exposure``."""
-    rows = [
+def judged(claim: Statement, **means: float) -> Claim:
+    """The ``claim``, judged by two prints a tenth of a decibel apart of each ``model__exposure``."""
+    rows: list[dict[str, Value]] = [
         {"model": name.split("__")[0], "exposure": name.split("__")[1], "psnr_db": mean + side, "picture": f"{side}"}
         for name, mean in means.items()
         for side in (-0.05, 0.05)
     ]
-    return Table(tuple(rows))
+    (found,) = claim.judge(Results(rows))
+    return found
 
 
 def test_a_claim_holds_where_both_models_are_near_the_papers_figure() -> None:
     """Two decibels beside a band count as it. (Planted: the rendered model alone.)"""
-    found = table(idealised__peak=36.8, rendered__peak=40.0, idealised__frame=32.7, rendered__frame=36.8)
-    claim = psnr_claim(found, "49 dots give 34 to 35.5 dB", (34, 35.5))
+    band = stated("49 dots give 34 to 35.5 dB", 34, 35.5)
+    claim = judged(band, idealised__peak=36.8, rendered__peak=40.0, idealised__frame=32.7, rendered__frame=36.8)
     assert claim.verdict == "confirmed only at frame" and claim.paper == "34 to 35.5 dB"
     assert claim.idealised == "peak: 36.80 ± 0.05 dB; frame: 32.70 ± 0.05 dB"
-    near = table(idealised__peak=36.8, rendered__peak=33.0)
-    assert psnr_claim(near, "", (34, 35.5)).verdict == "confirmed"
-    far = table(idealised__peak=31.2, rendered__peak=38.2)
-    assert psnr_claim(far, "", (34, 35.5)).verdict == "not confirmed"
+    assert judged(band, idealised__peak=36.8, rendered__peak=33.0).verdict == "confirmed"
+    assert judged(band, idealised__peak=31.2, rendered__peak=38.2).verdict == "not confirmed"
 
 
 @pytest.mark.parametrize(
@@ -87,22 +89,22 @@ def test_verdicts(peak: str, frame: str, verdict: str) -> None:
     holds = {"+": True, "-": False, "?": None}
     signs = {(model, name): holds[sign] for name, two in (("peak", peak), ("frame", frame))
              for model, sign in zip(MODELS, two, strict=True)}  # fmt: skip
-    found = table(**{f"{model}__{name}": 0.0 for model, name in signs})
-    claim = judge_claim(found, "", "", lambda rows: ("", signs[rows.rows[0]["model"], rows.rows[0]["exposure"]]))
-    assert claim.verdict == verdict
+    claim = Judged("", lambda rows: ("", signs[rows["model"].iloc[0], rows["exposure"].iloc[0]]))
+    assert judged(claim, **{f"{model}__{name}": 0.0 for model, name in signs}).verdict == verdict
 
 
 def test_images_are_those_of_their_rows() -> None:
     """Rows that are alike in all columns but one; a row of the grid with an image missing is left out. (Planted: the
     first image of the table.)"""
-    rows = [{"point": f"{name}{number}", "patterns": name, "number": number} for name in "ab" for number in (1, 2)]
+    rows = [{"point": f"{name}{number}", "kind": name, "number": number} for name in "ab" for number in (1, 2)]
     arrays = {(str(row["point"]), IMAGE): np.full((2, 2), index) for index, row in enumerate(rows)}
     del arrays["b1", IMAGE]
-    found = Results(Table(tuple(rows)), arrays)
-    lines = {name: found.table.where(patterns=name) for name in "ab"}
-    grid = image_rows(found, lines, "number", (2, 1), "number {number}")
-    assert list(grid) == ["a"]
-    assert [(image[0, 0], caption) for image, _, caption in grid["a"]] == [(1, "number 2"), (0, "number 1")]
+    grid = Images("number", columns=(2, 1), down=("kind",), caption="number {number}")
+    cells = grid.draw(Results(rows, arrays))["images.png"].axes
+    assert [axes.get_ylabel() for axes in cells] == ["a", ""]
+    assert [(float(axes.images[0].get_array()[0, 0]), axes.get_xlabel()) for axes in cells] == [
+        (lightness(np.array(1.0)), "number 2"), (0, "number 1")
+    ]  # fmt: skip
 
 
 def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
@@ -114,10 +116,10 @@ def test_a_page_says_how_many_images_are_flagged_and_what_for() -> None:
         *({"point": "c", "method": method, "flagged": False, "reason": "", **same} for method in "ab"),
         {"point": "d", "square": 1.0},
     ]
-    (text,) = flag_warnings("toy", Results(Table(tuple(rows))))
+    (text,) = flag_warnings("toy", Results(rows))
     assert text.startswith("2 of 4 images are flagged") and "toy.csv" in text
     assert text.endswith(f": 2 {TIMES} misfit, likely cause: depth; 1 {TIMES} The capture was flagged: dim.")
-    assert not flag_warnings("toy", Results(Table(tuple(rows[-2:]))))
+    assert not flag_warnings("toy", Results(rows[-2:]))
 
 
 def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_path: Path) -> None:
@@ -131,9 +133,9 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
         {"point": point.key, **point.row(psnr_db=psnr, misfit=misfit, flagged=off, reason="misfit" if off else "")}
         for point, psnr, misfit, off in values
     ]
-    results = Results(Table(tuple(rows)), scope=scope)
-    assert not experiment.figures(results)
-    section = Section.of(experiment, "sweep", scope, (), {}, results)
+    results = Results(rows, scope=scope)
+    assert not experiment.draw(results)
+    section = Section.of(experiment, "sweep", (), {}, results)
     page = build_page([section], tmp_path / "sweep.html", section.title).read_text()
     reported = (
         "mitsim study sweep photograph --over mask=separable,flatcam --measure psnr,misfit --patterns dots:4 --seed 3"
@@ -141,38 +143,43 @@ def test_the_page_of_a_sweep_says_what_was_swept_and_its_command_repeats_it(tmp_
     assert section.command == reported and "Sweep of mask" in page and "Zheng" not in page
     assert "PSNR is highest at mask separable (31.2 dB), lowest at mask flatcam (20.0 dB)" in page
     assert "1 of 2 images are flagged" in page
-    (table,) = section.tables
-    assert table.headings == ("mask", "psnr [dB]", "misfit [1]", "flagged")
+    (table,) = section.parts
+    assert table.head == ("mask", "psnr [dB]", "misfit [1]", "flagged")
     assert table.rows == (("separable", "31.2", "0", "0 of 1"), ("flatcam", "20.0", "0.0500", "1 of 1"))
 
 
-@pytest.mark.parametrize("name", ["reflectivity", "separation"])
-def test_a_page_states_the_accuracy_that_light_was_traced_to(name: str) -> None:
+def test_a_page_states_the_accuracy_that_light_was_traced_to() -> None:
     """(Planted: that of the scope, three times as fine.)"""
-    experiment = find_experiment(name)
+    experiment = find_experiment("reflectivity")
     point: Point = experiment.points(WHOLE)[0]
-    results = Results(Table(({"point": point.key},)))
-    assert "good to 0.003 " in Section.of(experiment, name, WHOLE, (), {}, results).count
+    results = Results([{"point": point.key}])
+    assert "good to 0.003 " in Section.of(experiment, "reflectivity", (), {}, replace(results, scope=WHOLE)).count
 
 
 def test_figures_of_gloss_have_each_image_under_its_title() -> None:
     """(Seen failing: the truths twice in a row, more images than titles.)"""
-    cases = {f"{label(name)}, {exposure}": (name, exposure) for exposure in EXPOSURES for name in GLOSS_FAMILIES}
+    cases = {f"{name}, {exposure}": (name, exposure) for name in GLOSS_FAMILIES for exposure in EXPOSURES}
     names = ["matt paint", "apparent", *cases]
     levels = dict(zip((*names, *ERROR_SOURCES), np.linspace(0, 0.4, len(names) + len(ERROR_SOURCES)), strict=True))
     points = {"gift_card": ("gift_card", ""), "compact_disc": ("compact_disc", "")}
     points |= {f"plate {alpha}": ("plate", alpha) for alpha in ("0.3", "1.0")}
-    shared = {"seed": 0, "psnr_db": 20.0, "psnr_matt_db": 20.0, **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES}}
+    shared = {
+        "part": "gloss",
+        "seed": 0,
+        "psnr_db": 20.0,
+        "psnr_matt_db": 20.0,
+        **{f"{cause}_db": 30.0 for cause in ERROR_SOURCES},
+    }
     rows = [
         {"point": point, "subject": subject, "roughness": alpha, "patterns": name, "exposure": exposure, **shared}
         for point, (subject, alpha) in points.items()
         for name, exposure in cases.values()
     ]
     arrays = {(point, name): np.full((2, 2), level) for point in points for name, level in levels.items()}
-    drawn = find_experiment("reflectivity").figures(Results(Table(tuple(rows)), arrays))
+    drawn = find_experiment("reflectivity").draw(Results(rows, arrays))
     cells = drawn["images_shipped.png"].axes
     titles = [axes.get_title().replace("\n", " ") for axes in cells[: len(names)]]
-    assert titles == [name.replace(", ", " ") for name in names]
+    assert titles == [*names[:2], *(f"{label(name)}, {exposure}" for name, exposure in cases.values())]
     shown = [float(axes.images[0].get_array()[0, 0]) for axes in cells]
     assert shown == [lightness(np.array(levels[name])) for name in names] * 2
     assert len(drawn["causes_shipped.png"].axes) == 2 * len(ERROR_SOURCES)

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
-from mitsim.report.pages import Table, Value
+from mitsim.report.pages import Value
 from mitsim.report.plots import curves, spans_decades, tells
 from mitsim.studies.framework.experiment import IMAGE, QUICK_IMAGES, TRUTH, Claim, Point, Results, Scope, Setup
 from mitsim.studies.framework.experiment import find_experiment as find
@@ -22,8 +22,8 @@ from mitsim.studies.sweep_study import axis_of
 from tests.unit.report.test_charts import curve
 
 STUDIES = (
-    "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient", "regularisation",
-    "convolutional", "depth", "drift", "models", "waterfall", "sweep",
+    "patterns", "distance", "binning", "multishot", "exposure", "resolution", "ambient",
+    "convolutional", "depth", "drift", "waterfall", "sweep",
 )  # fmt: skip
 KNOBS = ("sheet_z", ("390", "400", "410")), ("patterns", ("dots:4", "dots:7"))
 OTHERS = "spectrum", "without the drift"
@@ -67,9 +67,9 @@ def rows_of(point: Point, rng: np.random.Generator) -> Iterator[dict[str, Value]
     measured |= {"change_db": -1.5, "called_for": True, "lambda": float(10 ** rng.uniform(5, 9))}
     measured["ratio"] = float(dict(point.setup.parameters).get("lamp", 1.0)) / 1170
     kind, _, size = str(own.get("patterns", "")).partition(":")
+    measured["kind"] = kind
     measured["patterns_count"] = int(size) ** 2 if size.isdecimal() else 1
     measured["pixels"] = 512 // int(own.get("binning", 1) or 1)
-    measured |= {"frames": int(rng.integers(2, 512))} if "factors" in own else {}
     measured |= {"pairs_a_mm": float(rng.uniform(0.1, 0.6))} if "bars" in str(point.setup.picture) or kind else {}
     for model, exposure in product(MODELS, (EQUAL_PEAK, EQUAL_FRAME)):
         more = {"model": model, "exposure": exposure}
@@ -79,23 +79,21 @@ def rows_of(point: Point, rng: np.random.Generator) -> Iterator[dict[str, Value]
 
 def invented(name: str) -> Results:
     """Results of the study ``name``, quick, whose images are noise."""
-    scope = replace(
-        SCOPE, sweep=KNOBS if name == "sweep" else (), pictures=(None,) if name == "models" else QUICK_IMAGES
-    )
+    scope = replace(SCOPE, sweep=KNOBS if name == "sweep" else (), pictures=QUICK_IMAGES)
     rng, experiment = np.random.default_rng(1), find(name)
     points = experiment.points(scope)
     rows = [row for point in points for row in rows_of(point, rng)]
     if name == "waterfall":
         rows = [{**row, "model": model} for row in rows for model in ("assumed", "calibrated")]
     arrays = {(point.key, array): rng.random((4, 4)) for point in points for array in (IMAGE, TRUTH, *OTHERS)}
-    return Results(Table(tuple(rows)), arrays, scope)
+    return Results(rows, arrays, scope)
 
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_axes_have_units_and_decades_are_logarithmic(name: str) -> None:
     """Of all charts of a study. (Seen failing: numbers of patterns and frames without a unit in four studies, a sweep
     over the bare name of its parameter, lambda from 1e5 to 1e9 on a linear axis.)"""
-    drawn = find(name).figures(invented(name))
+    drawn = find(name).draw(invented(name))
     found = {file: faults(figure) for file, figure in drawn.items() if tells(figure)}
     assert found and not any(found.values()), found
 
@@ -142,12 +140,12 @@ def sweep(knobs: Sequence[tuple[str, tuple[str, ...]]], truth_by: str = "") -> R
     for point, row in zip(points, rows, strict=True):
         grey = 0.8 + 0.01 * values.index(str(row[truth_by])) if truth_by else 0.9
         arrays[point.key, TRUTH] = np.full((2, 2), grey)
-    return Results(Table(tuple(rows)), arrays, scope)
+    return Results(rows, arrays, scope)
 
 
 def grid(results: Results) -> tuple[list[str], list[str], list[str]]:
     """Titles of columns, names of rows and captions of its images."""
-    cells = find("sweep").figures(results)["images.png"].axes
+    cells = find("sweep").draw(results)["images.png"].axes
     titles = [axes.get_title() for axes in cells if axes.get_title()]
     return titles, [axes.get_ylabel() for axes in cells if axes.get_ylabel()], [axes.get_xlabel() for axes in cells]
 
@@ -171,7 +169,7 @@ def test_truths_stand_above_images_where_they_differ_along_a_row() -> None:
 def test_a_long_sweep_shows_both_ends_and_says_how_many_there_are() -> None:
     """(Planted: the first six.)"""
     results = sweep((("sheet_z", tuple(f"{390 + each}" for each in range(11))),))
-    figure = find("sweep").figures(results)["images.png"]
+    figure = find("sweep").draw(results)["images.png"]
     titles, names, _ = grid(results)
     assert titles == ["truth", *(f"sheet_z {390 + each}" for each in (0, 2, 4, 6, 8, 10))] and not names
     assert figure.get_suptitle().replace("\n", " ") == "Images by sheet_z [mm] (6 of 11 columns)"
@@ -186,16 +184,16 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
     assert tally(claims) == said and tally(claims[:1]) == "1 claim: 1 confirmed" and not tally(())
     results = invented("patterns")
     shown = {"psnr.png": curves({"": {"a": curve((1, 1.0), (2, 2.0))}}, "x [mm]")}
-    section = Section.of(find("patterns"), "patterns", SCOPE, claims, shown, results)
+    section = Section.of(find("patterns"), "patterns", claims, shown, results)
     page = build_page([section], tmp_path / "page.html", section.title).read_text()
-    order = [page.index(each) for each in (said, section.experiment.question, "claim 4", "<img", "Zheng")]
+    order = [page.index(each) for each in (said, section.detail, "claim 4", "<img", "Zheng")]
     assert order == sorted(order)
 
 
 def test_images_of_a_drift_stand_beside_the_truth() -> None:
     """Of the kinds that cost the most. (Planted: in the table's order.)"""
     results = invented("drift")
-    cells = find("drift").figures(results)["images.png"].axes
+    cells = find("drift").draw(results)["images.png"].axes
     assert [axes.get_title() for axes in cells[:3]] == ["truth", "without the drift", "with it"] and len(cells) == 12
-    most = max(results.table.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
+    most = max(results.rows, key=lambda row: row["lost_db"])  # type: ignore[arg-type,return-value]
     assert str(most["amount"]) and cells[2].get_xlabel() == f"{most['after_db']:.1f} dB"

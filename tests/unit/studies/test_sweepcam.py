@@ -18,7 +18,6 @@ from mitsim.devices.session import load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.report.pages import Table
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Results, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
@@ -186,7 +185,7 @@ def test_a_gain_within_the_noise_is_none(gain: float, verdict: str) -> None:
         for model in MODELS
         for exposure in (EQUAL_PEAK, EQUAL_FRAME)
     ]
-    *others, moved_or_not = experiment.claims(Results(Table(tuple(rows))))
+    *others, moved_or_not = experiment.judge(Results(rows))
     assert moved_or_not.verdict == verdict
     assert [claim.verdict for claim in others] == [
         "confirmed", "confirmed", "confirmed only idealised", "confirmed", "confirmed"

@@ -10,15 +10,14 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.pages import Mean, Table, Value
+from mitsim.report.pages import Mean, Value
 from mitsim.studies import drift_study
 from mitsim.studies.framework.claims import (
     CONFIRMED,
     NOT_CONFIRMED,
     UNDECIDED,
-    difference,
     every,
-    sample_mean,
+    mean_of,
     verdict_at,
     within,
 )
@@ -105,13 +104,14 @@ def binned(**gains: tuple[str, int, str, int]) -> Build:
 
 def shared(better: str, other: str) -> Build:
     third = [rows(20, patterns=name) for name in ("1 uniform", "49 uniform", "49 dots") if name not in (better, other)]
-    law = rows(1.0, "ser", patterns="49 dots", ser_law=1.0)
+    law = rows(1.0, "ser_over_law", patterns="49 dots", model=IDEALISED)
     return beside(gain("psnr_db", {"patterns": better}, {"patterns": other}), *third, law)
 
 
 def law(value: float) -> list[Row]:
     """A ratio of measured error and law; its scatter is a tenth of the others', as its borders are nearer."""
-    found = [{**row, "ser": value + 0.1 * row["ser"]} for row in rows(0.0, "ser", jitter=True, ser_law=1.0)]
+    ratios = rows(0.0, "ser_over_law", jitter=True, model=IDEALISED)
+    found = [{**row, "ser_over_law": value + 0.1 * row["ser_over_law"]} for row in ratios]
     return [*found, *(row for name in ("1 uniform", "49 uniform", "49 dots") for row in rows(20, patterns=name))]
 
 
@@ -150,15 +150,8 @@ def lit(**gains: float) -> list[Row]:
     return [
         row
         for name, value in gains.items()
-        for row in level("gain_db", subject=name, patterns="dots:7", depth="as it is")(value)
+        for row in level("gain_db", part="global light", subject=name, patterns="dots:7", depth="as it is")(value)
     ]
-
-
-def fitted(value: float) -> list[Row]:
-    case = {"exposure_fraction": 0.8}
-    rest = [rows(20, factors="geometric", frames=2, **case), rows(20, factors="measured", frames=258, **case)]
-    build = gain("psnr_db", {"factors": "wave", "frames": 2}, {"factors": "measured", "frames": 2048}, **case)
-    return beside(build, *rest)(value)
 
 
 def drifted(value: float) -> list[Row]:
@@ -190,7 +183,14 @@ def glossy(card: float = 40.0, disc: float = 10.0) -> list[Row]:
         for name, decibels in (("gift_card", card), ("compact_disc", disc))
         for exposure in (EQUAL_PEAK, "as the matt scene")
         for row in rows(
-            decibels, "artefacts_db", jitter=True, model=RENDERED, subject=name, exposure=exposure, patterns="dots:7"
+            decibels,
+            "artefacts_db",
+            jitter=True,
+            part="gloss",
+            model=RENDERED,
+            subject=name,
+            exposure=exposure,
+            patterns="dots:7",
         )
     ]
 
@@ -225,21 +225,6 @@ BORDERS = [
              {"mask_distance": "2.0", "patterns": "uniform"}),
         rows(18, mask_distance="0.75", patterns="uniform"), rows(30, mask_distance="0.75", patterns="dots:7"),
     ), -1.0, 1.0),
-    *(
-        ("regularisation", claim, beside(
-            lambda value: [
-                {**row, "psnr_best_db": row["psnr_db"], "seconds": 1.0, "peak_mib": 1.0}
-                for name in ("uniform", "dots:7")
-                for row in gain("psnr_db", {"method": "tv"}, {"method": "tikhonov"}, patterns=name)(value)
-            ]
-        ), -1.0, 1.0)
-        for claim in range(4)
-    ),
-    ("regularisation", 4, lambda value: [
-        {**row, "psnr_db": 20.0, "psnr_best_db": 20.0, "peak_mib": 1.0}
-        for name in ("uniform", "dots:7")
-        for row in gain("seconds", {"method": "tikhonov"}, {"method": "tv"}, patterns=name)(value)
-    ], -math.inf, 0.0),
     ("multishot", 4, frames("shifting dots", "SweepCam"), 0.5, math.inf),
     ("multishot", 5, frames("SweepCam", "uniform frames"), 0.5, math.inf),
     ("resolution", 0, bars(
@@ -261,8 +246,7 @@ BORDERS = [
     ("ambient", 0, lambda value: lamps(1.0, 0.5 + value), -math.inf, 0.0),
     ("ambient", 1, lamps, 0.0, math.inf),
     ("ambient", 2, lamps, -math.inf, 0.0),
-    ("separation", 0, lambda value: lit(corner=value, cookie_bag=9.0), 0.0, math.inf),
-    ("models", 0, fitted, -0.5, math.inf),
+    ("reflectivity", 2, lambda value: [*glossy(), *lit(corner=value, cookie_bag=9.0)], 0.0, math.inf),
     ("drift", 0, drifted, -drift_study.AGREE_DB, drift_study.AGREE_DB),
     ("waterfall", 0, lambda value: fallen(lost=value), -math.inf, 2.0),
     ("waterfall", 1, lambda value: fallen(gained=value), 0.0, math.inf),
@@ -286,7 +270,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
     0; the lower border of "comparable" left out; means of all images in place of pairs.)"""
 
     def verdict(value: float) -> str:
-        return find_experiment(study).claims(Results(Table(tuple(build(value)))))[claim].verdict
+        return find_experiment(study).judge(Results(build(value)))[claim].verdict
 
     aside = ASIDE / 10 if (study, claim) == ("exposure", 2) else ASIDE  # of a ratio near 1
     for border, inwards in ((low, aside), (high, -aside)):
@@ -299,7 +283,7 @@ def test_claims_are_decided_on_both_sides_of_each_border(
 def test_every_study_of_the_paper_is_held() -> None:
     from mitsim.studies import PAPER
 
-    assert {study for study, *_ in BORDERS} == set(PAPER) | {"models", "drift"}
+    assert {study for study, *_ in BORDERS} == set(PAPER) | {"drift"}
 
 
 def test_an_interval_decides_where_no_border_lies_in_it() -> None:
@@ -315,11 +299,11 @@ def test_pairs_are_of_prints_or_of_seeds_of_one_print() -> None:
     one = [{"picture": name, "seed": seed, "x": value} for name, seed, value in
            (("a", 0, 10.0), ("a", 1, 12.0), ("b", 0, 20.0), ("b", 1, 22.0))]  # fmt: skip
     other = [{**row, "x": float(row["x"]) - 1.0 - (row["picture"] == "b")} for row in one]
-    assert sample_mean(Table(tuple(one)), "x") == Mean(16.0, pytest.approx(5.0), 2)
-    assert difference(Table(tuple(one)), Table(tuple(other)), "x") == Mean(1.5, pytest.approx(0.5), 2)
-    assert sample_mean(Table(tuple(one[:2])), "x") == Mean(11.0, pytest.approx(1.0), 2)
+    assert mean_of(Results(one).frame, "x") == Mean(16.0, pytest.approx(5.0), 2)
+    assert mean_of(Results(one).frame, "x", Results(other).frame) == Mean(1.5, pytest.approx(0.5), 2)
+    assert mean_of(Results(one[:2]).frame, "x") == Mean(11.0, pytest.approx(1.0), 2)
     with pytest.raises(MitsimError, match="nothing was measured of x"):
-        difference(Table(tuple(one[:2])), Table(tuple(other[2:])), "x")
+        mean_of(Results(one[:2]).frame, "x", Results(other[2:]).frame)
 
 
 def test_a_claim_of_parts_and_of_places() -> None:

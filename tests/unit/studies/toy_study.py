@@ -3,13 +3,15 @@
 import os
 import signal
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
+from mitsim.studies.framework.claims import Judged, mean_of
+from mitsim.studies.framework.experiment import Found, Point, Scope, Study
+from mitsim.studies.framework.panels import Lines
 
 
 def points(scope: Scope) -> Sequence[Point]:
@@ -33,16 +35,17 @@ def measure(_: object, point: Point) -> Found:
     return Found(({"place": place, "number": number, "square": square},), {f"{place}{number}": np.full((2, 2), square)})
 
 
-def claims(results: Results) -> Sequence[Claim]:
-    mean = results.table.mean("square", number=2)
-    return [Claim("Two squared is four", "4", "4", f"{mean}", "confirmed" if abs(mean.value - 4) < 0.1 else "wrong")]
+def at_four(rows: object) -> tuple[str, bool]:
+    mean = mean_of(rows, "square")  # type: ignore[arg-type]
+    return f"{mean}", abs(mean.value - 4) < 0.1
 
 
-def figures(results: Results) -> Mapping[str, object]:
-    from mitsim.report.plots import curves  # not in the processes that measure: it takes a second
-
-    by_number = results.table.means("square", "number")
-    return {"squares.png": curves({"all": {"square": by_number}}, "number [1]", "square [1]")}
-
-
-EXPERIMENT = Experiment("toy", "Squares", "How large are squares?", points, measure, claims, figures)
+STUDY = Study(
+    "toy",
+    "Squares",
+    "How large are squares?",
+    points=points,
+    measure=measure,
+    claims=(Judged("Two squared is four", at_four, paper="4", where={"number": 2}),),
+    panels=(Lines("number", "number [1]", file="squares", y="square", y_label="square [1]", colour="", facet=""),),
+)

@@ -1,6 +1,6 @@
-"""Studies of what light does in the scene: gloss, and light over several surfaces.
+"""What light does in the scene: gloss by its causes, and direct light apart from light over several surfaces.
 
-*reflectivity*, supplement of the paper: gift card, metal blade, compact disc, then roughness from 1 to a mirror on a
+*Gloss*, supplement of the paper: gift card, metal blade, compact disc, then roughness from 1 to a mirror on a
 plate, to 0.03 on a ball. Gift card and metal blade come out quite good, the disc with severe artefacts. Every scene has
 a twin of matt paint (``finish=matt``), whose reflectance is the Lambertian truth; the image's error against it is split
 by cause. At one lambda an image R(Y) is linear in the frames Y, so its error against the reflectance L of the matt twin
@@ -15,24 +15,26 @@ sensor,
 
 Y_even is the twin's light, that of each projector pixel times t / L: as bright, from the same places, but matt.
 
-*separation*: direct from global light by the dots themselves, and what it gains over images that take all light for
-direct. Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with a lens; here
-:mod:`mitsim.reconstruct.convolution` does it, in scenes whose light over several surfaces is known. Depth hides most of
-it, so every scene is shown twice: as it is, and with direct light as the calibrated factors have it at any depth, as if
-depth were mended.
+*Global light*: dots separate direct from global light, which improves on images that take all light for direct. Nayar,
+Krishnan, Grossberg and Raskar (2006) need a camera with a lens; here :mod:`mitsim.reconstruct.convolution` separates
+them, in scenes whose light over several surfaces is known. Depth hides most of the gain, so every scene is shown twice:
+as it is, and with direct light as the calibrated factors have it at any depth, as if depth were mended.
+
+A scene of the user's own is measured for gloss if it has a parameter ``finish``, for global light otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import sparse
 from scipy.interpolate import RegularGridInterpolator
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import Shot
@@ -44,15 +46,17 @@ from mitsim.reconstruct.background import separate
 from mitsim.reconstruct.focus import FactorOfDepths, parallax_of
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
-from mitsim.report import EQUAL_PEAK, RENDERED, label
+from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
-from mitsim.report.pages import Mean, Table, Value
-from mitsim.report.plots import curves, image_grid
+from mitsim.report.pages import Value
 from mitsim.sensor.moments import frame_moments
-from mitsim.studies.framework import claims
-from mitsim.studies.framework.claims import Holds
-from mitsim.studies.framework.experiment import Claim, Experiment, Found, Point, Results, Scope
-from mitsim.studies.framework.studio import Studio, flags_of
+from mitsim.studies.framework.claims import Holds, Judged, Level, choose_rows, distinct, every, mean_of, within
+from mitsim.studies.framework.experiment import Found, Point, Scope, Study
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Studio, flags_of, single_precision
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 # -------- Light of a glossy scene and of its matt twin in
 
@@ -172,7 +176,8 @@ EXPOSURES = (EQUAL_PEAK, AS_MATT)
 _ACCURACY = 3e-3
 """Of the light: a tenth of the artefacts that matter, and of global light, in a third of the time of 1e-3."""
 _TRUTHS = ("matt paint", "apparent")
-_GREY = 0.5  # of no error
+_GREY = 0.5
+"""Grey of an error of 0, as images of errors are kept."""
 _ROUNDING = 1e-12
 """Mean square of an error that is rounding: factors of a condition of 1e7 leave 1e-28 to 1e-14 of the image's."""
 _PLAIN_DB = 20.0
@@ -183,29 +188,43 @@ _NAMES = {
     PIXELS: "gloss over pixels", SENSOR: "gloss over sensor", INTERREFLECTION: INTERREFLECTION,
     SATURATION: SATURATION, REST: "rest",
 }  # fmt: skip
-_DRAWN = ("dots:7", EQUAL_PEAK)
-"""Patterns and exposure of the causes that are shown as images."""
+_DRAWN = {"patterns": "dots:7", "exposure": EQUAL_PEAK}
+"""Rows whose causes are shown as images."""
+GLOSS, GLOBAL_LIGHT = PARTS = ("gloss", "global light")
 
 
-def _reflectivity_points(scope: Scope) -> Sequence[Point]:
+def _points(scope: Scope) -> list[Point]:
     base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
     if scope.pictures == (None,):
-        return [Point.of(base, subject=base.scene, seed=seed) for seed in scope.repeats]
-    setups = {name: [replace(base, scene=name)] for name in scope.choose(SHIPPED, (CARD, DISC))}
-    for name, shape in () if scope.quick else SHAPES.items():
-        setups[name] = [
-            replace(base, scene="highlight").with_parameters(roughness=each, **shape)
-            for each in ROUGHNESSES[: _COUNTS[name]]
-        ]
-    return [
-        Point.of(setup, subject=name, seed=seed)
-        for name, each in setups.items()
+        glossy = 'name="finish"' in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace")
+        gloss, bounced = ({base.scene: [base]}, []) if glossy else ({}, [base])
+    else:
+        gloss = {name: [replace(base, scene=name)] for name in scope.choose(SHIPPED, (CARD, DISC))}
+        for name, shape in () if scope.quick else SHAPES.items():
+            gloss[name] = [
+                replace(base, scene="highlight").with_parameters(roughness=each, **shape)
+                for each in ROUGHNESSES[: _COUNTS[name]]
+            ]
+        bounced = [replace(base, scene=name) for name in scope.choose(SCENES, SCENES[:1])]
+    found = [
+        Point.of(setup, part=GLOSS, subject=name, seed=seed)
+        for name, each in gloss.items()
         for setup in each
         for seed in scope.repeats
     ]
+    return found + [
+        Point.of(setup, part=GLOBAL_LIGHT, subject=setup.scene, patterns=family, seed=seed)
+        for setup in bounced
+        for seed in scope.repeats
+        for family in scope.choose(DOTS, DOTS[1:2])
+    ]
 
 
-def _reflectivity_measure(studio: Studio, point: Point) -> Found:
+def _measure(studio: Studio, point: Point) -> Found:
+    return _measure_gloss(studio, point) if point["part"] == GLOSS else _measure_global(studio, point)
+
+
+def _measure_gloss(studio: Studio, point: Point) -> Found:
     seed = int(point["seed"])
     factors = studio.factors(point.setup, seed)
     twin = studio.lit_scene(point.setup.with_parameters(finish="matt"))
@@ -222,120 +241,28 @@ def _reflectivity_measure(studio: Studio, point: Point) -> Found:
             measured |= flags_of(found.solution.status)
             measured |= {f"{cause}_db": _decibels(part) for cause, part in found.parts.items()}
             added = np.sum([found.parts[cause] for cause in (SENSOR, INTERREFLECTION, SATURATION)], axis=0)
-            rows.append(
-                point.row(
-                    patterns=name, exposure=exposure, exposure_s=seconds, artefacts_db=_decibels(added), **measured
-                )
-            )
-            images[f"{label(name)}, {exposure}"] = image
-            if (name, exposure) == _DRAWN:
-                images |= found.parts
-    return Found(tuple(rows), claims.single_precision(images))
+            own: dict[str, Value] = {"patterns": name, "exposure": exposure, "exposure_s": seconds}
+            rows.append(point.row(**own, artefacts_db=_decibels(added), **measured))
+            images[_KEPT_AS.format(**own)] = image
+            if own | _DRAWN == own:
+                images |= {cause: part + _GREY for cause, part in found.parts.items()}
+    return Found(tuple(rows), single_precision(images))
 
 
 def _decibels(error: FloatArray) -> float | None:
-    """PSNR of an image that has this ``error`` alone; None where there is none."""
+    """Return the PSNR of an image that has this ``error`` alone; None where there is none."""
     power = float(np.square(error).mean())
     return -10 * float(np.log10(power)) if power > _ROUNDING else None
 
 
-def _reflectivity_claims(results: Results) -> Sequence[Claim]:
-    table = results.table.where(patterns="dots:7")
-    there = [name for name in SHIPPED if name in table.distinct("subject")]
-    if not {CARD, DISC} <= set(there):
-        return []
-    found = {exposure: {name: table.where(subject=name, exposure=exposure) for name in there} for exposure in EXPOSURES}
-    texts = [
-        f"{exposure}: {', '.join(f'{name} {_artefacts(rows)} dB' for name, rows in by_name.items())}".replace("_", " ")
-        for exposure, by_name in found.items()
-    ]
-
-    def claim(text: str, paper: str, holds: Callable[[Mapping[str, Table]], Holds]) -> Claim:
-        decided = claims.verdict_at({exposure: holds(by_name) for exposure, by_name in found.items()})
-        return Claim(f"{text} (artefacts of gloss, 49 dots)", paper, "", "; ".join(texts), decided)
-
-    def well(by_name: Mapping[str, Table]) -> Holds:
-        others = (rows for name, rows in by_name.items() if name != DISC)
-        return claims.every(*(claims.within(_artefacts(rows), low=_PLAIN_DB) for rows in others))
-
-    def worst(by_name: Mapping[str, Table]) -> Holds:
-        disc = by_name[DISC]
-        more = (claims.difference(disc, rows, _ARTEFACTS) for name, rows in by_name.items() if name != DISC)
-        plainly = claims.within(_artefacts(disc), high=_PLAIN_DB)
-        return claims.every(plainly, *(claims.within(each, high=0) for each in more))
-
-    plain = " and ".join(name.replace("_", " ") for name in there if name != DISC)  # a quick study has no blade
-    return [
-        claim(f"{plain.capitalize()} come{'s' * (len(there) == 2)} out well", "quite good", well),
-        claim("The compact disc is the worst, with severe artefacts", "severe artefacts", worst),
-    ]
-
-
-def _artefacts(rows: Table) -> Mean:
-    return claims.sample_mean(rows, _ARTEFACTS)
-
-
-def _reflectivity_figures(results: Results) -> Mapping[str, Figure]:
-    table, drawn = results.table.where(patterns=_DRAWN[0]), {}
-    peak = table.where(exposure=_DRAWN[1], seed=table.distinct("seed")[0])
-    swept = [name for name in SHAPES if name in table.distinct("subject")]
-    if swept:
-        for exposure in EXPOSURES:
-            panels = {f"{name}, {exposure}": _curves(table.where(subject=name, exposure=exposure)) for name in swept}
-            drawn[f"causes_{exposure.replace(' ', '_')}.png"] = curves(
-                panels, "roughness, alpha of GGX [1]", "PSNR against matt paint [dB]", log=True
-            )
-        name = f"{label(_DRAWN[0])}, {_DRAWN[1]}"
-        for subject in swept:
-            found = peak.where(subject=subject).rows
-            images = [_caption(results, row, name, "psnr_db") for row in found]
-            columns = [f"alpha {row['roughness']}" for row in found]
-            drawn[f"images_{subject}.png"] = image_grid({subject: images}, columns, f"By roughness, {name}")
-    rows = [row for row in peak.rows if row["subject"] not in swept]
-    names = [str(row["subject"]).replace("_", " ") for row in rows]
-    shown = [_gloss_images(results, row, results.table) for row in rows]
-    titles = [*_TRUTHS, *(f"{label(name)}\n{exposure}" for exposure in EXPOSURES for name in GLOSS_FAMILIES)]
-    drawn["images_shipped.png"] = image_grid(dict(zip(names, shown, strict=True)), titles, "Truths and images")
-    causes = [[_caption(results, row, cause, f"{cause}_db") for cause in ERROR_SOURCES] for row in rows]
-    title = f"Errors against matt paint by cause, {label(_DRAWN[0])}, {_DRAWN[1]}: grey is no error"
-    drawn["causes_shipped.png"] = image_grid(dict(zip(names, causes, strict=True)), list(_NAMES.values()), title)
-    return drawn
-
-
-def _curves(rows: Table) -> dict[str, dict[Value, Mean]]:
-    columns = {"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}}
-    return {name: rows.means(column, "roughness") for column, name in columns.items()}
-
-
-def _gloss_images(results: Results, row: Mapping[str, Value], table: Table) -> list[tuple[FloatArray, str]]:
-    """Both truths of the point of a ``row``, and its images by exposure and patterns."""
-    truths = [_caption(results, row, name) for name in _TRUTHS]
-    cases = [(exposure, name) for exposure in EXPOSURES for name in GLOSS_FAMILIES]
-    each = (table.where(point=row["point"], exposure=exposure, patterns=name).rows[0] for exposure, name in cases)
-    shown = (_caption(results, row, f"{label(str(row['patterns']))}, {row['exposure']}", "psnr_db") for row in each)
-    return [*truths, *shown]
-
-
-def _caption(results: Results, row: Mapping[str, Value], name: str, column: str = "") -> tuple[FloatArray, str]:
-    """The array ``name`` of a ``row`` with its ``column`` for a caption; errors on grey."""
-    image, level = results.array(row, name), row.get(column)
-    if image is None:
-        raise MitsimError(f"study reflectivity: no {name} was kept of {row['subject']}; measure it again")
-    return image + (_GREY if name in ERROR_SOURCES else 0.0), "" if level is None else f"{level:.1f} dB"
-
-
-REFLECTIVITY = Experiment(
-    "reflectivity",
-    "Gloss",
-    "What do shiny surfaces do to the image, and by which cause?",
-    _reflectivity_points, _reflectivity_measure, _reflectivity_claims, _reflectivity_figures,
-    heads=("Paper", "", "Rendered"),
-    note="Each scene has a twin of matt paint, the truth that errors are taken against; apparent is what the glossy "
-    "scene shows, its mean over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as "
-    "the twin, so that highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. "
-    "Gloss over pixels: brightness that is not the matt one; gloss over sensor: light of a projector pixel that "
-    "changes over the sensor.",
-)  # fmt: skip
+def _is_worst(rows: DataFrame) -> tuple[str, Holds]:
+    """Judge whether the disc has plain artefacts, and more than each other subject."""
+    by_name = {name: choose_rows(rows, {"subject": name}) for name in distinct(rows, "subject")}
+    levels = {name: mean_of(own, _ARTEFACTS) for name, own in by_name.items()}
+    text = ", ".join(f"{name} {level} dB" for name, level in levels.items()).replace("_", " ")
+    disc = by_name.pop(DISC)
+    more = (within(mean_of(disc, _ARTEFACTS, own), high=0) for own in by_name.values())
+    return text, every(within(levels[DISC], high=_PLAIN_DB), *more)
 
 
 # -------- Direct and global light
@@ -353,23 +280,13 @@ Measured = list[tuple[Shot, FloatArray]]
 """Frames [electrons/s] with their shots."""
 
 
-def _separation_points(scope: Scope) -> Sequence[Point]:
-    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
-    own = scope.pictures == (None,)
-    setups = [base] if own else [replace(base, scene=name) for name in scope.choose(SCENES, SCENES[:1])]
-    return [
-        Point.of(setup, subject=setup.scene, patterns=family, seed=seed)
-        for setup in setups
-        for seed in scope.repeats
-        for family in scope.choose(DOTS, DOTS[1:2])
-    ]
-
-
-def _separation_measure(studio: Studio, point: Point) -> Found:
+def _measure_global(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, RENDERED, str(point["patterns"]), int(point["seed"]))
     lit = frames.lit
     if not lit.light.simulation.physics.interreflection:
-        raise MitsimError(f"study separation: light over several surfaces is not worth following in {point['subject']}")
+        raise MitsimError(
+            f"study reflectivity: light over several surfaces is not worth following in {point['subject']}"
+        )
     parallax = parallax_of(studio.factors(point.setup, int(point["seed"])))
     margin = _MARGIN * max(frames.family.left.shape[1], frames.family.right.shape[1])
     left, right = (FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides))
@@ -385,7 +302,7 @@ def _separation_measure(studio: Studio, point: Point) -> Found:
         gain = levels[f"{SEPARATED}_db"] - levels[f"{_ALL}_db"]
         rows.append(point.row(depth=depth, gain_db=gain, told=reported, **levels))
         arrays |= {f"{depth} {name}": image for name, image in images.items()}
-    return Found(tuple(rows), claims.single_precision(arrays))
+    return Found(tuple(rows), single_precision(arrays))
 
 
 def _separate_images(
@@ -453,53 +370,112 @@ def global_truth(light: SampledLight) -> FloatArray:
     return np.asarray(seen * area / light.apparent.board_flux.reshape(bench.n, bench.n))
 
 
-def _separation_claims(results: Results) -> Sequence[Claim]:
-    table = results.table
+# -------- The study
 
-    def claim(depth: str) -> Claim:
-        rows = table.where(depth=depth)
-        gains = {
-            name: claims.sample_mean(rows.where(subject=name, patterns="dots:7"), "gain_db")
-            for name in table.distinct("subject")
-        }
-        reported = ", ".join(f"{name.replace('_', ' ')} {gain} dB" for name, gain in gains.items())
-        gained = claims.every(*(claims.within(gain, low=0) for gain in gains.values()))
-        text = f"49 dots tell global light apart in scenes {_DEPTHS[depth]}, and the image gains (Nayar et al. 2006)"
-        return Claim(text, "", "", reported, claims.verdict(gained))
+_LIGHT = {
+    "direct, true": ("direct, true", ""),
+    **{f"{{depth}} {name}": (name, f"{{{name}_db:.1f}} dB") for name in IMAGES[:-1]},
+    "global, true": ("global, true", ""),
+    f"{{depth}} {GLOBAL}": (GLOBAL, f"{{{GLOBAL}_db:.1f}} dB"),
+}
+"""Titles and captions of the arrays of a scene with global light, from left to right."""
 
-    return [claim(depth) for depth in table.distinct("depth")]
+_GLOSS_OF_DOTS = {"part": GLOSS, "patterns": "dots:7"}
+_SWEPT, _NOT_SWEPT = (
+    {**_GLOSS_OF_DOTS, "subject": tuple(SHAPES)},
+    {"part": GLOSS, "subject": lambda name: name not in SHAPES},
+)
+_KEPT_AS = "{patterns}, {exposure}"
+"""Names of the images of gloss."""
 
-
-def _separation_figures(results: Results) -> Mapping[str, Figure]:
-    drawn = {}
-    table = results.table.where(patterns="dots:7")
-    for depth in table.distinct("depth"):
-        grid = {}
-        for row in table.where(depth=depth).rows:
-            truths = [(results.array(row, name), None) for name in ("direct, true", "global, true")]
-            images = [(results.array(row, f"{depth} {name}"), row[f"{name}_db"]) for name in IMAGES]
-            shown = [truths[0], *images[:-1], truths[1], images[-1]]
-            grid[str(row["subject"]).replace("_", " ")] = [
-                (image, "" if level is None else f"{level:.1f} dB") for image, level in shown if image is not None
-            ]
-        drawn[f"images_{depth.replace(' ', '_')}.png"] = image_grid(
-            grid, ["direct, true", *IMAGES[:-1], "global, true", GLOBAL], f"Scenes {_DEPTHS[depth]}, 49 dots"
-        )
-    return drawn
-
-
-SEPARATION = Experiment(
-    "separation",
-    "Direct and global light",
-    "What do dots tell of light that came over several surfaces, and what does the image gain?",
-    _separation_points, _separation_measure, _separation_claims, _separation_figures,
-    about="Global light came over several surfaces, direct light over one. Images of frames under dots, exposed at "
-    "equal peak: of all light taken for direct; of what is left once global light is told apart (Nayar et al. 2006, "
-    "without a lens); of direct light alone, as if there were no other, which is the best that telling apart can do; "
-    "and the global light itself. Twice: of scenes as they are, whose depth the solver does not know, and with "
-    "direct light as the calibration has it at any depth. PSNR below each, against the true direct or global light.",
-    heads=("", "", "Gain in PSNR"),
-)  # fmt: skip
-
-
-EXPERIMENTS = {each.name: each for each in (REFLECTIVITY, SEPARATION)}
+STUDY = Study(
+    "reflectivity",
+    "Gloss and global light",
+    "What do shiny surfaces and light over several surfaces do to the image, and what do dots tell of it?",
+    points=_points,
+    measure=_measure,
+    claims=(
+        Level(
+            "Gift card and metal blade come out well (artefacts of gloss, 49 dots)",
+            where={**_GLOSS_OF_DOTS, "subject": [name for name in SHIPPED if name != DISC]},
+            every="subject",
+            column=_ARTEFACTS,
+            paper="quite good",
+            at_least=_PLAIN_DB,
+            optional=True,
+        ),
+        Judged(
+            "The compact disc is the worst, with severe artefacts (artefacts of gloss, 49 dots)",
+            _is_worst,
+            where={**_GLOSS_OF_DOTS, "subject": SHIPPED},
+            paper="severe artefacts",
+            optional=True,
+        ),
+        *(
+            Level(
+                f"49 dots tell global light apart in scenes {words}, and the image gains (Nayar et al. 2006)",
+                where={"part": GLOBAL_LIGHT, "patterns": "dots:7", "depth": depth},
+                every="subject",
+                column="gain_db",
+                at_least=0.0,
+                optional=True,
+            )
+            for depth, words in _DEPTHS.items()
+        ),
+    ),
+    panels=(
+        Lines(
+            "roughness",
+            "roughness, alpha of GGX [1]",
+            file="causes",
+            y_label="PSNR against matt paint [dB]",
+            where=_SWEPT,
+            each="exposure",
+            colour={"psnr_matt_db": "image", **{f"{cause}_db": f"{name} alone" for cause, name in _NAMES.items()}},
+            facet="subject",
+            log=True,
+        ),
+        Images(
+            "roughness",
+            title="By roughness, 49 dots, equal peak",
+            where=_SWEPT | _DRAWN,
+            each="subject",
+            down=("subject",),
+            array=_KEPT_AS,
+            names="alpha {}",
+        ),
+        Images(
+            ("patterns", "exposure"),
+            file="images_shipped",
+            where=_NOT_SWEPT,
+            down=("subject",),
+            array=_KEPT_AS,
+            before={name: name for name in _TRUTHS},
+        ),
+        Images(
+            {cause: (name, f"{{{cause}_db:.1f}} dB") for cause, name in _NAMES.items()},
+            file="causes_shipped",
+            title="Errors against matt paint by cause, 49 dots, equal peak: grey is no error",
+            where=_NOT_SWEPT | _DRAWN,
+            down=("subject",),
+        ),
+        Images(
+            _LIGHT,
+            title="49 dots, scenes",
+            where={"part": GLOBAL_LIGHT, "patterns": "dots:7"},
+            each="depth",
+            down=("subject",),
+            names=_DEPTHS,
+        ),
+    ),
+    heads=("Paper", "", "Rendered"),
+    note="Each scene with gloss has a twin of matt paint, the truth that errors are taken against; apparent is what "
+    "the glossy scene shows, its mean over the sensor, the truth of the images' decibels. As the matt scene: "
+    "exposed as long as the twin, so that highlights saturate. Decibels of a cause are the PSNR that its errors "
+    "alone would leave. Gloss over pixels: brightness that is not the matt one; gloss over sensor: light of a "
+    "projector pixel that changes over the sensor. Global light came over several surfaces, direct light over "
+    "one. Its images, exposed at equal peak: of all light taken for direct; of what is left once global light "
+    "is told apart (Nayar et al. 2006, without a lens); of direct light alone, which is the best that telling "
+    "apart can do; and the global light itself. Twice: of scenes as they are, whose depth the solver does not "
+    "know, and with direct light as the calibration has it at any depth.",
+)

@@ -1,0 +1,346 @@
+"""Figures of a study: declared as lines, bars or images over columns of the table, and drawn by one plotter.
+
+A panel names the columns along its axes; every other column that varies is averaged over. All means and standard errors
+come from :func:`mitsim.studies.framework.claims.mean_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from itertools import pairwise, product
+from string import Formatter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.devices.patterns import FAMILIES
+from mitsim.report import label
+from mitsim.report.pages import Mean
+from mitsim.studies.framework.claims import Where, choose_rows, distinct, mean_of, measured, value_name
+from mitsim.studies.framework.experiment import IMAGE, TRUTH, Results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+Columns = str | Sequence[str] | Mapping[str, str]
+"""A column whose values are told apart, several whose combinations are, or names by column whose numbers are shown
+beside each other."""
+Names = Mapping[Any, str] | str
+"""Names by value, or by (column, value); or a template for numbers such as "{} mm"."""
+PSNR = "PSNR [dB]"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A figure of a study.
+
+    Attributes
+    ----------
+    file, title
+        name of the file without its ending, by default that of the measure or images, and what stands above.
+    where
+        rows that are shown.
+    each
+        column: there is a figure for each of its values, which file and title end with.
+    names
+        names of values in the legend, beside rows and above columns.
+    errors
+        columns of errors that all rows share, by the column of numbers that they belong to.
+    """
+
+    _: KW_ONLY
+    file: str = ""
+    title: str = ""
+    where: Where = field(default_factory=dict)
+    each: str = ""
+    names: Names = field(default_factory=dict)
+    errors: Mapping[str, str] = field(default_factory=dict)
+
+    def draw(self, results: Results) -> dict[str, Figure]:
+        """Return the figures by file name; a panel without rows has none."""
+        rows = choose_rows(results.frame, self.where)
+        drawn: dict[str, Figure | None] = {}
+        for value in distinct(rows, self.each) if self.each else [""]:
+            shown = f"exposure {value}" if self.each == "exposure" else self.name(self.each, value)
+            one = replace(self, title=", ".join(filter(None, (self.title, shown))))
+            name = (
+                "_".join(filter(None, (self.file or self.default_file, str(value)))).replace(" ", "_").replace(":", "")
+            )
+            own = choose_rows(rows, {self.each: value} if self.each else {})
+            drawn[f"{name}.png"] = one.figure(results, own)
+        return {name: figure for name, figure in drawn.items() if figure is not None}
+
+    @property
+    def default_file(self) -> str:
+        """Name of the file of a panel that states none."""
+        return "images"
+
+    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        """Return one figure of some ``rows``; None if they have nothing to show."""
+        raise NotImplementedError
+
+    def name(self, column: str, value: Any) -> str:
+        """Return the name of a ``value`` of a ``column``."""
+        if isinstance(self.names, str) and _is_number(value):
+            return self.names.format(f"{float(value):g}")
+        for key in ((column, value), value):
+            if not isinstance(self.names, str) and key in self.names:
+                return self.names[key]
+        if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
+            return label(str(value))
+        if value is None:
+            return "scene" if column == "picture" else ""
+        return value_name(column, value)
+
+    def combinations(self, rows: DataFrame, by: Columns) -> list[dict[str, Any]]:
+        """Return the combinations of the values of some columns that ``rows`` have, in the order of the table."""
+        columns = [by] if isinstance(by, str) else list(by)
+        values = [[*distinct(rows, each), *([None] if _lacks(rows, each) else [])] for each in columns]
+        found = [dict(zip(columns, chosen, strict=True)) for chosen in product(*values)]
+        return [each for each in found if len(choose_rows(rows, each))]
+
+    def parts(self, rows: DataFrame, by: Columns) -> dict[str, tuple[DataFrame, str]]:
+        """Return rows, and the column that is shown instead of the panel's own, by the name of each part of ``by``."""
+        if isinstance(by, Mapping):
+            return {name: (rows, column) for column, name in by.items() if column in rows}
+        chosen = self.combinations(rows, by) if by else [{}]
+        return {self.joined(each): (choose_rows(rows, each), "") for each in chosen}
+
+    def joined(self, values: Mapping[str, Any]) -> str:
+        """Return the names of some ``values`` by column, separated by commas."""
+        return ", ".join(filter(None, (self.name(*item) for item in values.items())))
+
+
+def _lacks(rows: DataFrame, column: str) -> bool:
+    return column not in rows or bool(rows[column].isna().any())
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(str(value))
+    except ValueError:
+        return False
+    return not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Lines(Panel):
+    """Means of a column over another with bars of one standard error, a curve for each colour, facets below each other.
+
+    Attributes
+    ----------
+    x, x_label, y, y_label
+        columns along the axes, and the axes' names with units.
+    colour, facet
+        columns of the curves and of the facets; a mapping shows several columns of numbers instead of ``y``.
+    shared
+        rows that begin every curve, such as the one uniform frame of several kinds of patterns.
+    log
+        True for a logarithmic x axis; an axis over decades is logarithmic anyway.
+    ticks
+        True for a tick at every x that was measured, as far as there is room.
+    """
+
+    x: str
+    x_label: str
+    _: KW_ONLY
+    y: str = "psnr_db"
+    y_label: str = PSNR
+    colour: Columns = "patterns"
+    facet: Columns = "model"
+    shared: Where | None = None
+    log: bool = False
+    ticks: bool = True
+
+    @property
+    def default_file(self) -> str:
+        """Name of the measure."""
+        return self.y.removesuffix("_db")
+
+    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        """Return the figure; None without rows."""
+        from mitsim.report.plots import curves
+
+        if rows.empty:
+            return None
+        first = None if self.shared is None else choose_rows(rows, self.shared)
+        shown: dict[str, dict[str, dict[float, Mean]]] = {}
+        for facet, (own, column) in self.parts(rows, self.facet).items():
+            begin = own[own.index.isin([] if first is None else first.index)]
+            shown[facet] = {
+                colour: self._means(begin, other or column or self.y) | self._means(line, other or column or self.y)
+                for colour, (line, other) in self.parts(own.drop(begin.index), self.colour).items()
+            }
+        return curves(shown, self.x_label, self.y_label, log=self.log, ticks=self.ticks, title=self.title)
+
+    def _means(self, rows: DataFrame, column: str) -> dict[float, Mean]:
+        from pandas import to_numeric
+
+        if column not in rows:
+            return {}
+        rows = rows[to_numeric(rows[column], errors="coerce").notna()]
+        return {
+            float(value): mean_of(choose_rows(rows, {self.x: value}), column, error_column=self.errors.get(column, ""))
+            for value in distinct(rows, self.x)
+        }
+
+
+@dataclass(frozen=True)
+class Bars(Panel):
+    """Means of a column as horizontal bars with one standard error, a group for each row, a bar for each colour.
+
+    Attributes
+    ----------
+    rows, colour
+        columns of the groups and of the bars in each; a mapping shows several columns of numbers instead of ``x``.
+    x, x_label
+        column, and the axis' name with unit.
+    ordered
+        True for the largest on top; False for the order of the table.
+    """
+
+    rows: Columns
+    _: KW_ONLY
+    colour: Columns = "model"
+    x: str = "psnr_db"
+    x_label: str = PSNR
+    ordered: bool = False
+
+    @property
+    def default_file(self) -> str:
+        """Name of the measure."""
+        return self.x.removesuffix("_db")
+
+    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        """Return the figure; None without rows."""
+        from mitsim.report.plots import grouped_bars
+
+        if rows.empty:
+            return None
+        groups: dict[str, dict[str, Mean]] = {}
+        for group, (own, column) in self.parts(rows, self.rows).items():
+            parts = (
+                (bar, line, other or column or self.x) for bar, (line, other) in self.parts(own, self.colour).items()
+            )
+            groups[group] = {
+                bar: mean_of(line, shown, error_column=self.errors.get(shown, ""))
+                for bar, line, shown in parts
+                if shown in line and line[shown].notna().any()
+            }
+        groups = {group: bars for group, bars in groups.items() if bars}
+        if self.ordered:
+            groups = dict(sorted(groups.items(), key=lambda item: -next(iter(item[1].values())).value))
+        return grouped_bars(groups, self.x_label, self.title) if groups else None
+
+
+_MOST_SHOWN = 6
+"""Images along either side of a grid: more would be too small to compare on a page."""
+
+
+@dataclass(frozen=True)
+class Images(Panel):
+    """A grid of images with their truths and a caption below each; rows with a missing image are left out.
+
+    Attributes
+    ----------
+    across
+        columns whose combinations are the grid's columns; or (title, caption) by the name of an array, for several
+        arrays of one point side by side.
+    columns
+        values of ``across`` in their order; None: all of the table.
+    down
+        columns whose combinations are the grid's rows.
+    array, before
+        template of the arrays' names, filled from their row, and titles by name of arrays that stand before the others.
+    caption
+        template of the text below an image, filled from its row.
+    """
+
+    across: str | Sequence[str] | Mapping[str, tuple[str, str]]
+    _: KW_ONLY
+    columns: Sequence[Any] | None = None
+    down: Sequence[str] = ("picture", "model")
+    array: str = IMAGE
+    before: Mapping[str, str] = field(default_factory=dict)
+    caption: str = "{psnr_db:.1f} dB"
+
+    def figure(self, results: Results, rows: DataFrame) -> Figure | None:
+        """Return the grid; None if no row of it has all images."""
+        kept = {key for key, _ in results.arrays}
+        rows = rows[rows["point"].isin(kept)] if "point" in rows else rows[:0]
+        shown: list[tuple[dict[str, Any], str, str]] = [({}, name, "") for name in self.before]
+        titles = list(self.before.values())
+        if isinstance(self.across, Mapping):
+            shown += [({}, name, caption) for name, (_, caption) in self.across.items()]
+            titles += [title for title, _ in self.across.values()]
+            count = len(titles)
+        else:
+            chosen = self.combinations(rows, self.across)
+            if self.columns is not None:
+                chosen = [{str(self.across): value} for value in self.columns]
+            shown += [(each, self.array, self.caption) for each in _few(chosen)]
+            titles += [self.joined(each) for each in _few(chosen)]
+            count = len(self.before) + len(chosen)
+        groups = {self.joined(each): choose_rows(rows, each) for each in self.combinations(rows, self.down)}
+        grid = {name: [cell for each in shown for cell in _cells(results, own, *each)] for name, own in groups.items()}
+        grid = {name: cells for name, cells in grid.items() if len(cells) == len(titles)}
+        if not grid:
+            return None
+        sides = {"columns": (len(titles), count), "rows": (min(len(grid), _MOST_SHOWN), len(grid))}
+        cut = ", ".join(f"{few} of {all_} {side}" for side, (few, all_) in sides.items() if few < all_)
+        title = f"{self.title}{f' ({cut})' if cut else ''}"
+        return grid_with_truths({name: grid[name] for name in _few(list(grid))}, titles, title)
+
+
+Cell = tuple[FloatArray, FloatArray | None, str]
+"""Image, truth where it was kept, and caption."""
+
+
+def _cells(results: Results, rows: DataFrame, where: Where, array: str, caption: str) -> list[Cell]:
+    """Return the first image of the ``rows`` that ``where`` chooses, if it was kept."""
+    for row in choose_rows(rows, where).to_dict("records"):
+        image = results.array(row, array.format(**row))
+        if image is not None:
+            known = all(measured(row.get(name)) for _, name, kind, _ in Formatter().parse(caption) if kind and name)
+            text = caption.format(**row) if known else ""
+            flag = "\nflagged" if caption and row.get("flagged") is True else ""
+            return [(image, results.array(row, TRUTH) if array == IMAGE else None, text + flag)]
+    return []
+
+
+def _few(items: Sequence[Any]) -> list[Any]:
+    """Return at most :data:`_MOST_SHOWN` of some ``items``, evenly spread, with both ends."""
+    count = min(len(items), _MOST_SHOWN)
+    return [items[int(place)] for place in np.linspace(0, len(items) - 1, count).round()]
+
+
+def grid_with_truths(grid: Mapping[str, Sequence[Cell]], titles: Sequence[str], title: str) -> Figure:
+    """Draw images with their truths: in a first column where each row has one truth, else in rows above the images.
+
+    Parameters
+    ----------
+    grid
+        cells by the rows' names.
+    titles, title
+        titles of the columns, and of the figure.
+    """
+    from mitsim.report.plots import image_grid
+
+    truths = {name: [truth for _, truth, _ in cells if truth is not None] for name, cells in grid.items()}
+    alone = {name: [(image, caption) for image, _, caption in cells] for name, cells in grid.items()}
+    if any(len(truths[name]) < len(cells) for name, cells in grid.items()):
+        return image_grid(alone, titles, title)
+    if all(np.array_equal(own[0], other) for own in truths.values() for other in own):
+        beside = {name: [(truths[name][0], ""), *cells] for name, cells in alone.items()}
+        return image_grid(beside, ["truth", *titles], title)
+    rows: dict[str, list[tuple[FloatArray, str]]] = {}
+    before: Sequence[FloatArray] = ()
+    several = any(not all(map(np.array_equal, one, other)) for one, other in pairwise(truths.values()))
+    for name, cells in alone.items():
+        if not before or not all(map(np.array_equal, before, truths[name])):
+            rows[f"truth, {name}" if name and several else "truth"] = [(truth, "") for truth in truths[name]]
+        rows[name or "image"], before = cells, truths[name]
+    return image_grid(rows, titles, title)

@@ -1,0 +1,197 @@
+"""The engine of studies: axes, rows that claims choose, means, declared claims and figures, on invented rows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.core.errors import MitsimError
+from mitsim.report.pages import Mean
+from mitsim.studies.framework.claims import Gain, Judged, Level, choose_rows, distinct, mean_of, measured
+from mitsim.studies.framework.experiment import IMAGE, TRUTH, Axes, Results, Scope, Setup
+from mitsim.studies.framework.panels import Bars, Images, Lines
+from mitsim.studies.framework.studio import flags_of
+
+Row = dict[str, Any]
+ROWS: list[Row] = [
+    {"patterns": name, "picture": picture, "seed": 0, "depth": depth, "psnr_db": level + offset + depth / 100}
+    for name, level in (("uniform", 20.0), ("dots:7", 30.0))
+    for depth in (390.0, 400.0)
+    for picture, offset in (("a", -5.0), ("b", 0.0), ("c", 5.2))
+]
+
+
+def test_axes_are_all_combinations_of_scene_and_values() -> None:
+    """Setups in a row, values of a quick study in place of all; combinations that are not kept are no points. (Planted:
+    the quick study's prints of a whole one; values that are not kept.)"""
+    axes = Axes(
+        {"patterns": ("uniform", "dots:7"), "model": ("idealised", "rendered")},
+        scene={"lamp": ("1", "2")},
+        quick={"lamp": ("1",), "patterns": ("dots:7",)},
+        quick_prints=1,
+        default="lamp_bench",
+        kept=lambda values: values["patterns"] == "dots:7" or values["model"] == "idealised",
+    )
+    whole, quick = (axes(Scope(Setup(), ("coins", "page"), quick=quick)) for quick in (False, True))
+    assert len(whole) == 2 * 2 * 3 and {point.key for point in quick} < {point.key for point in whole}
+    assert [(point["patterns"], point["model"]) for point in whole[:3]] == [
+        ("uniform", "idealised"), ("dots:7", "idealised"), ("dots:7", "rendered")
+    ]  # fmt: skip
+    assert len(quick) == 2 and {point.setup.picture for point in quick} == {"coins"}
+    assert {point.setup.scene for point in whole} == {"lamp_bench"}
+    assert {point.setup.scene for point in axes(Scope(Setup("mine.xml"), (None,)))} == {"mine.xml"}
+    assert {point["seed"] for point in replace(axes, repeats=True)(Scope(Setup(), ("page",), (4,)))} == {4, 5, 6}
+
+
+def test_rows_are_chosen_by_values_sets_and_functions() -> None:
+    """A column that is not there is None; a text is the patterns. (Planted: a missing column that fits any value.)"""
+    table = Results([*ROWS, {"patterns": None, "depth": math.nan}]).frame
+    assert len(choose_rows(table, "dots:7")) == 6
+    assert len(choose_rows(table, {"patterns": ("uniform", "dots:7"), "depth": 390.0})) == 6
+    assert len(choose_rows(table, {"depth": lambda depth: depth > 395})) == 6
+    assert len(choose_rows(table, {"psnr_db": measured})) == 12 and len(choose_rows(table, {"patterns": None})) == 1
+    assert len(choose_rows(table, {"focus": None})) == 13 and choose_rows(table, {"focus": "auto"}).empty
+    assert distinct(table, "depth") == [390.0, 400.0] and distinct(table, "focus") == []
+
+
+def test_means_are_of_prints_and_their_differences() -> None:
+    """Errors that all rows share are added in quadrature. (Planted: errors of rows in place of prints.)"""
+    table = Results([{**row, "shared": 3.0} for row in [*ROWS, *ROWS]]).frame
+    dots, uniform = choose_rows(table, {"patterns": "dots:7"}), choose_rows(table, {"patterns": "uniform"})
+    mean = mean_of(dots)
+    assert mean.of == 3 and mean.value == pytest.approx(34.0167, abs=1e-3)
+    assert mean.error == pytest.approx(np.std([-5.0, 0.0, 5.2], ddof=1) / 3**0.5)
+    gain = mean_of(dots, "psnr_db", uniform)
+    assert gain == Mean(pytest.approx(10.0), pytest.approx(0.0, abs=1e-9), 3)
+    assert mean_of(dots, error_column="shared").error == pytest.approx(math.hypot(mean.error, 3.0))
+    with pytest.raises(MitsimError, match="nothing was measured of ssim"):
+        mean_of(dots, "ssim")
+
+
+def test_claims_for_each_value_and_for_every_value() -> None:
+    """(Planted: the first of the values taken for every one.)"""
+    results = Results(
+        [
+            {**row, "psnr_db": row["psnr_db"] - 12 * (row["patterns"] == "dots:7" and row["depth"] == 400)}
+            for row in ROWS
+        ]
+    )
+    each = Gain("At {depth} mm dots are better", "dots:7", "uniform", each="depth").judge(results)
+    assert [(claim.claim, claim.verdict) for claim in each] == [
+        ("At 390 mm dots are better", "confirmed"), ("At 400 mm dots are better", "not confirmed")
+    ]  # fmt: skip
+    (every,) = Gain("Dots are better", "dots:7", "uniform", every="depth").judge(results)
+    assert every.verdict == "not confirmed" and every.idealised == "" and every.rendered.startswith("390: 34.0")
+    (level,) = Level("Images are good", where="uniform", at_least=10.0).judge(results)
+    assert level.verdict == "confirmed"
+
+
+def test_a_claim_without_rows_is_an_error_or_left_out() -> None:
+    """(Planted: left out in silence.)"""
+    claim = Level("Nobody measured this", where={"focus": "auto"})
+    with pytest.raises(MitsimError, match="nothing was measured of the claim 'Nobody measured this'"):
+        claim.judge(Results(ROWS))
+    assert replace(claim, optional=True).judge(Results(ROWS)) == []
+
+
+def test_a_claim_states_its_own_models_and_both_means_apart() -> None:
+    """(Planted: the paper's models for any other.)"""
+    rows = [
+        {**row, "psf": psf, "psnr_db": row["psnr_db"] + 60 * (psf == "traced")}
+        for row in ROWS
+        for psf in ("seen", "traced")
+    ]
+    models = ("psf", "seen", "traced")
+    (claim,) = Level("Bright", where="uniform", at_least=45.0, models=models).judge(Results(rows))
+    assert claim.verdict == "confirmed only traced"
+    pairs = [
+        {"picture": name, "lost_db": 1.0 + step, "told_db": 1.2 + step, "known": 0.4}
+        for name, step in (("a", 0), ("b", 1))
+    ]
+    apart = Gain(
+        "Told",
+        {},
+        {},
+        column="lost_db",
+        other_column="told_db",
+        other_error="known",
+        at_least=-1.0,
+        at_most=1.0,
+        apart=True,
+    )
+    (told,) = apart.judge(Results(pairs))
+    assert told.verdict == "confirmed"
+    assert told.idealised == "1.7 \N{PLUS-MINUS SIGN} 0.6 dB" and told.rendered == "1.5 \N{PLUS-MINUS SIGN} 0.5 dB"
+    (word,) = Judged("Own words", lambda rows: ("", "confirmed only here")).judge(Results(pairs))
+    assert word.verdict == "confirmed only here"
+
+
+def test_lines_have_a_figure_for_each_value_and_rows_that_begin_every_curve() -> None:
+    """(Planted: shared rows as a curve of their own.)"""
+    rows = [
+        {"kind": kind, "count": count, "exposure": exposure, "psnr_db": 20.0 + count, "ssim": 0.5}
+        for kind, count in (("uniform", 1), ("dots", 4), ("dots", 9), ("random", 9))
+        for exposure in ("equal peak", "equal frame")
+    ]
+    panel = Lines(
+        "count", "frames [1]", each="exposure", colour="kind", facet="", shared={"kind": "uniform"}, title="PSNR"
+    )
+    drawn = panel.draw(Results(rows))
+    assert set(drawn) == {"psnr_equal_peak.png", "psnr_equal_frame.png"}
+    figure = drawn["psnr_equal_peak.png"]
+    curves = {container.get_label(): container.lines[0].get_xdata().tolist() for container in figure.axes[0].containers}
+    assert curves == {"dots": [1, 4, 9], "random": [1, 9]} and figure.get_suptitle() == "PSNR, exposure equal peak"
+    both = Lines("count", "frames [1]", colour={"psnr_db": "image", "ssim": "likeness"}, facet="").draw(Results(rows))
+    assert {text.get_text() for text in both["psnr.png"].legends[0].get_texts()} == {"image", "likeness"}
+    assert Lines("count", "frames [1]", where={"kind": "none"}).draw(Results(rows)) == {}
+
+
+def test_bars_are_in_order_of_the_table_or_of_their_length() -> None:
+    rows = [
+        {"what": what, "model": model, "psnr_db": level}
+        for what, level in (("short", 10.0), ("long", 30.0))
+        for model in ("idealised", "rendered")
+    ]
+    for ordered, names in ((False, ["short", "long"]), (True, ["long", "short"])):
+        (figure,) = Bars("what", ordered=ordered).draw(Results(rows)).values()
+        axes = figure.axes[0]
+        assert [text.get_text() for text in axes.get_yticklabels()][::-1] == names
+        assert len(axes.patches) == 4 and axes.get_xlabel() == "PSNR [dB]"
+
+
+def test_images_of_several_arrays_stand_side_by_side() -> None:
+    """Of the first row of each group that kept them; a caption without its number is empty. (Planted: the number of
+    another row.)"""
+    rows = [
+        {"point": name, "subject": name, "way": "x", "psnr_db": 20.0, "lost_db": lost}
+        for name, lost in (("p", 1.0), ("q", None))
+    ]
+    arrays = {(name, array): np.full((2, 2), 0.5) for name in "pq" for array in ("truth", "x image", "error")}
+    panel = Images(
+        {"{way} image": ("image", "{psnr_db:.1f} dB"), "error": ("error", "{lost_db:.1f} dB")},
+        before={TRUTH: "truth"},
+        down=("subject",),
+    )
+    (figure,) = panel.draw(Results(rows, arrays)).values()
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["truth", "image", "error"]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["", "20.0 dB", "1.0 dB", "", "20.0 dB", ""]
+    kept = {("p", IMAGE): np.zeros((2, 2))}
+    assert Images("subject", columns=("p", "q"), down=("way",)).draw(Results(rows, kept)) == {}, (
+        "an image of q is missing"
+    )
+
+
+def test_flags_are_of_all_statuses_once() -> None:
+    """(Planted: reasons repeated.)"""
+    from mitsim.reconstruct.solution import Status, Verdict
+
+    good = next(verdict for verdict in Verdict if verdict.good)
+    status = Status(good, "solved", flags=("The frames are dim. Expose longer.",))
+    assert flags_of(status, status, others=("light is lost",)) == {
+        "flagged": True, "reason": "The frames are dim; light is lost"
+    }  # fmt: skip
+    assert flags_of(Status(good, "solved")) == {"flagged": False, "reason": ""}
