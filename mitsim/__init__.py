@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
-    from mitsim.report.folders import report_folder as report_folder
-    from mitsim.report.quality import reconstruct_colours as reconstruct_colours
+    from mitsim.report.folder_page import report_folder as report_folder
+    from mitsim.report.reconstruct_run import reconstruct_colours as reconstruct_colours
     from mitsim.sessions.repeat import session_of as session_of
     from mitsim.sessions.run_session import run as run
     from mitsim.verbs import characterise as characterise
@@ -96,8 +96,8 @@ _HOMES = {
         "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
-        "report.folders": "report_folder",
-        "report.quality": "reconstruct_colours",
+        "report.folder_page": "report_folder",
+        "report.reconstruct_run": "reconstruct_colours",
         "sessions.repeat": "session_of",
         "sessions.run_session": "run",
         "verbs": "characterise demo doctor scenes sense study",

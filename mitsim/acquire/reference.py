@@ -95,7 +95,7 @@ class Rendered:
         None, those of a new figure; returns them."""
         from mitsim.core.images import from_above
 
-        return from_above("report.result_plots", "draw_rendered")(self, ax)
+        return from_above("report.plots", "draw_rendered")(self, ax)
 
     def __repr__(self) -> str:
         rows, columns = self.mean.shape[:2]

@@ -92,7 +92,7 @@ class Sensed:
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the digital numbers with a colour bar, on matplotlib's axes ``ax`` or, where that is None, those of a
         new figure; returns them."""
-        return from_above("report.result_plots", "draw_sensed")(self, ax)
+        return from_above("report.plots", "draw_sensed")(self, ax)
 
     def __repr__(self) -> str:
         rows, columns = self.digital.shape

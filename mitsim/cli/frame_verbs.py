@@ -42,8 +42,7 @@ from mitsim.core.spectral_manifests import (
 from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
 
 if TYPE_CHECKING:
-    from mitsim.report.colour_image import JudgedColours
-    from mitsim.report.quality import Judged
+    from mitsim.report.reconstruct_run import ColourImage, Judged
 
 # ---- images of frames ------------------------------------------------------------------------------------------------
 
@@ -198,7 +197,7 @@ def reconstruct(
         check_parallax(manifest.parallax, str(calibration))
     check_output(output, overwrite=holds_image(output))
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct as reconstruct_folder
+    from mitsim.report.reconstruct_run import reconstruct as reconstruct_folder
 
     held = memory_from_here()
     with common.job() as job:
@@ -249,7 +248,7 @@ def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dic
     read_manifest(run, RunManifest)
     check_output(output, overwrite=holds_image(output))
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct_psf
+    from mitsim.report.reconstruct_run import reconstruct_psf
 
     held = memory_from_here()
     with common.job() as job:
@@ -303,7 +302,7 @@ def _reconstruct_colours(
     # What it holds is looked into later: an image of the same inputs may be replaced.
     check_output(output, overwrite=is_coloured(output))
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct_colours
+    from mitsim.report.reconstruct_run import reconstruct_colours
 
     held = memory_from_here()
     with common.job() as job:
@@ -315,7 +314,7 @@ def _reconstruct_colours(
 # ---- what is said of images, and words of options --------------------------------------------------------------------
 
 
-def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
+def _colours_lines(found: ColourImage, common: Common) -> list[str]:
     """What is said of an image in colour, as ``common`` options have it."""
     verdict = "Solved" if found.ok else "Flagged"
     quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
@@ -323,7 +322,7 @@ def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
         f"{verdict}: {quality}",
         f"Image: {found.output}",
         *(f"{name}: {row}" for name, row in found.table.items()),
-        *(f"{text[0].upper()}{text[1:]}" for text in found.colours.sentences),
+        *(f"{text[0].upper()}{text[1:]}" for text in found.sentences),
         *common.details(*found.described),
     ]
 

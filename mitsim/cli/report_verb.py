@@ -75,7 +75,7 @@ def finish_frame(
     """
 
     def make() -> dict[str, Any]:
-        from mitsim.report.folder_pictures import write_beside
+        from mitsim.report.pages import write_beside
 
         started = time.perf_counter()
         file, words = write_beside(*frame)
@@ -89,7 +89,7 @@ def finish_frame(
 def _page_of(folder: Path) -> dict[str, Any]:
     """The page of a ``folder`` and its pictures, for JSON."""
     started = time.perf_counter()
-    from mitsim.report.folders import report_folder
+    from mitsim.report.folder_page import report_folder
 
     page = report_folder(folder)
     pictures = sorted(map(str, (folder / PICTURES).glob("*.png")))

@@ -311,7 +311,7 @@ class Capture:
         MitsimError
             for a shot that there is not, and a quantity that is not known of a real camera.
         """
-        return from_above("report.result_plots", "draw_shot")(self, shot, quantity, ax)
+        return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
 
     def to_xarray(self) -> Dataset:
         """Frames, and where known expected electrons and truth, as an ``xarray.Dataset`` with units and coordinates;

@@ -7,6 +7,7 @@ folders hold what a perfect image of each would show.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -149,6 +150,59 @@ def is_coloured(folder: Path | str) -> bool:
 def is_mosaic(folder: Path | str) -> bool:
     """Whether ``folder`` has the colour.json of a run behind colour filters. MitsimError when it is no JSON."""
     return is_coloured(folder) and _kind(read_json(Path(folder) / COLOUR)) == MOSAIC
+
+
+@dataclass(frozen=True)
+class SpectralFolder:
+    """A run, calibration or image, and its spectral lines.
+
+    Attributes
+    ----------
+    folder
+        The folder.
+    colours
+        Content of its colour.json; None where the folder does not separate wavelengths.
+    """
+
+    folder: Path
+    colours: ColourManifest | None
+
+    @property
+    def filters(self) -> MosaicManifest | None:
+        """The colour filters that the frames were seen through."""
+        return self.colours if isinstance(self.colours, MosaicManifest) else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the lines; one empty name where wavelengths are not separated."""
+        return self.colours.names if self.colours else ("",)
+
+    @property
+    def parts(self) -> dict[str, Path]:
+        """Folders of frames or factors by line; behind filters, and without lines, the folder itself by ""."""
+        return {"": self.folder} if self.filters else {name: self.folder / name for name in self.names}
+
+    def check_calibration(self, calibration: Path) -> SpectralFolder:
+        """Return the ``calibration`` of this run; MitsimError where it has other lines than the run."""
+        if self.colours is not None:
+            check_lines(self.colours, str(self.folder), calibration)
+        elif is_coloured(calibration):
+            raise ArgumentError(
+                "calibration", f"{calibration}: is coloured, but {self.folder} is not; give a line's folder"
+            )
+        return open_lines(calibration, CALIBRATION)
+
+
+def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
+    """Return a folder of one of the ``kinds`` (:data:`KINDS`) with its spectral lines, if it separates wavelengths.
+
+    MitsimError for a colour.json of another kind, or one that breaks a rule.
+    """
+    if not is_coloured(folder):
+        return SpectralFolder(Path(folder), None)
+    data = read_json(Path(folder) / COLOUR)
+    kind = _kind(data)
+    return SpectralFolder(Path(folder), checked_colours(data, kind if kind in kinds else kinds[0], Path(folder)))
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:

@@ -371,7 +371,7 @@ class Plan:
         ax
             matplotlib's axes to draw on; None: those of a new figure.
         """
-        return from_above("report.result_plots", "draw_plan")(self, quantity, ax)
+        return from_above("report.plots", "draw_plan")(self, quantity, ax)
 
     def __repr__(self) -> str:
         states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")

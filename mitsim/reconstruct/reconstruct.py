@@ -224,7 +224,7 @@ class Reconstruction(Solution):
         MitsimError
             for an uncertainty or depths that are not known.
         """
-        return from_above("report.result_plots", "draw_image")(self, quantity, ax)
+        return from_above("report.plots", "draw_image")(self, quantity, ax)
 
     @check_arguments
     def to_xarray(self, factors: Factors | None = None) -> Dataset:

@@ -26,8 +26,17 @@ from mitsim.metrics import Quality
 from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report import plots
-from mitsim.report.pages import DASH, Mean, figure_uri, reflectance, render_page, sentence
-from mitsim.report.parts import PlanChart, stages_of, total_of
+from mitsim.report.pages import (
+    DASH,
+    Mean,
+    PlanChart,
+    figure_uri,
+    reflectance,
+    render_page,
+    sentence,
+    stages_of,
+    total_of,
+)
 from mitsim.report.plots import FONT, WIDTH, figure_of, panels_of
 
 _PATTERN_CORNER = 40

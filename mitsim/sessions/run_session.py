@@ -265,7 +265,7 @@ def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
         steps.end(step)
         found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
     if pictures and step.verb in FOLDERS and not (found.left_alone and (place / PAGE).is_file()):
-        from mitsim.report.folders import report_folder
+        from mitsim.report.folder_page import report_folder
 
         report_folder(place)
     pages = [place / PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
@@ -591,14 +591,14 @@ class _Steps:
             chart = load_chart(values["chart"])
 
         def work() -> Said:
-            from mitsim.report import quality
+            from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 
             job = self.job.apart(f"{step.output} ")
             if coloured:
-                colours = quality.reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
+                colours = reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
                 known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
                 return f"an image of every line{known}", colours.warnings
-            judged = quality.reconstruct(run, calibration, place, job=job, **options)
+            judged = reconstruct(run, calibration, place, job=job, **options)
             image = judged.reconstruction
             return str(judged.quality or f"{image.status.sentence}."), judged.summary()["warnings"]
 

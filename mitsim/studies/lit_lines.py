@@ -55,7 +55,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LAMBDAS, LitScene
-from mitsim.report.mosaic_images import MosaicCamera, Solver, solver_of
+from mitsim.report.mosaic_images import MosaicCamera, Solver
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Setup
 
@@ -261,7 +261,7 @@ class MosaicShots:
         MitsimError for demosaicing without colour-demosaicing.
         """
         patterns = self.family.left.astype(np.float64), self.family.right.astype(np.float64)
-        solver = solver_of(WAYS[way], self.camera, patterns)
+        solver = Solver(WAYS[way], self.camera, patterns)
         with single_threaded_blas():
             return self._best(solver, way)
 

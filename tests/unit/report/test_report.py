@@ -17,8 +17,7 @@ from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
-from mitsim.report.pages import page_figure
-from mitsim.report.parts import stages_of
+from mitsim.report.pages import page_figure, stages_of
 from mitsim.studies.demo import _no_image
 from mitsim.studies.framework.findings import Part, build_findings
 

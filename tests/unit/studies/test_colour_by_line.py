@@ -16,7 +16,7 @@ from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.quality import reconstruct, reconstruct_colours
+from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 from mitsim.studies.lit_lines import LitLine, serving
 from tests.coloured import LINES, PLACE, folders
 
