@@ -42,7 +42,8 @@ from mitsim.core.spectral_manifests import (
 from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
 
 if TYPE_CHECKING:
-    from mitsim.report.reconstruct_run import ColourImage, Judged
+    from mitsim.report.colour_image import ColourImage
+    from mitsim.report.reconstruct_run import Judged
 
 # ---- images of frames ------------------------------------------------------------------------------------------------
 

@@ -34,7 +34,7 @@ MOST_LINES = 4
 """Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
 """Ways to images of lines from frames behind colour filters, that of most PSNR first
-(:mod:`mitsim.report.mosaic_images`)."""
+(:mod:`mitsim.report.reconstruct_run`)."""
 Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -264,13 +264,6 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
     return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
-
-
-def same_lines(run: Path, calibration: Path) -> ColourManifest:
-    """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
-    lines = read_colours(run, RUN)
-    check_lines(lines, str(run), calibration)
-    return lines
 
 
 def _kind(data: Any) -> str:

@@ -18,15 +18,7 @@ from mitsim.core.files import check_apart, check_plain, output_file, whole_folde
 from mitsim.core.imagelist import check_channel
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import (
-    RUN,
-    check_lines,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
-    same_lines,
-)
+from mitsim.core.spectral_manifests import MOSAIC, RUN, open_lines
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 
@@ -157,14 +149,15 @@ def check_export(
     """
     chosen = check_format(format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    lines = _lines(folder, factors)
-    if is_mosaic(folder) and not chosen.filters:
+    lines = open_lines(folder, RUN, MOSAIC)
+    calibrated = None if factors is None else lines.check_calibration(factors)
+    if lines.filters and not chosen.filters:
         able = ", ".join(name for name, other in FORMATS.items() if other.filters)
         raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
-    for line in lines or ("",):  # refused before numpy is imported
-        read_manifest(folder if is_mosaic(folder) else folder / line, RunManifest)
-        if factors is not None:
-            read_manifest(factors / line, CalibrationManifest)
+    for part in lines.parts.values():  # refused before numpy is imported
+        read_manifest(part, RunManifest)
+    for part in calibrated.parts.values() if calibrated else ():
+        read_manifest(part, CalibrationManifest)
     check_apart(place, [folder, *([factors] if factors else [])])
     if projector is not None:
         from mitsim.exchange.png_files import Raster
@@ -197,20 +190,6 @@ def check_format(
             f"output {place}: {ending} is of {' and '.join(_ENDINGS[ending])}, not of {format}; rename it"
         )
     return chosen
-
-
-def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
-    """Names of a run's lines, which are its calibration's too; none of a run that tells none apart."""
-    if is_mosaic(run):
-        colours = read_mosaic(run)
-        if calibration is not None:
-            check_lines(colours, str(run), calibration)
-        return colours.names
-    if not is_coloured(run):
-        if calibration is not None and is_coloured(calibration):
-            raise ArgumentError("calibration", f"{calibration}: is coloured, but {run} is not; give a line's folder")
-        return ()
-    return (read_colours(run, RUN) if calibration is None else same_lines(run, calibration)).names
 
 
 @check_arguments

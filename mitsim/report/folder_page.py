@@ -30,6 +30,7 @@ from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, UNCERTAINTY_FILE, read_result
 from mitsim.reconstruct.request import IMAGE_FILE, RESULT_FILE
+from mitsim.report.colour_image import ColourImage
 from mitsim.report.pages import (
     LARGEST,
     REFLECTANCE,
@@ -44,7 +45,6 @@ from mitsim.report.pages import (
     stages_of,
     total_of,
 )
-from mitsim.report.reconstruct_run import ColourImage
 
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),

@@ -7,9 +7,8 @@ makes the image of one line, :func:`reconstruct_colours` the images of several l
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,15 +16,16 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, check_arguments
-from mitsim.core.exr import checksum, write_frame
-from mitsim.core.files import output_folder, read_json, remove_page, write_bytes
-from mitsim.core.images import card, png
+from mitsim.core.exr import write_frame
+from mitsim.core.files import output_folder, read_json, write_bytes
+from mitsim.core.images import png
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_mosaic, load_run
 from mitsim.core.spectral_manifests import (
     COLOUR,
+    DEMOSAIC,
     IMAGE,
     JOINT,
     MOSAIC,
@@ -36,12 +36,12 @@ from mitsim.core.spectral_manifests import (
     is_coloured,
     open_lines,
     read_colours,
-    write_colours,
 )
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.mask_profile import load_psf
-from mitsim.metrics import Quality, psnr, summary_of, truth_error_for, truth_for
-from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
+from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
+from mitsim.optics.terms import best_term
+from mitsim.reconstruct.colour import PLANES, JointMosaic
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import (
@@ -51,9 +51,12 @@ from mitsim.reconstruct.reconstruct import (
     may_replace,
     reconstruct_request,
 )
+from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
-from mitsim.reconstruct.solution import Status
-from mitsim.report.mosaic_images import Lambda, MosaicCamera, Solver
+from mitsim.reconstruct.solution import Solution, Status
+from mitsim.reconstruct.solver import prepare
+from mitsim.report.colour_image import ColourImage
+from mitsim.report.folder_page import report_folder
 
 # -------- The image of one line
 
@@ -163,219 +166,6 @@ def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = N
 # -------- Images of several lines, and one in colour
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ColourImage:
-    """Images of a scene at spectral lines, their colours, and how well both are known.
-
-    Attributes
-    ----------
-    lines
-        Spectral lines and their names.
-    images : (n, n', lines) array
-        Reflectances, 1 = the calibration's board.
-    board
-        Reflectance of that board.
-    model
-        Conversion of reflectances at the lines to colours.
-    truth : (n, n', lines) array
-        What perfect images would show, relative to the board; None for a real camera.
-    chart
-        Place of a colour chart in the image; None where there is none, or it is not known.
-    qualities
-        Quality of each line's image; None without a truth.
-    facts
-        How the images were found, in words, for the page.
-    warnings
-        What is wrong with the images.
-    seconds
-        Wall time by stage.
-    output
-        The folder that holds all files.
-    solution, of_lines
-        Numbers of one solve for all lines, or of the solve of each line, by the keys of the command line's JSON.
-    inputs
-        What one solve for all lines was made of: an image of other inputs is not replaced.
-    """
-
-    lines: ColourManifest
-    images: FloatArray
-    board: float
-    model: ColourModel
-    truth: FloatArray | None = None
-    chart: ChartPlace | None = None
-    qualities: Mapping[str, Quality | None] = field(default_factory=dict)
-    facts: Mapping[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    output: str = ""
-    solution: Mapping[str, Any] = field(default_factory=dict)
-    of_lines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    inputs: Mapping[str, str | float] = field(default_factory=dict)
-
-    @classmethod
-    def of(
-        cls, lines: ColourManifest, images: FloatArray, board: float | None, chart: ChartPlace | None, **more: Any
-    ) -> ColourImage:
-        """Convert images to colours, by a matrix fitted on the chart where its place is known, else by the fixed one.
-
-        Parameters
-        ----------
-        lines, images, chart, **more
-            As the attributes.
-        board
-            Reflectance of the calibration's board; None is taken for 1.
-
-        Raises
-        ------
-        MitsimError
-            Where the chart lies outside the image.
-        """
-        model, board = ColourModel.of_lines(lines.wavelengths_nm), board or 1.0
-        if chart is not None:
-            means = board * chart.means(images)
-            model = ColourModel.fit(lines.wavelengths_nm, means, "the chart in this image")
-        return cls(lines=lines, images=images, board=board, model=model, chart=chart, **more)
-
-    @property
-    def reflectances(self) -> FloatArray:
-        """(n, n', lines) reflectances, 1 = a perfect reflector."""
-        return self.board * self.images
-
-    @property
-    def ok(self) -> bool:
-        """True if the images of all lines can be used as they are."""
-        return not self.warnings
-
-    @property
-    def psnr_db(self) -> float | None:
-        """PSNR over the images of all lines together; None without a truth."""
-        count = self.images.shape[0]
-        return None if self.truth is None else psnr(self.images.reshape(count, -1), self.truth.reshape(count, -1))
-
-    @cached_property
-    def xyz(self) -> FloatArray:
-        """(n, n', 3) CIE XYZ under D65; a perfect reflector has Y = 1."""
-        return self.model.xyz(self.reflectances)
-
-    @cached_property
-    def truth_xyz(self) -> FloatArray | None:
-        """(n, n', 3) CIE XYZ of the truth, by the same matrix; None without a truth."""
-        return None if self.truth is None else self.model.xyz(self.board * self.truth)
-
-    @cached_property
-    def delta_e(self) -> FloatArray | None:
-        """(n, n') CIE Delta E 2000 of each pixel to the truth's, by the same matrix; None without a truth."""
-        return None if self.truth_xyz is None else delta_e(self.xyz, self.truth_xyz)
-
-    @cached_property
-    def patches(self) -> list[dict[str, Any]]:
-        """Name of each patch of the chart, and CIE Delta E 2000 of its mean to its spectrum in D65.
-
-        ``delta_e`` is of this image, ``floor`` of the patch's spectrum at the lines by the fixed matrix, below which no
-        camera behind these lines is, and ``truth`` of the truth by the image's matrix. Empty without a chart.
-        """
-        if self.chart is None:
-            return []
-        known, waves = chart(), self.lines.wavelengths_nm
-        columns = {
-            "delta_e": delta_e(self.chart.means(self.xyz), known.xyz),
-            "floor": delta_e(ColourModel.of_lines(waves).xyz(known.at(waves)), known.xyz),
-            "truth": None if self.truth_xyz is None else delta_e(self.chart.means(self.truth_xyz), known.xyz),
-        }
-        return [
-            {"name": name, **{key: None if each is None else float(each[number]) for key, each in columns.items()}}
-            for number, name in enumerate(known.names)
-        ]
-
-    def patch_mean(self, key: str) -> float | None:
-        """Return the mean over all patches of the number ``key``; None where it is not known."""
-        return _mean(patch[key] for patch in self.patches)
-
-    @property
-    def sentences(self) -> list[str]:
-        """Statements on the colours, for the command line."""
-        sentences = [f"colours by a matrix fitted on {self.model.fitted_on}"]
-        if self.delta_e is not None:
-            sentences.append(f"Delta E 2000 of a pixel to the truth {self.delta_e.mean():.2f} in the mean")
-        if self.patches:
-            mean, floor = self.patch_mean("delta_e"), self.patch_mean("floor")
-            sentences.append(f"of {len(self.patches)} patches to their spectra {mean:.2f}, floor {floor:.2f}")
-        return sentences
-
-    @property
-    def described(self) -> list[str]:
-        """Quality of each line, and how the images were found, for the command line's details."""
-        qualities = [f"{name}: {each or 'no truth to compare with'}" for name, each in self.qualities.items()]
-        return [*qualities, *(f"{name}: {value}" for name, value in self.facts.items())]
-
-    @property
-    def table(self) -> dict[str, str]:
-        """What differs between lines that were solved one by one, in words by line."""
-        rows = {}
-        for number, line in enumerate(self.lines.names if self.of_lines else ()):
-            found, size = self.of_lines[line], float(np.sqrt(np.square(self.images[..., number]).mean()))
-            fit = "" if found["misfit"] is None else f", chi-square {found['misfit']['chi_square']:.3g}"
-            known = "" if found["uncertainty"] is None else f" +- {found['uncertainty']:.2e}"
-            rows[line] = f"lambda {found['lambda']:.3g}{fit}, image {size:.2e}{known} rms"
-        return rows
-
-    def summary(self) -> dict[str, Any]:
-        """Return all but the pictures, by the keys of the command line's JSON."""
-        channels = [
-            {**line.model_dump(), **summary_of(self.qualities[line.name]), **self.of_lines.get(line.name, {})}
-            for line in self.lines.channels
-        ]
-        return {
-            **self.solution,
-            "channels": channels,
-            "ssim": _mean(channel["ssim"] or None for channel in channels),
-            **self.model.summary(),
-            "psnr": self.psnr_db,
-            "delta_e": None if self.delta_e is None else float(self.delta_e.mean()),
-            "delta_e_chart": self.patch_mean("delta_e"),
-            "delta_e_floor": self.patch_mean("floor"),
-            "patches": self.patches or None,
-            "warnings": self.warnings,
-            "status": " ".join(self.warnings) or "Solved: every line's image can be used as it is.",
-            "seconds": dict(self.seconds),
-            "output": self.output,
-        }
-
-    def write(self, folder: Path, **origin: Any) -> None:
-        """Write image.exr, image.png, and colour.json last, with the entries ``origin``; an earlier page is removed."""
-        remove_page(folder)
-        rgb = linear_srgb(self.xyz)
-        named = dict(zip("RGBXYZ", np.moveaxis(np.concatenate([rgb, self.xyz], axis=-1), -1, 0), strict=True))
-        channels = {name: values.astype(np.float32) for name, values in named.items()}
-        units = {"rgb": "linear sRGB", "xyz": "CIE 1931 under D65, perfect reflector Y = 1"}
-        checksums = {
-            IMAGE_FILE: write_frame(folder / IMAGE_FILE, channels, units),
-            PICTURE_FILE: write_bytes(folder / PICTURE_FILE, png(rgb)),
-        }
-        of_lines = (f"{name}/{IMAGE_FILE}" for name in self.lines.names)
-        checksums |= {name: checksum(folder / name) for name in of_lines if (folder / name).is_file()}
-        more = {key: value for key, value in self.summary().items() if key != "channels"}
-        write_colours(
-            folder,
-            ColourManifest(kind="colour-image", channels=self.lines.channels),
-            **({"inputs": self.inputs} if self.inputs else {}),
-            **origin,
-            **more,
-            facts={**self.facts, **self.table},
-            board_reflectance=self.board,
-            chart=self.chart,
-            checksums=checksums,
-        )
-
-    def _repr_html_(self) -> str:
-        pictures = {"in colour\nsRGB under D65": linear_srgb(self.xyz)}
-        if self.truth_xyz is not None:
-            pictures["truth\nsRGB under D65"] = linear_srgb(self.truth_xyz)
-        for number, name in enumerate(self.lines.names):
-            pictures[f"{name}\nreflectance 0 to 1"] = self.reflectances[..., number]
-        return card("Image in colour", pictures, self.sentences)
-
-
 @check_arguments
 def reconstruct_colours(
     run: Path | str,
@@ -413,8 +203,6 @@ def reconstruct_colours(
     MitsimError
         For folders of different lines, and as :func:`reconstruct`.
     """
-    from mitsim.report.folder_page import report_folder
-
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
     page, filters = options.pop("page", True), open_lines(run, RUN, MOSAIC).filters
     lines = filters or read_colours(run, RUN)
@@ -611,6 +399,163 @@ def _board_of(calibration: Path, lines: ColourManifest) -> float | None:
     return boards.pop()
 
 
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+# -------- Ways from frames behind colour filters to images of the lines
+#
+# *Demosaiced*: every frame becomes three whole frames (colour-demosaicing), each channel is solved, and the channels'
+# images are separated into lines. *Half resolution*: each plane of filters is solved with its own rows of the factors,
+# so that no pixel is interpolated. *Joint*: all planes are solved for all lines (:mod:`mitsim.reconstruct.colour`). A
+# channel or plane that sees several lines has the one separable camera that is nearest to them; only the joint solve
+# knows that each line has its own.
+#
+# Lambda is chosen without a truth: each plane, or channel, chooses its own (:mod:`mitsim.reconstruct.regularisation`).
+# The joint solve takes the geometric mean of the planes' lambdas, because the planes have the same scene and nearly the
+# same noise.
+
+Patterns = tuple[FloatArray, FloatArray]
+Lambda = float | Literal["auto"]
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicCamera:
+    """A camera under a mosaic of colour filters.
+
+    Attributes
+    ----------
+    lefts, rights : (lines, m, n) and (lines, m', n') arrays
+        Factors of each line, of pixels without filters.
+    weights : (4, lines) array
+        Response of the pixels of each plane of 2 x 2 to each line.
+    mosaic
+        Colours of these four, such as ``RGGB``.
+    """
+
+    lefts: FloatArray
+    rights: FloatArray
+    weights: FloatArray
+    mosaic: str
+
+    @classmethod
+    def of(cls, factors: Sequence[tuple[FloatArray, FloatArray]], weights: FloatArray, mosaic: str) -> MosaicCamera:
+        """Stack the (left, right) ``factors`` of all lines."""
+        lefts, rights = (np.stack(side) for side in zip(*factors, strict=True))
+        return cls(lefts, rights, weights, mosaic)
+
+
+@dataclass(frozen=True, eq=False)
+class LineImages:
+    """Images of all lines by one way.
+
+    Attributes
+    ----------
+    images : (lines, n, n') array
+        Reflectances.
+    lam
+        Lambda of the joint solve, or the geometric mean of those of the planes or channels.
+    residual
+        ||Y - model|| / ||Y|| over all frames, of planes or channels as they were solved.
+    joint
+        The joint solution; None for the other ways.
+    """
+
+    images: FloatArray
+    lam: float
+    residual: float
+    joint: Solution | None = None
+
+
+class Solver:
+    """Images of all lines from frames behind a camera's filters.
+
+    Each plane, or channel of demosaiced frames, is solved by itself. The joint way adds one model of all lines, and
+    needs the planes for lambda alone.
+
+    Parameters
+    ----------
+    way
+        One of :data:`mitsim.core.spectral_manifests.WAYS`.
+    camera, patterns
+        The camera, and the pattern columns P_L (n, K) and P_R (n', K').
+    """
+
+    def __init__(self, way: str, camera: MosaicCamera, patterns: Patterns) -> None:
+        self._mosaic = camera.mosaic if check_way(way) == DEMOSAIC else None
+        self._joint = JointMosaic(camera.lefts, camera.rights, camera.weights, *patterns) if way == JOINT else None
+        self._gathered = np.zeros(self._joint.shape if self._joint else ())
+        channels = [camera.mosaic.index(name) for name in "RGB"] if self._mosaic else list(range(len(PLANES)))
+        lines = [*zip(camera.lefts, camera.rights, strict=True)]
+        weights = camera.weights[channels]
+        terms = [
+            best_term([(weight * left, right) for weight, (left, right) in zip(row, lines, strict=True)])
+            for row in weights
+        ]
+        # (channels, lines): the part of each line's image in the image that the one separable camera gives.
+        mixing = np.array(
+            [
+                [
+                    weight * np.vdot(left, term.left) * np.vdot(right, term.right)
+                    for weight, (left, right) in zip(row, lines, strict=True)
+                ]
+                / (np.square(np.linalg.norm(term.left)) * np.square(np.linalg.norm(term.right)))
+                for row, term in zip(weights, terms, strict=True)
+            ]
+        )
+        self._undo = np.linalg.pinv(mixing)
+        sides = [(term.left, term.right) for term in terms]
+        if not self._mosaic:
+            sides = [(left[a::2], right[b::2]) for (left, right), (a, b) in zip(sides, PLANES, strict=True)]
+        self._models = [prepare(left, right, *patterns) for left, right in sides]
+        self._sums = [model.accumulator() for model in self._models]
+
+    def add(self, frame: FloatArray, row: int, column: int) -> None:
+        """Add the (m, m') ``frame`` [electrons/s] that was measured under pattern (``row``, ``column``)."""
+        if self._joint:
+            self._gathered += self._joint.gather(frame, row, column)
+        if self._mosaic:
+            parts = [*np.moveaxis(demosaic(frame, self._mosaic), -1, 0)]
+        else:
+            parts = [frame[a::2, b::2] for a, b in PLANES]
+        for total, part in zip(self._sums, parts, strict=True):
+            total.add(part, row, column)
+
+    def images(self, lam: Lambda, relative: bool = False) -> LineImages:
+        """Solve for the images of all lines.
+
+        Parameters
+        ----------
+        lam, relative
+            Lambda: a number, ``relative`` to the largest sigma^2 where asked for, or ``auto``.
+        """
+        pairs = [*zip(self._models, self._sums, strict=True)]
+        energy = sum(total.energy for total in self._sums)
+        if isinstance(lam, str):
+            lambdas = [automatic_lambda(model.problem(total)) for model, total in pairs]
+        elif self._joint:
+            lambdas = [lam * (self._joint.scale if relative else 1)]
+        else:
+            lambdas = [lam * (model.problem(total).scale if relative else 1) for model, total in pairs]
+        shared = lambdas[0] if len(lambdas) == 1 else _geometric(lambdas)
+        if self._joint is None:
+            found = [model.solve(total, float(own)) for (model, total), own in zip(pairs, lambdas, strict=True)]
+            left = sum(each.residual**2 * total.energy for each, total in zip(found, self._sums, strict=True))
+            images = np.tensordot(self._undo, np.stack([each.image for each in found]), axes=1)
+            return LineImages(images, shared, float(np.sqrt(left / energy)))
+        joint = self._joint.solve(self._gathered, shared)
+        left = energy + float(np.vdot(joint.image, self._joint.normal(joint.image) - 2 * self._gathered))
+        return LineImages(joint.image, shared, float(np.sqrt(max(left, 0.0) / energy)), joint)
+
+
+def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
+    """Return the (m, m', 3) red, green and blue of a ``frame`` (m, m') behind a ``mosaic`` (Menon and others 2007).
+
+    MitsimError without colour-demosaicing.
+    """
+    check_way(DEMOSAIC)
+    from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
+
+    return np.asarray(demosaicing_CFA_Bayer_Menon2007(frame, mosaic), dtype=np.float64)
+
+
+def _geometric(values: Sequence[float]) -> float:
+    """Return the geometric mean; 0 where one value is 0."""
+    logs = np.log(values) if all(value > 0 for value in values) else -np.inf
+    return float(np.exp(np.mean(logs)))

@@ -3,7 +3,7 @@
 Each line has a bench of its own, with the line's power, diffraction, photons and factors; light of all is traced on the
 same paths (:mod:`mitsim.acquire.spectral`). Daylight beside the projector is that of a lamp, in frames of its own.
 
-Three ways to images of the lines are compared (:mod:`mitsim.report.mosaic_images`), all with factors that were
+Three ways to images of the lines are compared (:mod:`mitsim.report.reconstruct_run`), all with factors that were
 calibrated line by line, each with its best lambda.
 
 Beside daylight the brightest pixel fills the well in every frame, by daylight too, whose frame is taken off. That
@@ -55,7 +55,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LAMBDAS, LitScene
-from mitsim.report.mosaic_images import MosaicCamera, Solver
+from mitsim.report.reconstruct_run import MosaicCamera, Solver
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Setup
 
