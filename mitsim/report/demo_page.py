@@ -270,7 +270,7 @@ def render_html(report: ReportData) -> str:
         best=best,
         figures={name: _picture(draw()) for name, (data, draw) in drawn.items() if data},
         frames=[Picture.of(name, name, _finite(dn, name), Scale.of(dn, "DN")) for name, dn in report.frames.items()],
-        trust=trust.pictures() if trust else (),
+        errors=trust.pictures() if trust else (),
         plan=PlanChart.of(report.effects, report.accuracy) if report.effects else None,
         total=total_of(report.seconds),
         stages=stages_of(report.seconds),

@@ -207,24 +207,21 @@ def reconstruct_colours(
     page, filters = options.pop("page", True), open_lines(run, RUN, MOSAIC).filters
     lines = filters or read_colours(run, RUN)
     check_lines(lines, str(run), calibration)
-    if filters:
-        with job.clock.stage("images"):
-            found = _solve_mosaic(run, calibration, output, chart, overwrite, job, **options)
-    else:
-        found = _solve_each(run, calibration, output, chart, overwrite, job, lines, **options)
+    solve = _solve_mosaic if filters else _solve_each
+    found = solve(lines, run, calibration, output, chart, overwrite, job, **options)
     if page:
         report_folder(output)
     return found
 
 
 def _solve_each(
+    lines: ColourManifest,
     run: Path,
     calibration: Path,
     output: Path,
     chart: ChartPlace | None,
     overwrite: bool,
     job: Job,
-    lines: ColourManifest,
     **options: Any,
 ) -> ColourImage:
     """Solve each line by itself, in a folder of its own."""
@@ -267,6 +264,7 @@ def _solve_each(
 
 @single_threaded_blas()
 def _solve_mosaic(
+    lines: ColourManifest,
     run: Path,
     calibration: Path,
     output: Path,
@@ -277,13 +275,14 @@ def _solve_mosaic(
     lam: Lambda = "auto",
 ) -> ColourImage:
     """Solve all lines from the same frames, which were seen through colour filters."""
-    started = time.perf_counter()
     check_way(way)
     check_joint(lam)
-    shots, names = load_mosaic(run), open_lines(run, MOSAIC).names
-    factors = {name: load_calibration(calibration / name) for name in names}
-    for each in factors.values():
-        each.check_fit(shots.shots)
+    clock = job.apart("").clock
+    with clock.stage("read"):
+        shots = load_mosaic(run)
+        factors = {name: load_calibration(calibration / name) for name in lines.names}
+        for each in factors.values():
+            each.check_fit(shots.shots)
     fingerprints = {"run": shots.shots.fingerprint, "calibration": "-".join(f.fingerprint for f in factors.values())}
     inputs: dict[str, str | float] = {**fingerprints, "mosaic": way, "lambda": lam}
     replaces = is_coloured(output)
@@ -292,16 +291,16 @@ def _solve_mosaic(
         if not overwrite:
             check_same_inputs(output, read_json(output / COLOUR), inputs)
     with output_folder(output, overwrite=replaces) as folder:
-        read = time.perf_counter()
-        camera = MosaicCamera.of([(f.left, f.right) for f in factors.values()], shots.weights, shots.manifest.mosaic)
-        solver, data, noise = Solver(way, camera, shots.shots.patterns), 0.0, 0.0
-        for each in shots.shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
-            solver.add(each.frame, each.row, each.column)
-            data += float(np.square(each.frame).sum())
-            noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
-        added = time.perf_counter()
-        solved = solver.images(lam)
-        ended = time.perf_counter()
+        with clock.stage("accumulate"):
+            pairs = [(each.left, each.right) for each in factors.values()]
+            camera = MosaicCamera.of(pairs, shots.weights, shots.manifest.mosaic)
+            solver, data, noise = Solver(way, camera, shots.shots.patterns), 0.0, 0.0
+            for each in shots.shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
+                solver.add(each.frame, each.row, each.column)
+                data += float(np.square(each.frame).sum())
+                noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
+        with clock.stage("solve"):
+            solved = solver.images(lam)
         # What the noise of frames and factors leaves of the residual, as a part of the data.
         explained = 0.0
         for each in factors.values():
@@ -309,9 +308,9 @@ def _solve_mosaic(
                 sides = (own.left, each.left), (own.right, each.right)
                 explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
         unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
-        board, qualities = _board_of(calibration, shots.manifest), dict[str, Quality | None].fromkeys(names)
+        board, qualities = _board_of(calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
         truth = shots.truth(board)
-        for number, name in enumerate(names if truth is not None else ()):
+        for number, name in enumerate(lines.names if truth is not None else ()):
             own = shots.truths[name]
             error = float(np.sqrt(np.square(own.standard_error).mean())) * own.board / (board or own.board)
             qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
@@ -335,7 +334,7 @@ def _solve_mosaic(
             )
         steps = solved.joint and solved.joint.iterations
         found = ColourImage.of(
-            shots.manifest,
+            lines,
             np.moveaxis(solved.images, 0, -1),
             board,
             chart,
@@ -348,12 +347,7 @@ def _solve_mosaic(
                 "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
             },
             warnings=tuple(warnings),
-            seconds={
-                "read": read - started,
-                "accumulate": added - read,
-                "solve": ended - added,
-                "total": time.perf_counter() - started,
-            },
+            seconds=clock.seconds(),
             output=str(folder),
             solution={
                 "mosaic": way,
@@ -364,7 +358,7 @@ def _solve_mosaic(
             },
             inputs=inputs,
         )
-        for name, image in zip(names, solved.images, strict=True):
+        for name, image in zip(lines.names, solved.images, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
                 write_bytes(place / PICTURE_FILE, png(image))
