@@ -1,7 +1,6 @@
-"""What people read: rows of a study in, means with standard errors and a tidy CSV file out; numbers as text; a template
-and what it shows in, one self-contained HTML page out.
+"""Parts of HTML pages: templates, numbers as text, plans as bars, and pictures of numbers.
 
-Processes that measure points load this and neither templates nor figures.
+Processes that measure points import this module, and load neither templates nor figures.
 """
 
 from __future__ import annotations
@@ -34,28 +33,26 @@ if TYPE_CHECKING:
 # -------- Pages
 
 _SHOWN_DPI = 110
-"""Figures are 8.6 inches wide at most: 946 pixels of the page."""
 
 
 def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
-    """A page as text.
+    """Render a page.
 
     Parameters
     ----------
     template
-        file of ``mitsim/report/templates``.
+        File of ``mitsim/report/templates``.
     filters
-        of its own, by name, beside ``sci`` and ``seconds`` of a number, ``typeset`` of a text and ``sentence`` of a
-        warning.
+        Filters of this template by name, beside ``sci``, ``seconds``, ``typeset`` and ``sentence``.
     **shown
-        what it shows, by the names that it has there; one that is missing is an error.
+        Variables of the template; a missing one is an error.
     """
     return _environment(tuple((filters or {}).items())).get_template(template).render(**shown)
 
 
 @cache
 def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environment:
-    """Templates with these ``filters``, kept for the next page: to compile them takes longer than to fill them."""
+    """Return templates with these ``filters``, kept for the next page because compiling takes longer than filling."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("mitsim.report")
@@ -68,17 +65,9 @@ def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environ
 
 
 def page_figure(figure: Figure) -> tuple[str, int]:
-    """A figure for a page: an SVG, sharp at any size, of a third of a PNG's bytes; the same of the same figure.
+    """Return a figure as the data URI of an SVG, and its width on a page [pixels].
 
-    Parameters
-    ----------
-    figure
-        drawn.
-
-    Returns
-    -------
-    tuple of str and int
-        its data URI, and how wide it is shown [pixels].
+    An SVG is sharp at any size and has a third of a PNG's bytes. The same figure gives the same bytes.
     """
     from matplotlib import rc_context
 
@@ -88,38 +77,29 @@ def page_figure(figure: Figure) -> tuple[str, int]:
 
 
 def written_figure(figure: Figure, path: Path) -> tuple[str, int]:
-    """The same of a ``figure`` that was written to the PNG file ``path``, which takes no time."""
+    """Return a ``figure`` that was written to the PNG file ``path`` as data URI, and its width on a page [pixels]."""
     return data_uri(path.read_bytes(), "png"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
 def figure_uri(figure: Figure, dots_per_inch: int) -> str:
-    """A figure as a data URI.
-
-    Parameters
-    ----------
-    figure
-        drawn.
-    dots_per_inch
-        of its picture.
-    """
+    """Return a figure as the data URI of a PNG."""
     figure.savefig(buffer := BytesIO(), format="png", dpi=dots_per_inch)
     return data_uri(buffer.getvalue())
 
 
-# -------- Numbers and plain text in, the same as a page or a figure prints them out
+# -------- Numbers and plain text as pages and figures print them
 
 DASH = "\N{EN DASH}"
-"""Where there is no number."""
 _SUPERSCRIPT = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TIMES = "\N{MULTIPLICATION SIGN}"
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d+)(?![\w.]\w)")
-"""A number such as 4.9e-03, and neither a part of a name nor of a longer number."""
+"""A number such as 4.9e-03 that is no part of a name or of a longer number."""
 _SIZE = re.compile(r"(?<![\w:.])(\d+(?:\.\d+)?)( ?)x\2(?=\d+(?:\.\d+)?(?![\w:]))")
 """512 x 512 and 3x3, but not dots:7x16."""
 
 
 def scientific(value: float | None) -> str:
-    """A number of three digits, a ``value`` below 0.01 or from 10,000 on of two with a power of ten; None as a dash."""
+    """Print three digits, or two and a power of ten below 0.01 and from 10,000 on; None is a dash."""
     if value is None or value == 0.0:
         return DASH if value is None else "0"
     if 1e-2 <= abs(value) < 1e4:
@@ -128,18 +108,12 @@ def scientific(value: float | None) -> str:
 
 
 def duration(value: float) -> str:
-    """Seconds, a ``value``, in three digits."""
+    """Print seconds in three digits."""
     return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def round_to_error(value: float, error: float) -> str:
-    """A number to the second digit of its standard error.
-
-    Parameters
-    ----------
-    value, error
-        in one unit; an error of 0, or none that is finite, leaves five digits.
-    """
+    """Print a number to the second digit of its standard error, or five digits where the error is 0 or not finite."""
     if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
         return f"{value:.5g}"
     places = 1 - math.floor(math.log10(error))
@@ -147,18 +121,14 @@ def round_to_error(value: float, error: float) -> str:
 
 
 def reflectance(value: float) -> str:
-    """An error in reflectance, its ``value``: four places, as all are below 1 and few below 0.001."""
+    """Print an error in reflectance in four places, because all are below 1 and few are below 0.001."""
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
 def with_error(value: float, error: float, unit: str = "") -> str:
-    """A number and its standard error, neither finer than 0.01: to the second digit of the error, without one that
-    rounds to nothing.
+    """Print a number and its standard error to the second digit of the error, but not finer than 0.01.
 
-    Parameters
-    ----------
-    value, error, unit
-        in one unit, which stands behind both.
+    An error that rounds to 0 is left out.
     """
     places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
     deviation = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
@@ -167,13 +137,12 @@ def with_error(value: float, error: float, unit: str = "") -> str:
 
 
 def sentence(text: str) -> str:
-    """A warning ``text`` of the command line as a sentence: a capital first, a full stop last."""
+    """Turn a warning of the command line into a sentence with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def typeset(text: str) -> str:
-    """A ``text`` for people: 4.9e-03 as a power of ten and 4.9e-02 without one, +- as one sign, 512 x 512 with a times
-    sign, um with a Greek letter."""
+    """Replace 4.9e-03 by a power of ten, 4.9e-02 by 0.049, +- by one sign, x in sizes by a times sign and um by µm."""
     text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
     text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
     return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)

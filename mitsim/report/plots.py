@@ -1,7 +1,6 @@
-"""Arrays and means in, matplotlib Figures out: one message a figure, units on every axis.
+"""Matplotlib figures with one message each and units on every axis.
 
-Colours are safe for the colour-blind. The caller saves the figure; no pyplot state is touched. What one study alone
-draws stands with that study.
+Colours are safe for the colour-blind. The caller saves the figure, and no state of pyplot is touched.
 """
 
 from __future__ import annotations
@@ -35,49 +34,44 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
-"""Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey."""
+"""Okabe and Ito's palette, distinct in all common forms of colour blindness and in grey."""
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-"""Seven of each, so that as many curves can be told apart."""
 _GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
-"""Lines behind the data, between them, and beside them: lighter than any curve; and bars that others stand beside."""
+"""Colours of grid lines, lines between data, lines beside data, and bars for comparison."""
 FONT = 11.0
-"""Points: as large as the text of a page of 8.6 inches."""
+"""Points: as large as the text of a page that is :data:`WIDTH` inches wide."""
 WIDTH = 8.6
-"""Inches: a page of text."""
 COLUMN = 4.65
-"""Inches of a figure of curves: two stand beside each other on a page, and one fits a telephone without shrinking its
-letters below 12 pixels."""
+"""Inches of a figure of curves: two fit a page side by side, and one fits a telephone with letters of 12 pixels."""
 _BARS = 6.2
-"""Inches of a figure of bars with their names: one fits a telephone with letters of 10 pixels."""
+"""Inches of a figure of bars with their names, which fits a telephone with letters of 10 pixels."""
 _PANEL = 2.3
-"""Inches of a panel of curves: half as high as it is wide."""
 _CELL = 1.5
-"""Inches of an image in a grid, at most: six stand on a page."""
+"""Largest size [inches] of an image in a grid: six fit a page."""
 _LABEL = 1.1
 """Inches beside a grid for the names of its rows."""
 _CAPTION = 0.32
 """Inches of a row for the captions below its images."""
 _LETTER = 0.085
-"""Inches of a letter of such a name, on the average."""
+"""Mean width of a letter [inches]."""
 _HANDLE = 0.6
-"""Inches of a line in a legend, and of the room beside its name."""
+"""Inches of a line in a legend, and of the space beside its name."""
 ROW = 0.27
-"""Inches of a row of bars: a line of text, and a third of one between two."""
+"""Inches of a row of bars: a line of text, and a third of a line between two."""
 _NAME_LETTERS = 34
-"""Of a line of the name of a bar: half of the figure is left for bars."""
+"""Letters in a line of a bar's name, which leave half of the figure to the bars."""
 _UPRIGHT_LETTERS, TITLE_LETTERS = 26, 46
-"""Of a line along a panel of curves, and above it."""
+"""Letters in a line beside and above a panel of curves."""
 LOGARITHMIC = 30.0
-"""Largest over least value from which an axis is logarithmic: on a linear one the smaller half of its decades lies
-within a dot of nothing."""
+"""Ratio of the largest to the least value from which an axis is logarithmic."""
 Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
 """Wall seconds, relative error."""
 _SHORT_AXIS = 30.0
-"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+"""Range of a logarithmic axis below which powers of ten alone leave at most one tick."""
 
 
 # -------- Figures
@@ -91,25 +85,22 @@ def curves(
     ticks: bool = True,
     title: str = "",
 ) -> Figure:
-    """Curves with bars of one standard error, in panels below each other on one scale.
+    """Draw curves with bars of one standard error, in panels below each other on one scale.
+
+    Panels with fewer than two places along x are left out; a figure without panels is empty (:func:`tells`).
 
     Parameters
     ----------
     panels
-        curves by name, by the panels' titles; one without points has its colour all the same.
+        Curves by name, by the panels' titles. A curve without a name is not in the legend.
     x, y
-        names of the axes, with units.
+        Names of the axes, with units.
     log
-        whether x is logarithmic even where its numbers span little (:func:`spans_decades`).
+        True for a logarithmic x axis even where the numbers span less than :func:`spans_decades` asks for.
     ticks
-        whether every x that was measured has a tick, as far as there is room.
+        True for a tick at every x that was measured, as far as there is room.
     title
-        of all panels.
-
-    Notes
-    -----
-    A curve alone needs no name: an empty one has no line in the legend. A panel without two places along x tells
-    nothing and is left out; a figure without panels is empty (:func:`tells`).
+        Title of the figure.
     """
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     found = {panel: {name: _points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
@@ -143,26 +134,25 @@ def curves(
 
 
 def _points(curve: Curve) -> FloatArray:
-    """(points, 3) numbers, means and standard errors of a ``curve`` in the order of its numbers, where all is finite
-    but the error."""
+    """Return (points, 3) numbers, finite means and standard errors of a ``curve``, sorted."""
     points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
     found = np.array(points, dtype=np.float64).reshape(-1, 3)
     return found[np.isfinite(found[:, :2]).all(axis=1)]
 
 
 def _column(shown: Mapping[str, FloatArray], column: int) -> set[float]:
-    """Different values of a ``column`` of all curves ``shown``."""
+    """Return the different values of a ``column`` of all curves."""
     return {float(value) for points in shown.values() for value in points[:, column]}
 
 
 def spans_decades(values: Iterable[float]) -> bool:
-    """Whether ``values`` are above 0, all of them, and the largest is :data:`LOGARITHMIC` times the least or more."""
+    """Return True if all ``values`` are positive and span a factor of :data:`LOGARITHMIC` at least."""
     found = np.array(list(values), dtype=np.float64)
     return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
 
 
 def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
-    """Ticks along x at those of some ``numbers``, in ascending order, whose text does not run into the one before."""
+    """Set ticks along x at the ``numbers``, in ascending order, whose labels do not overlap."""
     logarithmic = axes.get_xscale() == "log"
     places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
     inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
@@ -178,16 +168,14 @@ def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
-    """Images (n, n) [reflectance] with a caption below each, cut to 0..1 for display only.
+    """Draw (n, n) images [reflectance] with a caption below each, cut to 0..1 for display only.
 
     Parameters
     ----------
     rows
-        images and captions by the rows' names.
-    columns
-        titles.
-    title
-        of all.
+        Images and captions by the rows' names.
+    columns, title
+        Titles of the columns and of the figure.
     """
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
@@ -213,16 +201,14 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
 
 
 def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
-    """Two means of each thing beside each other, the first as a bar, the second as a dot, the largest on top.
+    """Draw two means for each name, the first as a bar, the second as a dot, the largest on top.
 
     Parameters
     ----------
-    values
-        both means by name.
-    labels
-        of the two.
+    values, labels
+        Both means by name, and what they are.
     x
-        name of the axis, with its unit.
+        Name of the axis, with its unit.
     """
     ordered = sorted(values.items(), key=lambda item: item[1][0].value)
     figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
@@ -239,14 +225,14 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
 
 
 def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
-    """A bar and its error for each value, the largest on top.
+    """Draw a bar with its error for each value, the largest on top.
 
     Parameters
     ----------
     kinds
-        values by name, by what they are: two kinds at most, each in its colour.
+        Values by name, for at most two kinds, each in its colour.
     x
-        name of the axis, with its unit.
+        Name of the axis, with its unit.
     """
     values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
     ordered = sorted(values, key=lambda value: value[0].value)
@@ -266,14 +252,14 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
 
 
 def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
-    """A bar for each row, the first on top, that its parts make up in their order.
+    """Draw a bar for each row, the first on top, stacked from its parts in their order.
 
     Parameters
     ----------
     rows
-        the parts' values >= 0 by name, by the rows' names.
+        Values >= 0 of the parts by name, by the rows' names.
     x
-        name of the axis, with its unit.
+        Name of the axis, with its unit.
     """
     parts = list(dict.fromkeys(part for row in rows.values() for part in row))
     figure, axes = figure_of(1.6 + ROW * len(rows), _BARS)
@@ -291,10 +277,7 @@ def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
 
 
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
-
-    Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
-    """
+    """Draw the singular values of each family's system, relative to the largest, over their rank in percent."""
     figure, axes = figure_of(0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
@@ -307,8 +290,10 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
 
 
 def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
-    """Errors of singular values of each of ``factors``, and their standard errors as lines; rows are of (without noise,
-    with noise less its bias, standard error)."""
+    """Draw errors of the singular values of ``factors``, and their standard errors as lines.
+
+    Rows are (value without noise, value with noise less its bias, standard error).
+    """
     figure, axes = figure_of(0.45 * WIDTH)
     for index, (name, rows) in enumerate(factors.items()):
         exact, noisy, error = rows.T
@@ -331,14 +316,14 @@ def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
 
 
 def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
-    """A map of a factor's errors.
+    """Draw a map of a factor's errors.
 
     Parameters
     ----------
     values, largest
-        (m, n) error of each entry in predicted deviations, and up to how many the scale goes, of either sign.
+        (m, n) errors in predicted deviations, and the end of the scale for either sign.
     title
-        what is said above.
+        Title of the figure.
     """
     figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
     axes.set_title(title, fontsize=FONT)
@@ -354,14 +339,14 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
 
 
 def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
-    """PSNR [dB] by family, a pair of bars each, with one standard error where there is one.
+    """Draw the PSNR [dB] by family, a pair of bars each, with one standard error where it is known.
 
     Parameters
     ----------
     quality
-        of the idealised model, and of the rendered light.
+        PSNR in the idealised model, and with rendered light.
     title
-        of both.
+        Title of the figure.
     """
     figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
@@ -385,18 +370,18 @@ def error_bars(
     bounds: Mapping[str, float] | None = None,
     axes: Axes | None = None,
 ) -> Figure:
-    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
+    """Draw relative errors on a logarithmic axis, the largest on top, with the numbers beside the axes.
 
     Parameters
     ----------
     errors
-        by name, >= 0: one of 0 has no dot.
+        Errors >= 0 by name; an error of 0 has no dot.
     limit
-        accuracy asked for.
+        Accuracy that was asked for.
     bounds
-        what each error is below at some confidence, by name: a line runs on to it.
+        Upper bounds at some confidence by name, drawn as thin lines.
     axes
-        that are drawn on; None: those of a new figure.
+        Axes to draw on; None for those of a new figure.
     """
     ordered = sorted(errors.items(), key=lambda item: item[1])
     if axes is None:
@@ -431,8 +416,10 @@ def error_bars(
 
 @dataclass(frozen=True)
 class Cost:
-    """An ``error``, and the median, least and most ``seconds`` of the work called ``name``; ``text`` stands beside it.
-    It is hollow where it was not ``measured``."""
+    """An ``error`` and the median, least and most ``seconds`` of the work ``name``, with a ``text`` beside the dot.
+
+    The dot is hollow where the seconds were not ``measured``.
+    """
 
     name: str
     error: float
@@ -442,16 +429,16 @@ class Cost:
 
 
 def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
-    """Error against time, in panels below each other; rings are around what no other in the panel beats in both.
+    """Draw error against time, in panels below each other, with rings around the Pareto front.
 
     Parameters
     ----------
     panels
-        points by the panels' titles, one at least each.
+        Points by the panels' titles, one at least each.
     error
-        name of the axis of errors, with its unit.
+        Name of the axis of errors, with its unit.
     levels
-        errors that others are held against, by name.
+        Errors for comparison, by name.
     """
     figure, places = panels_of(len(panels), 1, 1.3 + 2.8 * len(panels), _BARS, sharex=True)
     names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
@@ -481,7 +468,7 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Those of ``points`` that no other beats in both seconds and error, fastest first."""
+    """Return the ``points`` that no other point beats in both seconds and error, the fastest first."""
     front: list[Point] = []
     for seconds, error in sorted(points):
         if not front or error < front[-1][1]:
@@ -493,7 +480,7 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:
-    """Names of bars, from below, and a legend above the axes, where no bar is, of two or more kinds."""
+    """Set the names of bars, from below, and for two or more kinds a legend above the axes."""
     axes.set_yticks(range(len(names)), [fill(typeset(name), _NAME_LETTERS) for name in names])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(names) - 0.4)
@@ -502,18 +489,18 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _rows_height(names: Iterable[str]) -> float:
-    """Inches of rows of bars with these ``names``, all as high as the one of the most lines."""
+    """Return the height [inches] of rows of bars, all as high as the name with the most lines."""
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
     return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
-    """Errors of bars; None where none is known, so that no bar of zero is drawn."""
+    """Return the errors, or None where no error is known, so that no bar of zero is drawn."""
     return None if np.isnan(errors).all() else errors
 
 
 def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Ticks at these ``parts`` of a decade where powers of ten alone leave the x axis of ``axes`` one or none."""
+    """Set ticks at ``parts`` of a decade where powers of ten alone leave at most one tick on the x axis."""
     low, high = axes.get_xlim()
     if high < _SHORT_AXIS * low:
         axes.xaxis.set_major_locator(LogLocator(subs=parts))
@@ -522,22 +509,12 @@ def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
 
 
 def line_style(index: int) -> dict[str, Any]:
-    """Colour and dashes of the curve number ``index``."""
+    """Return colour and dashes of curve number ``index``."""
     return {"color": _PALETTE[index % len(_PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
 
 
 def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Names of the axes, where given, and a grid behind the data.
-
-    Parameters
-    ----------
-    axes
-        that are drawn on.
-    x, y
-        names, with units; empty for none.
-    grid
-        lines of which axis.
-    """
+    """Set the names of the axes with units, where given, and a grid behind the data."""
     if x:
         axes.set_xlabel(x, fontsize=FONT)
     if y:
@@ -547,15 +524,7 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    """A legend below a figure, in as many columns as its width has room for; none without names.
-
-    Parameters
-    ----------
-    figure
-        that it is of.
-    handles, labels
-        matplotlib's.
-    """
+    """Draw a legend below a figure, in as many columns as fit its width; without labels there is none."""
     names = list(labels)
     if not names:
         return
@@ -565,13 +534,7 @@ def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
 
 
 def tells(figure: Figure) -> bool:
-    """Whether a figure shows an image, or two points at least: a chart of nothing, or of one point, is not drawn.
-
-    Parameters
-    ----------
-    figure
-        of any study; only numbers count, and no line across all of the axes.
-    """
+    """Return True if a figure shows an image, or two points or bars; lines across all of the axes do not count."""
     for axes in figure.axes:
         if axes.images or any(
             isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
@@ -593,15 +556,9 @@ def tells(figure: Figure) -> bool:
 def figure_of(
     height: float, width: float = WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
 ) -> tuple[Figure, Axes]:
-    """An empty figure with its own Agg canvas and one open axes.
+    """Return an empty figure [inches] with its own Agg canvas and one axes.
 
-    Parameters
-    ----------
-    height, width
-        inches.
-    layout
-        matplotlib's engine: "compressed" makes room around an image of fixed aspect, whose row label "constrained" lets
-        run off the figure.
+    The layout "compressed" leaves space around an image of fixed aspect, whose labels "constrained" would cut off.
     """
     figure, places = panels_of(1, 1, height, width, layout)
     axes: Axes = places[0, 0]
@@ -616,17 +573,7 @@ def panels_of(
     layout: Literal["constrained", "compressed"] = "constrained",
     **shared: Any,
 ) -> tuple[Figure, Any]:
-    """An empty figure with (rows, columns) open axes.
-
-    Parameters
-    ----------
-    rows, columns
-        of axes.
-    height, width, layout
-        as for :func:`figure_of`.
-    **shared
-        as for matplotlib's ``subplots``.
-    """
+    """Return an empty figure with (rows, columns) axes; ``shared`` are options of matplotlib's ``subplots``."""
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
