@@ -48,5 +48,5 @@ def test_a_calibration_has_the_lines_of_its_run(tmp_path: Path) -> None:
                 run.check_calibration(wrong)
     mono = open_lines(tmp_path, RUN)
     assert mono.check_calibration(tmp_path).parts == {"": tmp_path}
-    with pytest.raises(MitsimError, match="is coloured, but .* is not"):
+    with pytest.raises(MitsimError, match=r"is coloured, but .* is not"):
         mono.check_calibration(calibration)
