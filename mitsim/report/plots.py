@@ -638,8 +638,8 @@ def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: A
     """Draw the factor of a camera's rows (``left``) or columns (``right``), and return the axes."""
     line = "row" if side == "left" else "column"
     title = f"{side.capitalize()} factor, of {line}s"
-    axes = _draw(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]", aspect="auto")
-    axes.set(xlabel=f"scene {line} [projector pixel]", ylabel=f"sensor {line} [pixel]")
+    axes = _draw(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]")
+    axes.set(aspect="auto", xlabel=f"scene {line} [projector pixel]", ylabel=f"sensor {line} [pixel]")
     return axes
 
 
@@ -699,11 +699,10 @@ def _draw(
     pixel: str = "",
     white: float | None = None,
     cmap: str = "gray",
-    aspect: Literal["equal", "auto"] = "equal",
 ) -> Axes:
     """Draw numbers (rows, columns) in equal steps, or, where ``white`` is given, as a screen shows reflectances."""
     shown, axes = np.asarray(values, dtype=np.float64), _axes(ax)
-    style: dict[str, Any] = {"cmap": cmap, "aspect": aspect, "interpolation": "none"}
+    style: dict[str, Any] = {"cmap": cmap, "interpolation": "none"}
     extend, scale = "neither", "linear"
     if white is not None:
         curve = (lambda part: lightness(part / white), lambda shade: white * linear_light(shade))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -204,35 +205,43 @@ def reconstruct_colours(
         For folders of different lines, and as :func:`reconstruct`.
     """
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
-    page, filters = options.pop("page", True), open_lines(run, RUN, MOSAIC).filters
-    lines = filters or read_colours(run, RUN)
+    page, found = options.pop("page", True), open_lines(run, RUN, MOSAIC)
+    lines = found.filters or read_colours(run, RUN)
     check_lines(lines, str(run), calibration)
-    solve = _solve_mosaic if filters else _solve_each
-    found = solve(lines, run, calibration, output, chart, overwrite, job, **options)
+    kind = _AllAtOnce if found.filters else _OneByOne
+    work = kind(lines, run, calibration, overwrite, job, **options)
+    with output_folder(output, overwrite=work.may_replace(output)) as folder:
+        image = work.solve(folder, chart)
+        image.write(folder, **_origin(job, run, calibration))
     if page:
         report_folder(output)
-    return found
+    return image
 
 
-def _solve_each(
-    lines: ColourManifest,
-    run: Path,
-    calibration: Path,
-    output: Path,
-    chart: ChartPlace | None,
-    overwrite: bool,
-    job: Job,
-    **options: Any,
-) -> ColourImage:
-    """Solve each line by itself, in a folder of its own."""
-    held = is_coloured(output)
-    earlier = held and read_colours(output, IMAGE).names == lines.names
-    with output_folder(output, overwrite=earlier or (overwrite and held)) as folder:
+class _OneByOne:
+    """Solves each line of a run by itself, in a folder of its own."""
+
+    def __init__(
+        self, lines: ColourManifest, run: Path, calibration: Path, overwrite: bool, job: Job, **options: Any
+    ) -> None:
+        self.lines, self.run, self.calibration, self.overwrite = lines, run, calibration, overwrite
+        self.job, self.options = job, options
+
+    def may_replace(self, output: Path) -> bool:
+        """Return True if ``output`` holds an image of the same lines, or one that may be replaced anyway."""
+        return is_coloured(output) and (read_colours(output, IMAGE).names == self.lines.names or self.overwrite)
+
+    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
         images = {
             name: reconstruct(
-                run / name, calibration / name, folder / name, overwrite=overwrite, job=job.apart(f"{name} "), **options
+                self.run / name,
+                self.calibration / name,
+                folder / name,
+                overwrite=self.overwrite,
+                job=self.job.apart(f"{name} "),
+                **self.options,
             )
-            for name in lines.names
+            for name in self.lines.names
         }
         solved = {name: judged.reconstruction for name, judged in images.items()}
         shapes = {each.image.shape for each in solved.values()}
@@ -240,10 +249,10 @@ def _solve_each(
             raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
         truths = [judged.truth for judged in images.values() if judged.truth is not None]
         of_lines = {name: judged.summary() for name, judged in images.items()}
-        found = ColourImage.of(
-            lines,
+        return ColourImage.of(
+            self.lines,
             np.stack([each.image for each in solved.values()], axis=-1),
-            _board_of(calibration, lines),
+            _board_of(self.calibration, self.lines),
             chart,
             truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
             qualities={name: judged.quality for name, judged in images.items()},
@@ -258,82 +267,78 @@ def _solve_each(
             output=str(folder),
             of_lines=of_lines,
         )
-        found.write(folder, **_origin(job, run, calibration))
-    return found
 
 
-@single_threaded_blas()
-def _solve_mosaic(
-    lines: ColourManifest,
-    run: Path,
-    calibration: Path,
-    output: Path,
-    chart: ChartPlace | None,
-    overwrite: bool,
-    job: Job,
-    way: str = JOINT,
-    lam: Lambda = "auto",
-) -> ColourImage:
-    """Solve all lines from the same frames, which were seen through colour filters."""
-    check_way(way)
-    check_joint(lam)
-    clock = job.apart("").clock
-    with clock.stage("read"):
-        shots = load_mosaic(run)
-        factors = {name: load_calibration(calibration / name) for name in lines.names}
-        for each in factors.values():
-            each.check_fit(shots.shots)
-    fingerprints = {"run": shots.shots.fingerprint, "calibration": "-".join(f.fingerprint for f in factors.values())}
-    inputs: dict[str, str | float] = {**fingerprints, "mosaic": way, "lambda": lam}
-    replaces = is_coloured(output)
-    if replaces:
+class _AllAtOnce:
+    """Solves all lines from the same frames, which were seen through colour filters."""
+
+    def __init__(
+        self,
+        lines: ColourManifest,
+        run: Path,
+        calibration: Path,
+        overwrite: bool,
+        job: Job,
+        way: str = JOINT,
+        lam: Lambda = "auto",
+    ) -> None:
+        check_joint(lam)
+        self.lines, self.calibration, self.overwrite = lines, calibration, overwrite
+        self.way, self.lam = check_way(way), lam
+        self.clock = job.apart("").clock
+        with self.clock.stage("read"):
+            self.mosaic = load_mosaic(run)
+            self.factors = {name: load_calibration(calibration / name) for name in lines.names}
+            for factors in self.factors.values():
+                factors.check_fit(self.mosaic.shots)
+
+    @cached_property
+    def inputs(self) -> dict[str, str | float]:
+        """What the image is made of, by which colour.json recognises it."""
+        calibration = "-".join(factors.fingerprint for factors in self.factors.values())
+        run = self.mosaic.shots.fingerprint
+        return {"run": run, "calibration": calibration, "mosaic": self.way, "lambda": self.lam}
+
+    def may_replace(self, output: Path) -> bool:
+        """Return True if ``output`` holds an image; MitsimError where that is of other inputs and must stay."""
+        if not is_coloured(output):
+            return False
         read_colours(output, IMAGE)
-        if not overwrite:
-            check_same_inputs(output, read_json(output / COLOUR), inputs)
-    with output_folder(output, overwrite=replaces) as folder:
-        with clock.stage("accumulate"):
-            pairs = [(each.left, each.right) for each in factors.values()]
-            camera = MosaicCamera.of(pairs, shots.weights, shots.manifest.mosaic)
-            solver, data, noise = Solver(way, camera, shots.shots.patterns), 0.0, 0.0
-            for each in shots.shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
+        if not self.overwrite:
+            check_same_inputs(output, read_json(output / COLOUR), self.inputs)
+        return True
+
+    @single_threaded_blas()
+    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
+        lines, shots = self.lines, self.mosaic.shots
+        with self.clock.stage("accumulate"):
+            pairs = [(factors.left, factors.right) for factors in self.factors.values()]
+            camera = MosaicCamera.of(pairs, self.mosaic.weights, self.mosaic.manifest.mosaic)
+            solver, data, noise = Solver(self.way, camera, shots.patterns), 0.0, 0.0
+            for each in shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
                 solver.add(each.frame, each.row, each.column)
                 data += float(np.square(each.frame).sum())
-                noise += float(np.maximum(shots.shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
-        with clock.stage("solve"):
-            solved = solver.images(lam)
+                noise += float(np.maximum(shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
+        with self.clock.stage("solve"):
+            solved = solver.images(self.lam)
         # What the noise of frames and factors leaves of the residual, as a part of the data.
         explained = 0.0
-        for each in factors.values():
-            if (own := each.manifest.noise) is not None:
-                sides = (own.left, each.left), (own.right, each.right)
+        for factors in self.factors.values():
+            if (own := factors.manifest.noise) is not None:
+                sides = (own.left, factors.left), (own.right, factors.right)
                 explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
         unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
-        board, qualities = _board_of(calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
-        truth = shots.truth(board)
+        board, qualities = _board_of(self.calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
+        truth, steps = self.mosaic.truth(board), solved.joint and solved.joint.iterations
         for number, name in enumerate(lines.names if truth is not None else ()):
-            own = shots.truths[name]
-            error = float(np.sqrt(np.square(own.standard_error).mean())) * own.board / (board or own.board)
+            known = self.mosaic.truths[name]
+            error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
             qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
-        warnings = [f"The capture was flagged: {text.rstrip('.')}." for text in shots.warnings]
-        warnings += [
-            f"The calibration of {name} was flagged: {text.rstrip('.')}."
-            for name, each in factors.items()
-            for text in each.warnings
-        ]
-        if unexplained > UNEXPLAINED:
-            warnings.insert(
-                0,
-                f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond "
-                "noise; look for depth, light over several surfaces or another camera than was calibrated.",
-            )
-        if solved.joint is not None and not solved.joint.ok:
-            warnings.insert(
-                0,
-                f"Not converged: {solved.joint.iterations} steps leave {solved.joint.residual:.1e} of the normal "
-                "equations; raise lambda.",
-            )
-        steps = solved.joint and solved.joint.iterations
-        found = ColourImage.of(
+        for name, image in zip(lines.names, solved.images, strict=True):
+            with output_folder(folder / name, overwrite=True) as place:
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                write_bytes(place / PICTURE_FILE, png(image))
+        return ColourImage.of(
             lines,
             np.moveaxis(solved.images, 0, -1),
             board,
@@ -342,28 +347,39 @@ def _solve_mosaic(
             qualities=qualities,
             facts={
                 "frames": "all lines at once, behind colour filters",
-                "solved": way if steps is None else f"{way}, {steps} steps",
+                "solved": self.way if steps is None else f"{self.way}, {steps} steps",
                 "lambda": f"{solved.lam:.3g}",
                 "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
             },
-            warnings=tuple(warnings),
-            seconds=clock.seconds(),
+            warnings=self._warnings(solved.joint, unexplained),
+            seconds=self.clock.seconds(),
             output=str(folder),
             solution={
-                "mosaic": way,
+                "mosaic": self.way,
                 "lambda": solved.lam,
                 "steps": steps,
                 "residual": solved.residual,
                 "unexplained": unexplained,
             },
-            inputs=inputs,
+            inputs=self.inputs,
         )
-        for name, image in zip(lines.names, solved.images, strict=True):
-            with output_folder(folder / name, overwrite=True) as place:
-                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
-                write_bytes(place / PICTURE_FILE, png(image))
-        found.write(folder, **_origin(job, run, calibration))
-    return found
+
+    def _warnings(self, joint: Solution | None, unexplained: float) -> tuple[str, ...]:
+        warnings = []
+        if joint is not None and not joint.ok:
+            warnings.append(
+                f"Not converged: {joint.iterations} steps leave {joint.residual:.1e} of the normal equations; raise "
+                "lambda."
+            )
+        if unexplained > UNEXPLAINED:
+            warnings.append(
+                f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond "
+                "noise; look for depth, light over several surfaces or another camera than was calibrated."
+            )
+        flags = {"The capture": self.mosaic.warnings}
+        flags |= {f"The calibration of {name}": factors.warnings for name, factors in self.factors.items()}
+        flagged = [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
+        return (*warnings, *flagged)
 
 
 def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
