@@ -8,23 +8,25 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import check_arguments
 from mitsim.core.job import Job
+from mitsim.core.options import takes
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
-    from typing import Self
+    from typing_extensions import Self, Unpack
 
     from mitsim.acquire.capture import Light
     from mitsim.acquire.choose_colour import Coloured
     from mitsim.acquire.reference import Rendered
+    from mitsim.bench.request import ExposureKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
-    from mitsim.devices.session import BoardShape, SessionRecipe
+    from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
     from mitsim.report.bench_view import BenchView
@@ -88,16 +90,14 @@ class Bench(Apparatus):
 
     # ---- The plan, and light of the scene ----
 
-    @check_arguments
-    def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
+    @takes(Request, "patterns")
+    def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
 
         Parameters
         ----------
         patterns
             of a family (:func:`mitsim.devices.patterns.parse_patterns`).
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, such as ``accuracy`` or ``effects``.
 
         Raises
         ------
@@ -106,10 +106,10 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.spectral import plan_request
 
-        return plan_request(self, Request.of(patterns=patterns, **request))
+        return plan_request(self, Request(patterns=patterns, **request))
 
-    @check_arguments
-    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Any) -> Light:
+    @takes(Request, "patterns")
+    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Unpack[ExposureKeys]) -> Light:
         """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
         :meth:`plan`.
 
@@ -119,8 +119,6 @@ class Bench(Apparatus):
             the family whose frames are to have the accuracy, or a plan of this bench.
         job
             clock, progress and limits.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`.
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
@@ -136,14 +134,14 @@ class Bench(Apparatus):
 
     # ---- Captures ----
 
-    @check_arguments
+    @takes(Request, "patterns")
     def capture(
         self,
         plan: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[ExposureKeys],
     ) -> Capture:
         """One noisy frame for each shot of a pattern family.
 
@@ -157,9 +155,6 @@ class Bench(Apparatus):
             go on with an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
         job
             clock, progress and limits.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`; of a plan, all but accuracy, seconds and effects, and
-            of patterns and seeds such as light the same pixels together.
 
         Raises
         ------
@@ -177,14 +172,14 @@ class Bench(Apparatus):
 
     # ---- Spectral lines and colour filters ----
 
-    @check_arguments
+    @takes(Request, "patterns")
     def capture_lines(
         self,
         patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[ExposureKeys],
     ) -> dict[str, Capture]:
         """Sequential colour: a capture of each spectral line of the projector, by its name, as ``638nm``.
 
@@ -199,8 +194,6 @@ class Bench(Apparatus):
             folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
         resume, job
             as for :meth:`capture`.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -215,8 +208,8 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
 
-    @check_arguments
-    def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured[Self]:
+    @takes(Request, "patterns")
+    def choose_colour(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Coloured[Self]:
         """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
 
         Looks at the scene in this variant and in the spectral one, and sets that of the bench that it returns.
@@ -225,8 +218,6 @@ class Bench(Apparatus):
         ----------
         patterns
             name of the family.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -235,7 +226,7 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.choose_colour import choose_colour
 
-        return choose_colour(self, Request.of(patterns=patterns, **request))
+        return choose_colour(self, Request(patterns=patterns, **request))
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:
@@ -243,21 +234,19 @@ class Bench(Apparatus):
         not be used with it. MitsimError as :func:`mitsim.open_bench`."""
         return reopen(self, variant)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_lines(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
         """Sequential colour: the camera's factors at each spectral line of the projector, by its name.
 
         Parameters
         ----------
-        seed, accuracy, recipe, resume, job
+        resume, job
             as for :meth:`calibrate`.
         output
             folder that holds a calibration's folder for each line, and colour.json; None keeps them in memory.
@@ -271,16 +260,16 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate_lines
 
-        return calibrate_lines(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate_lines(self, SessionRequest(**request), task)
 
-    @check_arguments
+    @takes(Request, "patterns")
     def capture_mosaic(
         self,
         patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[ExposureKeys],
     ) -> MosaicCapture:
         """All lines of the projector at once, seen by a camera under a mosaic of colour filters: one frame a shot.
 
@@ -294,8 +283,6 @@ class Bench(Apparatus):
             RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
         resume, job
             as for :meth:`capture`.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -310,27 +297,23 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_mosaic(self, request_of(patterns, request), task, known)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_mosaic(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
         """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
 
-        One session a line, whose light the filters dim; each pixel's reading is divided by what its filter passes of
+        One session a line, by the shipped recipe with four shots of each pattern if none is given, whose light the filters dim; each pixel's reading is divided by what its filter passes of
         the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
 
         Parameters
         ----------
-        seed, accuracy, output, resume, job
+        output, resume, job
             as for :meth:`calibrate_lines`.
-        recipe
-            how each session is run; None: the shipped one, with four shots of each pattern.
 
         Raises
         ------
@@ -341,30 +324,22 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate_mosaic
 
-        return calibrate_mosaic(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate_mosaic(self, SessionRequest(**request), task)
 
     # ---- Calibration sessions ----
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> Factors:
         """The camera's two factors, from a rendered Hadamard session on a white board.
 
         Parameters
         ----------
-        seed
-            root of every random stream.
-        accuracy
-            relative rms error of the expected responses.
-        recipe
-            how the session is run; None: the shipped one.
         output
             CAL folder that is written, with its unfinished parts meanwhile; None keeps the factors in memory.
         resume
@@ -381,41 +356,37 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate
 
-        return calibrate(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate(self, SessionRequest(**request), task)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_depths(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[float, Factors]:
         """The camera's two factors at each of a recipe's depths, by depth [mm]. MitsimError as :meth:`calibrate`, and
         for a recipe without depths, or with one at which the mask is.
 
         Parameters
         ----------
-        seed, accuracy, recipe, resume, job
+        resume, job
             as :meth:`calibrate`.
         output
             folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
-        return calibrate_depths(self, SessionRequest(seed, accuracy, recipe), Task.of(output, resume, job))
+        return calibrate_depths(self, SessionRequest(**request), Task.of(output, resume, job))
 
-    @check_arguments
+    @takes(SessionRequest)
     def write_session(
         self,
         frames: Path | str,
         output: Path | str | None = None,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> Factors:
         """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
         which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe
@@ -425,12 +396,12 @@ class Bench(Apparatus):
         ----------
         frames
             new or empty folder.
-        output, seed, accuracy, recipe, job
+        output, job
             as :meth:`calibrate`.
         """
         from mitsim.calibrate.calibrate import write_session
 
-        return write_session(self, frames, SessionRequest(seed, accuracy, recipe), Task.of(output, job=job))
+        return write_session(self, frames, SessionRequest(**request), Task.of(output, job=job))
 
     # ---- The bench to look at, renderings, and the same devices before a board ----
 

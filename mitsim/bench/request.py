@@ -11,24 +11,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import AfterValidator, BeforeValidator
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import validate
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.mistakes import refusal
+from mitsim.core.options import QUALITY, Options, option
 from mitsim.core.seeds import check_root
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
+from mitsim.devices.session import SessionRecipe
 
 if TYPE_CHECKING:
     from mitsim.devices.camera import Devices
-    from mitsim.devices.session import SessionRecipe
 
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
@@ -83,25 +82,6 @@ class Task:
         """The stage "imports" of the job's clock."""
         with self.job.clock.stage("imports"), pause_collector():
             yield
-
-
-@dataclass(frozen=True)
-class SessionRequest:
-    """Which factors are wanted, and how well.
-
-    Attributes
-    ----------
-    seed
-        root of every random stream.
-    accuracy
-        relative rms error of the expected responses.
-    recipe
-        how the session is run; None: the shipped one.
-    """
-
-    seed: int = 0
-    accuracy: float = 1e-3
-    recipe: SessionRecipe | None = None
 
 
 @dataclass(frozen=True)
@@ -175,6 +155,10 @@ def check_untimed(seconds: float | None) -> None:
         )
 
 
+def _switches(effects: object) -> object:
+    return parse_switches(effects) if isinstance(effects, str) else effects
+
+
 def _of_a_family(patterns: str) -> str:
     read_name(patterns)
     return patterns
@@ -197,55 +181,87 @@ def _some_shots(shots: int) -> int:
     return shots
 
 
-class Request(BaseModel):
+class Seeded(Options):
+    """The root of all random streams."""
+
+    seed: Annotated[int, AfterValidator(check_root)] = option(0, "root of every random stream", panel=QUALITY)
+
+
+class SeedKeys(TypedDict, total=False):
+    """Keywords of :class:`Seeded`, for type checkers; tests/test_verbs.py compares such classes with their models."""
+
+    seed: int
+
+
+class SampledKeys(SeedKeys, total=False):
+    """Keywords of :class:`Sampled`."""
+
+    accuracy: float
+
+
+class SessionKeys(SampledKeys, total=False):
+    """Keywords of :class:`SessionRequest`."""
+
+    recipe: SessionRecipe | None
+
+
+class ExposureKeys(SampledKeys, total=False):
+    """Keywords of :class:`Request`, without the patterns."""
+
+    exposure: float | Literal["auto"]
+    exposure_fraction: float
+    seconds: float | None
+    effects: dict[str, bool] | str
+    noise_fraction: float | None
+    ambient_frame: Literal["auto", "yes", "no"]
+    ambient_shots: int | None
+    closing_frame: Literal["first", "uniform"] | None
+
+
+class Sampled(Seeded):
+    """How finely light is sampled."""
+
+    accuracy: Annotated[float, AfterValidator(check_accuracy)] = option(
+        1e-3, "relative rms error of the expected frames", panel=QUALITY
+    )
+
+
+class Timed(Seeded):
+    """How long the camera is exposed."""
+
+    exposure: float | Literal["auto"] = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
+    exposure_fraction: float = option(0.8, "brightest pixel, as a part of full well", metavar="PART")
+
+
+class Request(Sampled, Timed):
     """Which shots of a scene are wanted, and how well."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-    patterns: Annotated[str, AfterValidator(_of_a_family)] = Field("dots:7", description=pattern_names())
-    accuracy: Annotated[float, AfterValidator(check_accuracy)] = Field(
-        1e-3, description="relative rms error of the expected frames"
+    patterns: Annotated[str, AfterValidator(_of_a_family)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+    seconds: Annotated[float, AfterValidator(_some_time)] | None = option(
+        None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY
     )
-    seconds: Annotated[float, AfterValidator(_some_time)] | None = Field(
-        None, description="take the finest accuracy that a run of so many seconds buys"
+    effects: Annotated[dict[str, bool], BeforeValidator(_switches), AfterValidator(check_switches)] = option(
+        {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
     )
-    seed: Annotated[int, AfterValidator(check_root)] = Field(0, description="root of every random stream")
-    exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
-    exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
-    effects: Annotated[dict[str, bool], AfterValidator(check_switches)] = Field(
-        {}, description="effects switched on or off, whatever they are worth"
+    noise_fraction: Annotated[float, AfterValidator(_worth_it)] | None = option(
+        None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY
     )
-    noise_fraction: Annotated[float, AfterValidator(_worth_it)] | None = Field(
-        None, description="stop sampling at this part of the sensor's noise"
+    ambient_frame: Literal["auto", "yes", "no"] = option(
+        "auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no"
     )
-    ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
-    ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = Field(
-        None, description="shots of that frame; None: by the patterns"
+    ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = option(
+        None, "shots of that frame; by the patterns if not given", metavar="N"
     )
-    closing_frame: Literal["first", "uniform"] | None = Field(
-        None, description="frame at the end that checks lamp, camera and scene: the first one again, or a uniform one"
+    closing_frame: Literal["first", "uniform"] | None = option(
+        None,
+        "frame at the end that checks lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
     )
-
-    def __init__(self, **values: Any) -> None:
-        """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise refusal(type(self), error, "request") from error
 
     @classmethod
-    @check_arguments
-    def of(cls, **values: object) -> Request:
-        """The request of these ``values``; effects may be written ``"+ambient,-diffraction"``.
-
-        Raises
-        ------
-        MitsimError
-            for a name that is no field, or a value that a field cannot have.
-        """
-        if isinstance(values.get("effects"), str):
-            values["effects"] = parse_switches(str(values["effects"]))
-        return validate(cls, values, "request")
+    def of(cls, **values: Any) -> Request:
+        """Return the request of these ``values``; MitsimError for one that cannot be served."""
+        return cls(**values)
 
     def with_values(self, **values: object) -> Request:
         """The same request with other ``values``; MitsimError as :meth:`of`."""
@@ -257,15 +273,6 @@ class Request(BaseModel):
         unused = {"accuracy" if self.seconds is not None else "seconds"}
         # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
-
-    @field_validator("ambient_frame", "closing_frame", mode="before")
-    @classmethod
-    def _a_choice(cls, choice: object, info: ValidationInfo) -> object:
-        allowed = {"ambient_frame": ("auto", "yes", "no"), "closing_frame": ("first", "uniform")}
-        *most, last = allowed[str(info.field_name)]
-        if choice not in (*most, last) and not (choice is None and info.field_name == "closing_frame"):
-            raise ArgumentError(str(info.field_name), f"{choice!r}: use {', '.join(most)} or {last}")
-        return choice
 
     def model_post_init(self, _: object) -> None:
         """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
@@ -286,6 +293,12 @@ class Request(BaseModel):
     def timing(self) -> Exposure:
         """How the exposure time is found."""
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
+
+
+class SessionRequest(Sampled):
+    """Which factors a calibration is to find, and how well."""
+
+    recipe: SessionRecipe | None = option(None, "session recipe, TOML", metavar="FILE.toml")
 
 
 # ---- What `mitsim sense` takes ----

@@ -35,7 +35,7 @@ NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=Fa
 class Configuration(pydantic.BaseModel):
     """A frozen model of finite numbers, of the very types that it states, without further fields."""
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
 
 def shipped_path(*parts: str) -> Path:

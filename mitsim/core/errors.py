@@ -124,23 +124,21 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     annotated = {name: each.annotation for name, each in signature.parameters.items()}
     kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
 
-    rest = next((kinds[name] for name, each in signature.parameters.items() if each.kind == each.VAR_KEYWORD), [])
-
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
         for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
-            allowed = kinds.get(name, rest)
+            allowed = kinds.get(name)
             if allowed and not any(allows(value) for _, allows in allowed):
                 words = " or ".join(dict.fromkeys(words for words, _ in allowed))
                 raise ArgumentError(name, f"{short_text(value)}: give {words}")
-        plain = {name: _plain(value) for name, value in named.items()}
-        return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
+        plain = {name: plain_number(value) for name, value in named.items()}
+        return function(*map(plain_number, arguments), **plain)  # type: ignore[arg-type]
 
     return call
 
 
-def _plain(value: object) -> object:
-    """A number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
+def plain_number(value: object) -> object:
+    """Return a number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
     if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
         return value
     kind = getattr(getattr(value, "dtype", None), "kind", "")
