@@ -86,7 +86,7 @@ class Light(SampledLight):
     """Sampled light of one scene, ready to be exposed; its attributes are those of
     :class:`mitsim.light.light.SampledLight`."""
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def expose(
         self,
         patterns: str = "dots:7",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mitsim.acquire.capture import Light
     from mitsim.acquire.choose_colour import Coloured
     from mitsim.acquire.reference import Rendered
-    from mitsim.bench.request import ExposureKeys, SessionKeys
+    from mitsim.bench.request import ExposureKeys, RequestKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
     from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
@@ -90,7 +90,7 @@ class Bench(Apparatus):
 
     # ---- The plan, and light of the scene ----
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
         """What will be simulated, why, and what it costs, by a short look at the scene.
 
@@ -108,7 +108,7 @@ class Bench(Apparatus):
 
         return plan_request(self, Request(patterns=patterns, **request))
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Unpack[ExposureKeys]) -> Light:
         """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
         :meth:`plan`.
@@ -134,14 +134,14 @@ class Bench(Apparatus):
 
     # ---- Captures ----
 
-    @takes(Request, "patterns")
+    @takes(Request)
     def capture(
         self,
         plan: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Unpack[ExposureKeys],
+        **request: Unpack[RequestKeys],
     ) -> Capture:
         """One noisy frame for each shot of a pattern family.
 
@@ -172,7 +172,7 @@ class Bench(Apparatus):
 
     # ---- Spectral lines and colour filters ----
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def capture_lines(
         self,
         patterns: Plan | str = "dots:7",
@@ -208,7 +208,7 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def choose_colour(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Coloured[Self]:
         """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
 
@@ -262,7 +262,7 @@ class Bench(Apparatus):
 
         return calibrate_lines(self, SessionRequest(**request), task)
 
-    @takes(Request, "patterns")
+    @takes(Request, without="patterns")
     def capture_mosaic(
         self,
         patterns: Plan | str = "dots:7",
@@ -307,7 +307,8 @@ class Bench(Apparatus):
     ) -> dict[str, Factors]:
         """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
 
-        One session a line, by the shipped recipe with four shots of each pattern if none is given, whose light the filters dim; each pixel's reading is divided by what its filter passes of
+        One session a line, by the shipped recipe with four shots of each pattern if none is given. The filters dim its
+        light; each pixel's reading is divided by what its filter passes of
         the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
 
         Parameters

@@ -7,24 +7,29 @@ what a calibration is to find, and :class:`Task` where results go and who watche
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BeforeValidator, field_validator
 
 from mitsim.bench.effects import check_switches, parse_switches
+from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate
+from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.options import QUALITY, Options, option
+from mitsim.core.manifests import MOST_SHOTS
+from mitsim.core.options import DEVICES, LIMITS, QUALITY, Options, option, shipped_names
 from mitsim.core.seeds import check_root
+from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
-from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
-from mitsim.devices.session import SessionRecipe
+from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel, load_sensor
+from mitsim.devices.session import SessionRecipe, load_recipe
 
 if TYPE_CHECKING:
     from mitsim.devices.camera import Devices
@@ -159,26 +164,10 @@ def _switches(effects: object) -> object:
     return parse_switches(effects) if isinstance(effects, str) else effects
 
 
-def _of_a_family(patterns: str) -> str:
+def family_of(patterns: str) -> str:
+    """Return the ``patterns``, the name of a family; ArgumentError for another name."""
     read_name(patterns)
     return patterns
-
-
-def _some_time(seconds: float) -> float:
-    if not 0 < seconds <= LONGEST_S:
-        raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
-    return seconds
-
-
-def _worth_it(fraction: float) -> float:
-    return _check_range("noise_fraction", fraction, _LEAST_NOISE, 1, "a part of the sensor's noise from {}")
-
-
-def _some_shots(shots: int) -> int:
-    from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
-
-    _check_range("ambient_shots", shots, 1, MOST_SHOTS, "{} shots, or none for the patterns' own")
-    return shots
 
 
 class Seeded(Options):
@@ -218,6 +207,12 @@ class ExposureKeys(SampledKeys, total=False):
     closing_frame: Literal["first", "uniform"] | None
 
 
+class RequestKeys(ExposureKeys, total=False):
+    """Keywords of :class:`Request`."""
+
+    patterns: str
+
+
 class Sampled(Seeded):
     """How finely light is sampled."""
 
@@ -232,25 +227,34 @@ class Timed(Seeded):
     exposure: float | Literal["auto"] = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
     exposure_fraction: float = option(0.8, "brightest pixel, as a part of full well", metavar="PART")
 
+    def model_post_init(self, context: object) -> None:
+        """Refuse an exposure that no camera has."""
+        self.timing  # noqa: B018 - checks itself
+
+    @property
+    def timing(self) -> Exposure:
+        """How the exposure time is found."""
+        return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
+
 
 class Request(Sampled, Timed):
     """Which shots of a scene are wanted, and how well."""
 
-    patterns: Annotated[str, AfterValidator(_of_a_family)] = option("dots:7", pattern_names(), metavar="PATTERNS")
-    seconds: Annotated[float, AfterValidator(_some_time)] | None = option(
-        None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY
+    patterns: Annotated[str, AfterValidator(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+    seconds: float | None = option(
+        None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
     effects: Annotated[dict[str, bool], BeforeValidator(_switches), AfterValidator(check_switches)] = option(
         {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
     )
-    noise_fraction: Annotated[float, AfterValidator(_worth_it)] | None = option(
-        None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY
+    noise_fraction: float | None = option(
+        None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY, ge=_LEAST_NOISE, le=1
     )
     ambient_frame: Literal["auto", "yes", "no"] = option(
         "auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no"
     )
-    ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = option(
-        None, "shots of that frame; by the patterns if not given", metavar="N"
+    ambient_shots: int | None = option(
+        None, "shots of that frame; by the patterns if not given", metavar="N", ge=1, le=MOST_SHOTS
     )
     closing_frame: Literal["first", "uniform"] | None = option(
         None,
@@ -267,6 +271,13 @@ class Request(Sampled, Timed):
         """The same request with other ``values``; MitsimError as :meth:`of`."""
         return Request.of(**{**self.model_dump(exclude_unset=True), **values})
 
+    def refuse_idle(self) -> None:
+        """Refuse options that have no effect beside others that are given."""
+        if self.exposure != "auto":
+            self.refuse(["exposure_fraction"], "on an exposure in seconds")
+        if self.ambient_frame == "no":
+            self.refuse(["ambient_shots"], "with ambient_frame no")
+
     @property
     def deciding(self) -> dict[str, Any]:
         """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
@@ -274,9 +285,9 @@ class Request(Sampled, Timed):
         # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
 
-    def model_post_init(self, _: object) -> None:
-        """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
-        self.timing  # noqa: B018 - checks itself
+    def model_post_init(self, context: object) -> None:
+        """Refuse an exposure that no camera has, and seconds beside what they decide."""
+        super().model_post_init(context)
         if self.seconds is None:
             return
         if "accuracy" in self.model_fields_set:
@@ -289,16 +300,176 @@ class Request(Sampled, Timed):
                 f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
             )
 
-    @property
-    def timing(self) -> Exposure:
-        """How the exposure time is found."""
-        return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
-
 
 class SessionRequest(Sampled):
     """Which factors a calibration is to find, and how well."""
 
-    recipe: SessionRecipe | None = option(None, "session recipe, TOML", metavar="FILE.toml")
+    recipe: SessionRecipe | None = option(
+        None, "session recipe, TOML", metavar="FILE.toml", kind=Path, read=load_recipe
+    )
+
+
+# ---- A scene and its devices ----
+
+NO, MOSAIC, AUTO = "no", "mosaic", "auto"
+"""Words of ``colour`` beside ``lines`` and ``bands:K``."""
+
+
+def by_line(colour: str) -> bool:
+    """Return True if a ``colour`` is lines, or bands of them, one after the other."""
+    return colour.partition(":")[0] in (LINES, BANDS)
+
+
+def _known_variant(name: str) -> str:
+    check_variant(name)
+    return name
+
+
+def _parameters(texts: Iterable[str]) -> dict[str, Any]:
+    """Return the scene's parameters that are written NAME=VALUE."""
+    parameters = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
+        if name in ("scene", "for_render", *Opening.model_fields):
+            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
+        parameters[name] = value
+    return parameters
+
+
+class OpeningKeys(TypedDict, total=False):
+    """Keywords of :class:`Opening`."""
+
+    variant: str
+    camera: Path | str | None
+    projector: Path | str | None
+    allow_outside_files: bool
+    parameters: Mapping[str, Any]
+
+
+class Variant(Options):
+    """The variant of Mitsuba."""
+
+    variant: Annotated[str, AfterValidator(_known_variant)] = option(
+        DEFAULT_VARIANT,
+        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
+        metavar="VARIANT",
+        panel=LIMITS,
+    )
+
+
+class LitScene(Variant):
+    """What opens a scene with the projector's light."""
+
+    PANEL = DEVICES
+
+    projector: Path | str | None = option(
+        None, "projector: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
+    )
+    parameters: Mapping[str, Any] = option(
+        {}, "set a <default> of the scene", "-D", metavar="NAME=VALUE", kind=list[str], read=_parameters
+    )
+    allow_outside_files: bool = option(False, "let the scene read files outside its own folder")
+
+
+class Opening(LitScene):
+    """What opens a bench, beside its scene."""
+
+    camera: Path | str | None = option(
+        None, "camera electronics: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
+    )
+
+    def traced_in(self, colour: str) -> str:
+        """Return the variant that light is traced in for a ``colour``: one that knows wavelengths if lines are told
+        apart."""
+        return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
+
+    def check(
+        self,
+        scene: Path | str,
+        patterns: str | None = None,
+        timing: Exposure | None = None,
+        colour: str = NO,
+        seconds: float | None = None,
+    ) -> None:
+        """Refuse, before the renderer is imported, what the scene and its devices cannot have.
+
+        Parameters
+        ----------
+        scene, patterns
+            Scene of the bench, and a family that its projector is to show; None for no family.
+        timing
+            Exposure; None where nothing is exposed.
+        colour, seconds
+            Which light is told apart, and how long a capture is to take.
+        """
+        from mitsim.bench.apparatus import check_devices, check_scene
+        from mitsim.devices.projector import ProjectorModel
+
+        camera, projector = check_devices(self.camera, self.projector)
+        sensor = load_sensor(camera)
+        if colour == MOSAIC and sensor.mosaic is None:
+            raise ArgumentError(
+                "colour",
+                f"mosaic: camera {camera} has no mosaic of colour filters; give one that has, such as imx249_rggb, or "
+                "use colour lines",
+            )
+        if colour not in (NO, MOSAIC) and sensor.mosaic is not None:
+            raise ArgumentError(
+                "colour",
+                f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once; use "
+                "colour mosaic",
+            )
+        if colour != NO:
+            check_untimed(seconds)
+        if colour == AUTO:
+            check_undecided(self.variant)
+        elif by_line(colour) or colour == MOSAIC:
+            light = load_model(projector, ProjectorModel)
+            (light.in_bands(bands_of(colour)) if colour.startswith(BANDS) else light).traced_lines  # noqa: B018
+        if timing is not None and colour != MOSAIC:
+            timing.check(sensor, camera)
+        check_scene(scene, self.texts, self.allow_outside_files, [] if patterns is None else [patterns])
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The parameters as a scene spells them."""
+        from mitsim.bench.apparatus import spelling
+
+        return {name: spelling(value) for name, value in self.parameters.items()}
+
+    @property
+    def models(self) -> list[Path]:
+        """Files of the camera and its mask, and of the projector, that are named."""
+        from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
+
+        named = (self.camera, CAMERA), (self.projector, PROJECTOR)
+        files = [locate(each, "calibration", ".toml", field) for each, field in named if each]
+        mask = load_mask(files[0]) if self.camera else None
+        return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
+
+
+class Coloured(Options):
+    """Which of the projector's light is told apart."""
+
+    colour: str = option(
+        NO,
+        "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
+        "its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or lines, as the "
+        "accuracy needs (not calibrate); no: light that is not told apart",
+        metavar="no|lines|bands:K|mosaic|auto",
+    )
+    WORDS: ClassVar[tuple[str, ...]] = (NO, LINES, f"{BANDS}:K", MOSAIC, AUTO)
+
+    @field_validator("colour")
+    @classmethod
+    def _of_a_kind(cls, colour: str) -> str:
+        if colour.startswith(f"{BANDS}:"):
+            bands_of(colour)
+        elif colour not in cls.WORDS:
+            raise ArgumentError("colour", f"{colour!r}: use {', '.join(cls.WORDS[:-1])} or {cls.WORDS[-1]}")
+        return colour
 
 
 # ---- What `mitsim sense` takes ----
@@ -307,8 +478,35 @@ IMAGES, ENDINGS = (".exr", ".npy"), (".png", ".exr", ".npy")
 """Files that an image is read from, and digital numbers are written to."""
 _LARGEST_PNG = 2**16 - 1
 """What 16 bits of grey hold."""
-_WAVELENGTHS_NM = 1.0, 1e6
-"""As a projector's."""
+
+
+class Lit(Options):
+    """Light of one wavelength."""
+
+    wavelength: float = option(550.0, "of the light [nm]", ge=1, le=1e6)
+
+
+class Irradiance(Timed, Lit):
+    """How an image's numbers are light on a sensor, and how the sensor is exposed to it."""
+
+    VERB = "sense"
+
+    exposure: float | Literal["auto"] = option("auto", "seconds, or auto", metavar="auto|SECONDS")
+    f_number: float | None = option(
+        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N", ge=0.5, lt=math.inf
+    )
+    scale: float = option(1.0, "what its numbers are multiplied by", gt=0, lt=math.inf)
+    channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
+
+
+class IrradianceKeys(SeedKeys, total=False):
+    """Keywords of :class:`Irradiance`, without the exposure time."""
+
+    exposure_fraction: float
+    wavelength: float
+    f_number: float | None
+    scale: float
+    channel: str | None
 
 
 def check_image(path: Path) -> None:
@@ -316,17 +514,6 @@ def check_image(path: Path) -> None:
     if path.suffix.lower() not in IMAGES:
         raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
     check_plain(path, "image")
-
-
-def check_wavelength(wavelength_nm: float) -> None:
-    """ArgumentError for light of a ``wavelength_nm`` [nm] that there is not."""
-    _check_range("wavelength", wavelength_nm, *_WAVELENGTHS_NM, "{} nm")
-
-
-def check_f_number(f_number: float) -> None:
-    """ArgumentError for an ``f_number`` that no lens has."""
-    if not 0.5 <= f_number < math.inf:
-        raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
 
 
 def check_view(path: Path | str) -> Path:

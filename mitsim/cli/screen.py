@@ -1,24 +1,182 @@
-"""What the terminal shows: results and warnings in; text, JSON and an exit status out."""
+"""What the terminal shows: pages of help; results, warnings and the pages of their folders, as text or JSON.
+
+Help is plain text, on a terminal or not. Typer's panels of rich take half as long again to show, leave a sentence 22 of
+80 characters, and take `mitsim[learn]` for markup.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from mitsim.cli.options import Pictured, message_of
 from mitsim.core.errors import MitsimError, printable
+from mitsim.core.files import PICTURES
+from mitsim.core.options import OUTPUT, PANELS
 from mitsim.core.spectral_manifests import RUN, read_colours
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from mitsim.light.plan import Plan, PlanRow
+
+# ---- pages of help ---------------------------------------------------------------------------------------------------
+
+_NARROWEST = 30
+"""Columns that a page has at least: an option and a word beside it."""
+_FIRST_COLUMN = 3 / 8
+"""Part of the width that names of options have at most, so that what is said of them has twelve words of 80 columns and
+five of 40; chosen."""
+
+
+def parts_of(text: str | None) -> tuple[str, str, tuple[str, ...]]:
+    """A docstring's ``text`` in three: its first line, all else that is said, and the commands, its lines after a $."""
+    prose, *examples = re.split(r"\n\s*\$ ", (text or "").rstrip())
+    summary, _, more = prose.partition("\n")
+    return summary, more.strip(), tuple(examples)
+
+
+class _Page:
+    """What the pages of verbs and of the program share."""
+
+    help: str | None
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the page.
+
+        Parameters
+        ----------
+        ctx, formatter
+            of the command line, and what takes the text; click makes it no narrower than 50 columns.
+        """
+        formatter.width = min(formatter.width, max(shutil.get_terminal_size().columns - 2, _NARROWEST))
+        self.format_usage(ctx, formatter)  # type: ignore[attr-defined]
+        summary, more, examples = parts_of(self.help)
+        for text in filter(None, (summary, more)):
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write_text(text)
+        self.format_options(ctx, formatter)  # type: ignore[attr-defined]
+        if examples:
+            with formatter.section(_heading("Examples")):
+                for line in examples:
+                    formatter.write(f"  {line}\n")
+
+
+class Verb(_Page, TyperCommand):
+    """A verb, whose page has a heading for each panel of its options, and examples in the end."""
+
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        """Write the line of what must be given.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        words = [f"{each.opts[0]} {each.metavar}" if _is_option(each) else _name(each) for each in self.params
+                 if each.required or not _is_option(each)]  # fmt: skip
+        formatter.write_usage(ctx.command_path, " ".join([*words, "[OPTIONS]"]))
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write all that may be given, by panels.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        shown = self.get_params(ctx)
+        panels = {"Arguments": [each for each in shown if not _is_option(each)]}
+        for name in PANELS:
+            panels[name] = [each for each in shown if _is_option(each) and (_panel(each) or OUTPUT) == name]
+        _write_panels({name: [(_name(each), _meaning(each)) for each in panel] for name, panel in panels.items()},
+                      formatter)  # fmt: skip
+
+
+class Program(_Page, TyperGroup):
+    """The program, whose page has its verbs by panels, a whole line for each."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write verbs and options.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        panels = {
+            str(panel): [(str(verb.name), parts_of(verb.help)[0]) for verb in verbs]
+            for panel, verbs in groupby(self.commands.values(), _panel)
+        }
+        _write_panels(panels, formatter)
+        _write_panels({"Options": [(_name(each), _meaning(each)) for each in self.get_params(ctx)]}, formatter)
+
+
+def _write_panels(panels: Mapping[str, Sequence[tuple[str, str]]], formatter: Any) -> None:
+    """Write rows of names and meanings below a heading each, with the same columns in all of them."""
+    most = int(_FIRST_COLUMN * formatter.width)
+    width = max((len(name) for rows in panels.values() for name, _ in rows if len(name) <= most), default=0)
+    for heading, rows in panels.items():
+        if rows:
+            with formatter.section(_heading(heading)):
+                formatter.write_dl([(name.ljust(width), meaning) for name, meaning in rows], col_max=width)
+
+
+def _heading(text: str) -> str:
+    return typer.style(text, bold=True)  # left out where nobody would see it
+
+
+def _is_option(parameter: Any) -> bool:
+    return bool(parameter.param_type_name == "option")
+
+
+def _panel(holder: Any) -> Any:
+    return holder.rich_help_panel if hasattr(holder, "rich_help_panel") else None
+
+
+def _name(parameter: Any) -> str:
+    """What is typed for a parameter: its names, shortest first, and what stands for its value."""
+    if not _is_option(parameter):
+        return str(parameter.metavar)
+    names = ", ".join(sorted(parameter.opts, key=len))
+    return names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
+
+
+def _meaning(parameter: Any) -> str:
+    """What the help says of a parameter, with its default."""
+    least, most = (getattr(parameter, end, None) for end in ("min", "max"))
+    allowed = f"{least} to {most}" if most is not None else f"at least {least}" if least is not None else ""
+    needed = "required" if parameter.required and _is_option(parameter) else ""
+    return "; ".join(filter(None, [parameter.help, allowed, _default(parameter), needed]))
+
+
+def _default(parameter: Any) -> str:
+    shown = parameter.show_default
+    if isinstance(shown, str):
+        return f"default {shown}"
+    value = parameter.default
+    if not shown or value in (None, "", ()) or isinstance(value, bool):
+        return ""
+    return f"default {value:g}" if isinstance(value, float) else f"default {value}"
+
+
+# ---- results ---------------------------------------------------------------------------------------------------------
 
 _COLUMNS = 80
 """Of the usual terminal, and of what is no terminal."""
@@ -171,3 +329,85 @@ def write_at_end() -> Iterator[None]:
         if isinstance(error, BrokenPipeError):
             sys.exit(128 + signal.SIGPIPE)
         raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None
+
+
+# ---- pages and pictures of results -----------------------------------------------------------------------------------
+
+
+def finish_folder(
+    options: Pictured, folder: Path, payload: dict[str, Any], lines: Sequence[str], warnings: Sequence[str]
+) -> int:
+    """Make the pictures and the page of a folder whose work is done, and print the result; the exit status.
+
+    Parameters
+    ----------
+    options
+        of the verb.
+    folder
+        of the work, which is not lost where they cannot be made: a warning says so.
+    payload, lines, warnings
+        as for :func:`mitsim.cli.screen.finish`; JSON gains ``report``, null without a page.
+    """
+    again = f"`mitsim report {folder}` makes them later"
+    made, failed = _attempt(options, lambda: page_of(folder), again)
+    said = [] if made is None else [page_line(made)]
+    return finish(options.as_json, {**payload, "report": made}, [*lines, *said], [*warnings, *failed])
+
+
+def finish_frame(
+    options: Pictured,
+    frame: tuple[Path, npt.NDArray[Any], str],
+    payload: dict[str, Any],
+    lines: Sequence[str],
+    warnings: Sequence[str],
+) -> int:
+    """Make a picture beside a file of one frame, and print the result; the exit status.
+
+    Parameters
+    ----------
+    options
+        of the verb.
+    frame
+        its file, its numbers (rows, columns), or (rows, columns, 3) in colour, and their unit.
+    payload, lines, warnings
+        as for :func:`mitsim.cli.screen.finish`; JSON gains ``picture``, null without one.
+    """
+
+    def make() -> dict[str, Any]:
+        from mitsim.report.folder_pictures import write_beside
+
+        started = time.perf_counter()
+        file, words = write_beside(*frame)
+        return {"file": str(file), "shows": words, "seconds": time.perf_counter() - started}
+
+    made, failed = _attempt(options, make, "the frame is kept")
+    said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]
+    return finish(options.as_json, {**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
+
+
+def page_of(folder: Path) -> dict[str, Any]:
+    """The page of a ``folder`` and its pictures, for JSON."""
+    started = time.perf_counter()
+    from mitsim.report.folders import report_folder
+
+    page = report_folder(folder)
+    pictures = sorted(map(str, (folder / PICTURES).glob("*.png")))
+    return {"page": str(page), "pictures": pictures, "seconds": time.perf_counter() - started}
+
+
+def page_line(made: dict[str, Any]) -> str:
+    return f"Page: {made['page']} (pictures in {made['seconds']:.1f} s)"
+
+
+def _attempt(
+    options: Pictured, make: Callable[[], dict[str, Any]], kept: str
+) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
+    """What is to be made, unless nobody wants it; where that fails, nothing, and a warning with what is ``kept``."""
+    if options.no_pictures:
+        return None, ()
+    try:
+        return make(), ()
+    except MitsimError as error:
+        return None, (f"pictures: {message_of(error)}; {kept}",)
+    except (OSError, MemoryError) as error:
+        return None, (f"pictures: {getattr(error, 'strerror', None) or 'out of memory'}; {kept}",)

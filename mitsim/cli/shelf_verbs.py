@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.help_page import WHAT
-from mitsim.cli.options import Common, completing, refuse_unused, verb
+from mitsim.cli.options import Common, completing, verb
 from mitsim.cli.screen import finish
 from mitsim.core.configuration import (
     CAMERA,
@@ -28,6 +27,7 @@ from mitsim.core.configuration import (
     shipped_files,
 )
 from mitsim.core.errors import MitsimError, near_name
+from mitsim.core.options import WHAT, refuse_unused
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -315,7 +315,6 @@ _STARTERS = {
 @verb
 def new(
     *,
-    context: typer.Context,
     kind: Annotated[
         str,
         typer.Argument(help=", ".join(_STARTERS), metavar="KIND", autocompletion=completing(lambda: _STARTERS)),
@@ -340,6 +339,7 @@ def new(
         ),
     ] = None,
     common: Common,
+    given: set[str],
 ) -> int:
     """A file to begin with: commented, whole, valid as it is.
 
@@ -359,7 +359,7 @@ def new(
         raise MitsimError(f"new {kind} {name!r}: give a name of letters, digits, - and _ that begins with a letter")
     begin = _STARTERS[kind]
     if not begin.like:
-        refuse_unused(context, ["like"], f"on a {kind}, of which there is one to begin with")
+        refuse_unused(given, ["like"], f"on a {kind}, of which there is one to begin with")
     ending = ".py" if kind == "study" else "" if begin.lines is None else ".toml"
     output = output or Path(f"{name}{ending}")
     if output.suffix != ending and ending:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, ParamSpec, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from mitsim.core.errors import ArgumentError, check_arguments, near_name, plain_number, short_text
 
@@ -38,11 +39,21 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
     kind
         Type of the word on the command line, if it differs from the field's; False for an option of Python alone.
     shown
-        Further arguments of :class:`typer.Option`: ``metavar``, ``panel``, ``show_default``, ``min``, ``max``,
-        ``complete``, a function that lists words; and ``read``, which makes the value of the word.
+        Further arguments of :class:`typer.Option`, such as ``metavar`` and ``show_default``; ``panel``, a heading;
+        ``complete``, which lists words; ``read``, which makes the value of the word; and limits of a number: ``ge``,
+        ``gt``, ``le`` and ``lt``, or ``min`` and ``max`` where the help states them.
     """
-    extra: Any = {"names": names, "kind": kind, "shown": shown}
-    return Field(default, description=help, json_schema_extra=extra)
+    limits = {name: shown.pop(name) for name in ("ge", "gt", "le", "lt") if name in shown}
+    limits |= {name: shown[shown_as] for name, shown_as in (("ge", "min"), ("le", "max")) if shown_as in shown}
+    extra: Any = {"names": names, "kind": kind, **shown}
+    return Field(default, description=help, json_schema_extra=extra, **limits)
+
+
+def shipped_names(field: str) -> list[str]:
+    """Return the names of shipped files that have a ``field``, which a shell offers."""
+    from mitsim.core.configuration import shipped_files
+
+    return [*shipped_files("calibration", ".toml", field)]
 
 
 class Options(BaseModel):
@@ -68,19 +79,23 @@ class Options(BaseModel):
         found = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")[0]
         name, *inner = map(str, found["loc"])
         if found["type"] == "extra_forbidden" and not inner:
-            known = [*cls.model_fields]
-            of = f"option of {cls.VERB}" if cls.VERB else "such option"
-            return ArgumentError(name, f"is no {of}; {near_name(name, known)}use {', '.join(known)}")
+            return unknown_option(name, cls.VERB, [*cls.model_fields])
         if found["type"] == "missing":
             return ArgumentError(name, "is missing; give it")
-        kinds = [one["msg"] for one in error.errors() if one["loc"][0] == found["loc"][0]]
-        rule = " or ".join(dict.fromkeys(_rule(text) for text in kinds))
+        rules = (_rule(one["msg"]) for one in error.errors() if one["loc"][0] == found["loc"][0])
+        rule, limits = " or ".join(dict.fromkeys(rules)), limits_of(cls.model_fields[name])
+        if limits:
+            rule = f"a number from {limits}" if found["type"].startswith(("greater", "less")) else f"{rule}, {limits}"
         return ArgumentError(name, f"{short_text(found['input'])}: give {rule}")
 
     @property
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
         return {name: getattr(self, name) for name in type(self).model_fields if name in self.model_fields_set}
+
+    def without(self, *names: str) -> dict[str, Any]:
+        """Return the options that were given, but for those of some ``names``."""
+        return {name: value for name, value in self.given.items() if name not in names}
 
     def refuse(self, names: Iterable[str], where: str) -> None:
         """Refuse options that are given and have no effect: a user would believe that they are obeyed.
@@ -102,56 +117,62 @@ def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> Non
             raise ArgumentError(name, f"has no effect {where}; leave it out")
 
 
+def limits_of(field: FieldInfo) -> str:
+    """Return the range of a number that a ``field`` states, in words; empty without one."""
+    words = {"ge": "{:g}", "gt": "above {:g}", "le": "to {:g}", "lt": "to below {:g}"}
+    limits = {name: getattr(mark, name) for mark in field.metadata for name in words if hasattr(mark, name)}
+    if limits and not limits.keys() & {"le", "lt"}:
+        words["ge"] = "at least {:g}"
+    return " ".join(words[name].format(limits[name]) for name in words if name in limits)
+
+
 def _rule(message: str) -> str:
     """Return a rule of pydantic, without the words that all of them begin with."""
     return message.removeprefix("Value error, ").removeprefix("Input should be ")
 
 
-def takes(model: type[Options], *leave_out: str, **defaults: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Give a function that ends in ``**options`` the fields of a model as keyword arguments in its signature.
+def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Give a function that ends in ``**options`` the fields of models as keyword arguments in its signature.
 
     Its other arguments are checked as :func:`mitsim.core.errors.check_arguments` does.
 
     Parameters
     ----------
-    model
+    models
         What the function makes of its ``**options``.
-    leave_out
-        Fields that the function does not take by keyword.
-    defaults
-        Defaults that differ from the model's.
+    without
+        Fields that the function does not take by keyword, with spaces between.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        checked = check_arguments(function)
-        signature = inspect.signature(function)
+        checked, signature = check_arguments(function), inspect.signature(function)
         own = [each for each in signature.parameters.values() if each.kind != each.VAR_KEYWORD]
-        fields = [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=defaults.get(name, each.get_default(call_default_factory=True))
-                if not each.is_required()
-                else inspect.Parameter.empty,
-                annotation=each.annotation,
-            )
-            for name, each in model.model_fields.items()
-            if name not in {*leave_out, *signature.parameters}
-        ]
-        known = {each.name for each in (*own, *fields)}
+        left_out = {*without.split(), *signature.parameters}
+        fields = {name: each for model in models for name, each in model.model_fields.items() if name not in left_out}
 
         @functools.wraps(function)
         def call(*arguments: P.args, **named: P.kwargs) -> R:
-            for name in named.keys() - known:
-                of = f"option of {function.__name__}"
-                raise ArgumentError(
-                    name, f"is no {of}; {near_name(name, known)}use {', '.join(e.name for e in fields)}"
-                )
+            for name in named:
+                if name not in fields and name not in signature.parameters:
+                    raise unknown_option(name, function.__name__, [*fields])
             return checked(*arguments, **named)
 
-        call.__signature__ = signature.replace(parameters=[*own, *fields])  # type: ignore[attr-defined]
-        lines = [f"    {each.name}\n        {model.model_fields[each.name].description}." for each in fields]
-        call.__doc__ = "\n".join([inspect.getdoc(function) or "", "", "Options", "-------", *lines])
+        keywords = [_keyword(name, each) for name, each in fields.items()]
+        call.__signature__ = signature.replace(parameters=[*own, *keywords])  # type: ignore[attr-defined]
+        lines = [f"{name}\n    {each.description}" for name, each in fields.items()]
+        call.__doc__ = "\n".join([inspect.getdoc(function) or "", "", "Other Parameters", "----------------", *lines])
         return call
 
     return decorate
+
+
+def _keyword(name: str, field: FieldInfo) -> inspect.Parameter:
+    """Return the parameter of a signature that a ``field`` of a ``name`` is."""
+    default = inspect.Parameter.empty if field.is_required() else field.default
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=field.annotation)
+
+
+def unknown_option(name: str, function: str, known: Sequence[str]) -> ArgumentError:
+    """Return the refusal of an option that a ``function`` does not have, with those that are ``known``."""
+    of = f"option of {function}" if function else "such option"
+    return ArgumentError(name, f"is no {of}; {near_name(name, known)}use {', '.join(known)}")

@@ -70,7 +70,7 @@ def reconstruct(
         ``method``, ``focus``, ``margin``, ``depth_range``, ``bounds`` and ``iterations``, as of
         :class:`mitsim.reconstruct.request.ImageRequest`.
     """
-    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam=lam, **options)
     with job.clock.stage("read"):
         shots, factors = load_run(run), load_calibration(calibration)
         factors.check_fit(shots)
