@@ -9,9 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import AfterValidator
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.bench.request import (
     AUTO,
@@ -21,6 +19,7 @@ from mitsim.bench.request import (
     Irradiance,
     Opening,
     OpeningKeys,
+    Planned,
     Request,
     Sampled,
     SampledKeys,
@@ -36,7 +35,7 @@ from mitsim.core.configuration import CAMERA, load_model, locate, opening_words,
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.options import LIMITS, QUALITY, WHAT, option, takes
+from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, FilePath, Options, checked, option, takes
 from mitsim.core.spectral_manifests import BANDS, LINES, RUN, bands_of
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
@@ -121,7 +120,7 @@ def in_colour(bench: Bench, colour: str) -> Bench:
     return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
 
 
-def plan_in(bench: Bench, colour: str, request: Request) -> Plan:
+def plan_in(bench: Bench, colour: str, request: Planned) -> Plan:
     """Return the plan of a ``request`` on a ``bench``, for light in a ``colour``."""
     if colour == AUTO:
         return bench.choose_colour(**request.given).plan
@@ -129,7 +128,9 @@ def plan_in(bench: Bench, colour: str, request: Request) -> Plan:
         return bench.plan(**request.given)
     from mitsim.acquire.spectral import SpectralBench
 
-    return SpectralBench.of(in_colour(bench, colour), MOSAIC_RUN if colour == MOSAIC else RUN).plan(request)
+    return SpectralBench.of(in_colour(bench, colour), MOSAIC_RUN if colour == MOSAIC else RUN).plan(
+        Request(**request.given)
+    )
 
 
 def capture_in(
@@ -182,13 +183,16 @@ def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task)
 # ---- the demo --------------------------------------------------------------------------------------------------------
 
 
-class DemoRequest(Opening, Sampled):
+class MainFamily(Sampled):
+    """The demo's main family of patterns."""
+
+    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+
+
+class DemoRequest(Opening, MainFamily):
     """How the demo is made."""
 
-    PANEL = WHAT
     VERB = "demo"
-
-    patterns: Annotated[str, AfterValidator(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
 
 
 class DemoKeys(OpeningKeys, SampledKeys, total=False):
@@ -251,9 +255,9 @@ class StudyOptions(Opening, Seeded):
     PANEL = WHAT
     VERB = "study"
 
-    patterns: Annotated[str, AfterValidator(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
-    recipe: Path | str | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
-    data: Path | str | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
+    patterns: Annotated[str, checked(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
+    recipe: FilePath | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
+    data: FilePath | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
     quick: bool = option(False, "a few points, for a first look", panel=QUALITY)
     shard: str = option(WHOLE, "measure part I of N of the points", metavar="I/N", panel=LIMITS)
@@ -494,6 +498,29 @@ def _study_of_a_bench(
     place = scene or "photograph"
     asked.check(place, request.patterns, request.timing if name in EXPOSED else None)
     return lambda: run_study(open_as(place, asked, job), output, request, job)
+
+
+# ---- sessions --------------------------------------------------------------------------------------------------------
+
+
+class RunOptions(Options):
+    """How a session is run."""
+
+    VERB = "run"
+
+    resume: bool = option(False, "go on where an interrupted one of the same options stopped", panel=OUTPUT)
+    pictures: bool = option(True, "make pictures and pages", kind=False)
+    shard: str = option(WHOLE, "measure part I of N of a sweep's points", metavar="I/N")
+    scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
+
+
+class RunKeys(TypedDict, total=False):
+    """Keywords of :class:`RunOptions`."""
+
+    resume: bool
+    pictures: bool
+    shard: str
+    scheduler: str | None
 
 
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------

@@ -12,18 +12,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
-
-from pydantic import AfterValidator, BeforeValidator, field_validator
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.bench.effects import check_switches, parse_switches
 from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.manifests import MOST_SHOTS
-from mitsim.core.options import DEVICES, LIMITS, QUALITY, Options, option, shipped_names
+from mitsim.core.options import DEVICES, LIMITS, QUALITY, FilePath, Options, checked, option, shipped_names
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.core.worker import pause_collector
@@ -160,8 +158,12 @@ def check_untimed(seconds: float | None) -> None:
         )
 
 
-def _switches(effects: object) -> object:
-    return parse_switches(effects) if isinstance(effects, str) else effects
+def _switches(effects: object) -> dict[str, bool]:
+    """Return effects that are switched on or off, by name; MitsimError for anything else."""
+    found = parse_switches(effects) if isinstance(effects, str) else effects
+    if not isinstance(found, Mapping) or not all(isinstance(value, bool) for value in found.values()):
+        raise ArgumentError("effects", f"{short_text(effects)}: give +NAME,-NAME, or True or False by name")
+    return check_switches(dict(found))
 
 
 def family_of(patterns: str) -> str:
@@ -173,7 +175,7 @@ def family_of(patterns: str) -> str:
 class Seeded(Options):
     """The root of all random streams."""
 
-    seed: Annotated[int, AfterValidator(check_root)] = option(0, "root of every random stream", panel=QUALITY)
+    seed: Annotated[int, checked(check_root)] = option(0, "root of every random stream", panel=QUALITY)
 
 
 class SeedKeys(TypedDict, total=False):
@@ -216,7 +218,7 @@ class RequestKeys(ExposureKeys, total=False):
 class Sampled(Seeded):
     """How finely light is sampled."""
 
-    accuracy: Annotated[float, AfterValidator(check_accuracy)] = option(
+    accuracy: Annotated[float, checked(check_accuracy)] = option(
         1e-3, "relative rms error of the expected frames", panel=QUALITY
     )
 
@@ -229,6 +231,7 @@ class Timed(Seeded):
 
     def model_post_init(self, context: object) -> None:
         """Refuse an exposure that no camera has."""
+        super().model_post_init(context)
         self.timing  # noqa: B018 - checks itself
 
     @property
@@ -237,16 +240,29 @@ class Timed(Seeded):
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
 
 
-class Request(Sampled, Timed):
-    """Which shots of a scene are wanted, and how well."""
+class Planned(Sampled):
+    """Which light is simulated, and how finely."""
 
-    patterns: Annotated[str, AfterValidator(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
     seconds: float | None = option(
         None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
-    effects: Annotated[dict[str, bool], BeforeValidator(_switches), AfterValidator(check_switches)] = option(
+    effects: Annotated[Any, checked(_switches)] = option(
         {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
     )
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse an accuracy beside the seconds that decide it."""
+        super().model_post_init(context)
+        if self.seconds is not None and "accuracy" in self.model_fields_set:
+            raise ArgumentError(
+                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
+            )
+
+
+class Request(Planned, Timed):
+    """Which shots of a scene are wanted, and how well."""
+
     noise_fraction: float | None = option(
         None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY, ge=_LEAST_NOISE, le=1
     )
@@ -286,15 +302,9 @@ class Request(Sampled, Timed):
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
 
     def model_post_init(self, context: object) -> None:
-        """Refuse an exposure that no camera has, and seconds beside what they decide."""
+        """Refuse a second rule that ends sampling beside seconds."""
         super().model_post_init(context)
-        if self.seconds is None:
-            return
-        if "accuracy" in self.model_fields_set:
-            raise ArgumentError(
-                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
-            )
-        if self.noise_fraction is not None:
+        if self.seconds is not None and self.noise_fraction is not None:
             raise ArgumentError(
                 "noise_fraction",
                 f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
@@ -318,11 +328,6 @@ NO, MOSAIC, AUTO = "no", "mosaic", "auto"
 def by_line(colour: str) -> bool:
     """Return True if a ``colour`` is lines, or bands of them, one after the other."""
     return colour.partition(":")[0] in (LINES, BANDS)
-
-
-def _known_variant(name: str) -> str:
-    check_variant(name)
-    return name
 
 
 def _parameters(texts: Iterable[str]) -> dict[str, Any]:
@@ -351,7 +356,7 @@ class OpeningKeys(TypedDict, total=False):
 class Variant(Options):
     """The variant of Mitsuba."""
 
-    variant: Annotated[str, AfterValidator(_known_variant)] = option(
+    variant: Annotated[str, checked(check_variant)] = option(
         DEFAULT_VARIANT,
         "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
         metavar="VARIANT",
@@ -364,7 +369,7 @@ class LitScene(Variant):
 
     PANEL = DEVICES
 
-    projector: Path | str | None = option(
+    projector: FilePath | None = option(
         None, "projector: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
     )
     parameters: Mapping[str, Any] = option(
@@ -376,7 +381,7 @@ class LitScene(Variant):
 class Opening(LitScene):
     """What opens a bench, beside its scene."""
 
-    camera: Path | str | None = option(
+    camera: FilePath | None = option(
         None, "camera electronics: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
     )
 
@@ -450,26 +455,34 @@ class Opening(LitScene):
         return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
 
 
+def _known_colour(colour: str) -> None:
+    """Refuse a word of ``colour`` that is not known."""
+    if colour.startswith(f"{BANDS}:"):
+        bands_of(colour)
+    elif colour not in (NO, LINES, MOSAIC, AUTO):
+        raise ArgumentError("colour", f"{colour!r}: use {NO}, {LINES}, {BANDS}:K, {MOSAIC} or {AUTO}")
+
+
 class Coloured(Options):
     """Which of the projector's light is told apart."""
 
-    colour: str = option(
+    colour: Annotated[str, checked(_known_colour)] = option(
         NO,
         "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
         "its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or lines, as the "
         "accuracy needs (not calibrate); no: light that is not told apart",
         metavar="no|lines|bands:K|mosaic|auto",
     )
-    WORDS: ClassVar[tuple[str, ...]] = (NO, LINES, f"{BANDS}:K", MOSAIC, AUTO)
 
-    @field_validator("colour")
-    @classmethod
-    def _of_a_kind(cls, colour: str) -> str:
-        if colour.startswith(f"{BANDS}:"):
-            bands_of(colour)
-        elif colour not in cls.WORDS:
-            raise ArgumentError("colour", f"{colour!r}: use {', '.join(cls.WORDS[:-1])} or {cls.WORDS[-1]}")
-        return colour
+
+class FixedColour(Coloured):
+    """Which of the projector's light is told apart, without a choice."""
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse a colour that a plan would have to choose."""
+        super().model_post_init(context)
+        if self.colour == AUTO:
+            raise ArgumentError("colour", f"{AUTO!r}: use {NO}, {LINES}, {BANDS}:K or {MOSAIC}")
 
 
 # ---- What `mitsim sense` takes ----

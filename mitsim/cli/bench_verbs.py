@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import mitsim
-from mitsim.bench.request import AUTO, NO, Coloured, LitScene, Opening, Request, by_line
+from mitsim.bench.request import AUTO, NO, Coloured, LitScene, Opening, Planned, Request, by_line
 from mitsim.cli.options import (
     Common,
     KnownPlan,
@@ -42,7 +42,7 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.pair_request import PairOptions
 from mitsim.studies import ALL, EXPERIMENTS, STUDIES
-from mitsim.verbs import DemoRequest, StudyOptions, capture_in, open_as, plan_in
+from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
 _OF_OTHER = {"reference": ("accuracy", "effects"), "factored": ("spp",)}
 """Options of `mitsim render` without effect on an estimator: a note says so, because programs give all of them."""
@@ -81,10 +81,8 @@ def demo(
     return finish(common.as_json, result.payload(), result.lines(), result.warnings)
 
 
-class Running(Resumed):
-    """How a session is run."""
-
-    PANEL = WHAT
+class Running(RunOptions):
+    """How a session is run, and where it goes."""
 
     output: Path | None = option(
         None,
@@ -97,8 +95,6 @@ class Running(Resumed):
     values: list[str] | None = option(
         None, "set a field of the file; may be given again", "-D", metavar="TABLE.FIELD=VALUE", kind=list[str]
     )
-    shard: str = option("1/1", "measure part I of N of a sweep's points", metavar="I/N")
-    scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
     repeated: Path | None = option(None, "write the session file that repeats a folder", "--from", metavar="FOLDER")
 
 
@@ -205,7 +201,7 @@ def view(
 @verb
 def plan(
     scene: Scene,
-    asked: Annotated[Request, shown(f"patterns {_SAMPLING}", accuracy=_ACCURACY)],
+    asked: Annotated[Planned, shown(accuracy=_ACCURACY)],
     coloured: Coloured,
     opening: Opening,
     overwritten: Overwritten,
@@ -455,7 +451,7 @@ def render(
 def transport(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
-    asked: Annotated[Request, shown(f"patterns {_SAMPLING}", accuracy=_ACCURACY)],
+    asked: Annotated[Planned, shown(accuracy=_ACCURACY)],
     planned: KnownPlan,
     overwritten: Overwritten,
     opening: Opening,

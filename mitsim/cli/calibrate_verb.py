@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.bench.request import NO, Coloured, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
 from mitsim.cli.options import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
 from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.errors import MitsimError
 from mitsim.core.options import OUTPUT, option
 from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
@@ -100,7 +100,7 @@ def calibrate(
     ] = None,
     *,
     session: SessionRequest,
-    coloured: Coloured,
+    coloured: FixedColour,
     opening: Opening,
     limited: LimitedPictured,
     given: set[str],
@@ -115,8 +115,6 @@ def calibrate(
     $ mitsim calibrate --frames session -o cal --camera imx249
     """
     colour = coloured.colour
-    if colour == "auto":
-        raise ArgumentError("colour", "'auto': use no, lines, bands:K or mosaic")
     if asked.known is not None:
         asked.refuse_others(given, _OF_KNOWN, f"--known {asked.known}: runs and their list decide")
         return _calibrate_known(asked.known, asked.aged, asked.folder, limited)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
+import itertools
 import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
 
 from mitsim.cli.options import Common, completing, verb
 from mitsim.cli.screen import finish
@@ -25,12 +29,10 @@ from mitsim.core.configuration import (
     opening_words,
     read_toml,
     shipped_files,
+    toml_value,
 )
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.options import WHAT, refuse_unused
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 # ---- `mitsim list` ---------------------------------------------------------------------------------------------------
 
@@ -240,14 +242,12 @@ class _Starter:
 
 
 def _camera(name: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.sensor import SensorModel, load_sensor
 
     return starter(SensorModel, _begun_as(like, load_sensor(like), name=name))
 
 
 def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.mask_profile import MaskProfile
 
     yield from _camera(name, like)
@@ -256,7 +256,6 @@ def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
 
 
 def _projector(name: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.projector import ProjectorModel
 
     return starter(ProjectorModel, _begun_as(like, load_model(like, ProjectorModel), name=name))
@@ -268,14 +267,12 @@ def _session(_: str, like: Path) -> Iterator[str]:
 
 
 def _recipe(_: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.session import SessionRecipe, load_recipe
 
     return starter(SessionRecipe, _begun_as(like, load_recipe(like)))
 
 
 def _list(_: str, __: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.exchange.capture_list import CaptureList
 
     return starter(CaptureList, _LIST)
@@ -388,3 +385,111 @@ def new(
             write_text(place, text)
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
     return finish(common.as_json, payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"], ())
+
+
+# ---- what fields of a file are ---------------------------------------------------------------------------------------
+
+_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
+_WIDTH = 100
+"""Columns of a comment: chosen, so that a file fits beside its neighbour on a screen."""
+
+
+def meanings(model: type[BaseModel]) -> dict[str, str]:
+    """What each field of a ``model`` is: the first paragraph of the docstring below it, as tables and refusals have it;
+    nothing where the source is not there."""
+    found: dict[str, str] = {}
+    for base in reversed([one for one in model.__mro__ if issubclass(one, BaseModel) and one.model_fields]):
+        try:
+            (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        body = getattr(written, "body", [])
+        for field, below in itertools.pairwise(body):
+            text = getattr(getattr(below, "value", None), "value", None)
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(text, str):
+                text = " ".join(text.split("\n\n")[0].split()).removesuffix(".")
+                plain = len(text) > 1 and (text[1].islower() or text[1] == " ")
+                found[ast.unparse(field.target)] = text[0].lower() + text[1:] if plain else text
+    return found
+
+
+def default_text(value: object) -> str:
+    """A field's default ``value`` in words."""
+    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def allowed_text(rules: Mapping[str, Any]) -> str:
+    """What a field takes, from the ``rules`` of its JSON schema."""
+    if "anyOf" in rules:
+        choices = rules["anyOf"]
+        return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
+    if "const" in rules or "enum" in rules:
+        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
+    if "$ref" in rules or rules.get("type") == "object":
+        return "object"
+    if "prefixItems" in rules:
+        return f"list of {len(rules['prefixItems'])}: {allowed_text(rules['prefixItems'][0])}"
+    if rules.get("type") == "array":
+        length = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
+        return f"list: {allowed_text(rules['items'])}{length}"
+    if "pattern" in rules:
+        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
+        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
+    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
+    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
+    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
+    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
+    if start and end:
+        return start if start == end else f"{start} to {end}"
+    kind = _PLAIN.get(rules.get("type", ""), "anything")
+    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
+
+
+def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:
+    """Lines of a file of a ``model``: every field with what it is and may be, those without a value after a #.
+
+    Parameters
+    ----------
+    model
+        of the file.
+    values
+        fields that are set; they make the file whole.
+    table
+        name of the table that the fields are in; empty: of none.
+    """
+    parts = {name: _model_of(field.annotation) for name, field in model.model_fields.items()}
+    schema, known = model.model_json_schema()["properties"], meanings(model)
+    if table:
+        yield f"{'' if values else '#'}[{table}]"
+    plain = [name for name, part in parts.items() if part is None]
+    given = [name for name in plain if name in values]
+    for name in (*given, *(name for name in plain if name not in values)):
+        if given and name not in values:
+            yield from ("", *_comment("Further fields."))
+            given = []
+        allowed = allowed_text(schema[name]).replace("`", "").removesuffix(", null")
+        default = model.model_fields[name].default
+        lacks = default is PydanticUndefined or default_text(default) in ("none", "infinite")
+        yield from _comment(f"{known[name]}. Allowed: {allowed}.")
+        shown = "..." if lacks else toml_value(default)
+        yield f"{name} = {toml_value(values[name])}" if name in values else f"#{name} = {shown}"
+    for name, part in parts.items():
+        if part is not None:
+            yield from ("", *_comment(f"{known[name]}."))
+            yield from starter(part, values.get(name) or {}, f"{table}.{name}".removeprefix("."))
+
+
+def _comment(text: str) -> list[str]:
+    text = text[0].upper() + text[1:] if text[1].islower() or text[1] == " " else text
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False)
+
+
+def _model_of(kind: Any) -> type[BaseModel] | None:
+    """The model of a table, where a field of a ``kind`` is one; None of other fields, lists of tables among them."""
+    kinds = [kind, *get_args(kind)]
+    found = (each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
+    return next(found, None)

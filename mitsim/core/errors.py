@@ -8,8 +8,8 @@ import difflib
 import functools
 import inspect
 import os
+import reprlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import fields
 from numbers import Integral, Real
 from typing import Any, ParamSpec, TypeVar
 
@@ -32,12 +32,14 @@ class MitsimError(Exception):
 class ArgumentError(MitsimError):
     """A value that one argument cannot have; ``argument`` names it.
 
-    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option.
+    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option. Where
+    several arguments of a call are wrong, ``others`` has the refusals of the further ones.
     """
 
     def __init__(self, argument: str, message: str) -> None:
         super().__init__(f"{argument} {message}")
         self.argument, self._message = argument, message
+        self.others: tuple[ArgumentError, ...] = ()
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, str]]:
         """As a process that works for a study hands it back."""
@@ -67,28 +69,6 @@ def near_name(text: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
-def options_of(made: type, values: Mapping[str, Any], function: str) -> Mapping[str, Any]:
-    """The ``values``, which are fields of a dataclass.
-
-    Parameters
-    ----------
-    made, values
-        the dataclass, and what it is to be made of.
-    function
-        that takes them, for the message.
-
-    Raises
-    ------
-    ArgumentError
-        for a name that is none of them, with those that are.
-    """
-    known = [each.name for each in fields(made)]
-    for name in values:
-        if name not in known:
-            raise ArgumentError(name, f"is no option of {function}; {near_name(name, known)}use {', '.join(known)}")
-    return values
-
-
 # -------- Arguments of public functions
 # Annotations are read as they are written, so that no type of another room is imported for it: a class is known by its
 # name. What a value may be within its kind, such as a range, each function checks itself.
@@ -97,6 +77,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
 _ANY = "object", "Any"
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 100
 _LONGEST_PATH, _LONGEST_NAME = 4095, 255
 """Bytes of a path, and of a name in it, that Linux takes."""
 Kind = tuple[str, Callable[[object], bool]]
@@ -217,11 +199,11 @@ def is_masked(value: object) -> bool:
     return "MaskedArray" in (each.__name__ for each in type(value).__mro__)
 
 
-def short_text(value: object) -> str:
-    """Return a refused ``value`` on a short line; of a number of thousands of digits its kind."""
+def short_text(value: object, length: int = 60) -> str:
+    """Return a refused ``value`` on a short line; only its kind if it cannot be written."""
     try:
-        return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else repr(value))
-    except (TypeError, ValueError):
+        return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else _SHORT.repr(value), length)
+    except (TypeError, ValueError, RecursionError):
         return f"a {type(value).__name__}"
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, ParamSpec, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from mitsim.core.errors import ArgumentError, check_arguments, near_name, plain_number, short_text
+from mitsim.core.configuration import rule_of, shipped_files
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, is_path, near_name, plain_number, short_text
 
 WHAT, QUALITY, DEVICES = "What", "Quality", "Scene and devices"
 OUTPUT, LIMITS = "Output", "Machine and limits"
@@ -49,10 +51,40 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
     return Field(default, description=help, json_schema_extra=extra, **limits)
 
 
+class _Refused(ValueError):
+    """A refusal of ours, which pydantic collects with its own."""
+
+    def of(self, name: str) -> ArgumentError:
+        """Return the refusal as one of the option ``name``."""
+        (error,) = self.args
+        return error if isinstance(error, ArgumentError) else ArgumentError(name, str(error).removeprefix(f"{name}: "))
+
+
+def checked(check: Callable[[Any], Any]) -> AfterValidator:
+    """Return a validator of a field by a ``check``, which raises MitsimError, and returns the value or nothing."""
+
+    def validate(value: Any) -> Any:
+        try:
+            result = check(value)
+        except MitsimError as error:
+            raise _Refused(error) from error
+        return value if result is None else result
+
+    return AfterValidator(validate)
+
+
+def _can_be_path(value: Path | str) -> Path | str:
+    if not is_path(value):
+        raise ValueError("a path")
+    return value
+
+
+FilePath = Annotated[Path | str, AfterValidator(_can_be_path)]
+"""Path of a file or folder, or the name of a shipped file."""
+
+
 def shipped_names(field: str) -> list[str]:
     """Return the names of shipped files that have a ``field``, which a shell offers."""
-    from mitsim.core.configuration import shipped_files
-
     return [*shipped_files("calibration", ".toml", field)]
 
 
@@ -71,22 +103,31 @@ class Options(BaseModel):
         try:
             super().__init__(**{name: plain_number(value) for name, value in values.items()})
         except ValidationError as error:
-            raise self._refusal(error) from error
+            first, *others = self._refusals(error)
+            first.others = tuple(others)
+            raise first from error
 
     @classmethod
-    def _refusal(cls, error: ValidationError) -> ArgumentError:
-        """Return the refusal of the first value that pydantic found wrong; a misspelt name comes first."""
-        found = sorted(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")[0]
-        name, *inner = map(str, found["loc"])
-        if found["type"] == "extra_forbidden" and not inner:
-            return unknown_option(name, cls.VERB, [*cls.model_fields])
-        if found["type"] == "missing":
-            return ArgumentError(name, "is missing; give it")
-        rules = (_rule(one["msg"]) for one in error.errors() if one["loc"][0] == found["loc"][0])
-        rule, limits = " or ".join(dict.fromkeys(rules)), limits_of(cls.model_fields[name])
-        if limits:
-            rule = f"a number from {limits}" if found["type"].startswith(("greater", "less")) else f"{rule}, {limits}"
-        return ArgumentError(name, f"{short_text(found['input'])}: give {rule}")
+    def _refusals(cls, error: ValidationError) -> list[ArgumentError]:
+        """Return the refusal of each option that pydantic found wrong; misspelt names come first."""
+        found: dict[str, ArgumentError] = {}
+        errors = error.errors(include_url=False)
+        for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
+            name, original = str(one["loc"][0]), one.get("ctx", {}).get("error")
+            if isinstance(original, _Refused):
+                found.setdefault(name, original.of(name))
+            elif one["type"] == "extra_forbidden" and len(one["loc"]) == 1:
+                found[name] = unknown_option(name, cls.VERB, [*cls.model_fields])
+            elif one["type"] == "missing":
+                found.setdefault(name, ArgumentError(name, "is missing; give it"))
+            elif name not in found:
+                rules = (rule_of(each["msg"]).removeprefix("give ") for each in errors if each["loc"][0] == name)
+                rule, limits = " or ".join(dict.fromkeys(rules)), limits_of(cls.model_fields[name])
+                if limits:
+                    kind = "a number" if one["type"].startswith(("greater", "less")) else rule
+                    rule = f"{kind}, {limits}"
+                found[name] = ArgumentError(name, f"{short_text(one['input'])}: give {rule}")
+        return [*found.values()]
 
     @property
     def given(self) -> dict[str, Any]:
@@ -124,11 +165,6 @@ def limits_of(field: FieldInfo) -> str:
     if limits and not limits.keys() & {"le", "lt"}:
         words["ge"] = "at least {:g}"
     return " ".join(words[name].format(limits[name]) for name in words if name in limits)
-
-
-def _rule(message: str) -> str:
-    """Return a rule of pydantic, without the words that all of them begin with."""
-    return message.removeprefix("Value error, ").removeprefix("Input should be ")
 
 
 def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]], Callable[P, R]]:

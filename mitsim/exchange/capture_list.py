@@ -14,7 +14,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
-from mitsim.core.options import QUALITY, Options, option, shipped_names
+from mitsim.core.options import QUALITY, FilePath, Options, option, shipped_names
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
@@ -277,30 +277,28 @@ class FrameFacts(Options):
 
     VERB = "import_frames"
 
-    list: Path | str | None = option(
+    list: FilePath | None = option(
         None,
         "of frames: list of what is known of them; options take its place",
         metavar="NAME|FILE",
         complete=partial(shipped_names, LIST),
     )
     patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: Path | str | None = option(
+    camera: FilePath | None = option(
         None,
         "of frames: camera electronics, name or TOML file",
         metavar="NAME|FILE",
         complete=partial(shipped_names, CAMERA),
     )
     exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
-    calibration: Path | str | None = option(
+    calibration: FilePath | None = option(
         None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
     )
     projector_pixels: int | None = option(
         None, "of frames: projector pixels a side, without a calibration", metavar="N"
     )
     black_level: float | None = option(None, "of frames: number of a pixel without charge; the camera's if not given")
-    ambient_frame: Path | str | None = option(
-        None, "frame, or folder of frames, with the projector off", metavar="PATH"
-    )
+    ambient_frame: FilePath | None = option(None, "frame, or folder of frames, with the projector off", metavar="PATH")
     ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
     closing_frame: Literal["first", "uniform"] | None = option(
         None,
@@ -323,9 +321,9 @@ class FrameFacts(Options):
         None, "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
     )
     divide: int | None = option(None, "of frames: factor that all numbers have; found if not given", metavar="N")
-    dark_frame: Path | str | None = option(None, "frame, or folder of frames, without any light", metavar="PATH")
-    flat_frame: Path | str | None = option(None, "the same of even light without a mask", metavar="PATH")
-    flat_dark_frame: Path | str | None = option(None, "the same without light, of the flat's exposure", metavar="PATH")
+    dark_frame: FilePath | None = option(None, "frame, or folder of frames, without any light", metavar="PATH")
+    flat_frame: FilePath | None = option(None, "the same of even light without a mask", metavar="PATH")
+    flat_dark_frame: FilePath | None = option(None, "the same without light, of the flat's exposure", metavar="PATH")
     orientation: int | str | None = option(None, "of frames: Exif's, or as the file says", metavar="1..8|file")
     turn: float | None = option(None, "of frames: turned counter-clockwise after that", metavar="DEGREES")
     crop: str | tuple[int, ...] | None = option(

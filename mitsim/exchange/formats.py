@@ -19,7 +19,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.imagelist import check_channel
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.options import DEVICES, OUTPUT, QUALITY, WHAT, Options, option, shipped_names, takes
+from mitsim.core.options import DEVICES, OUTPUT, QUALITY, WHAT, FilePath, Options, option, shipped_names, takes
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import (
     RUN,
@@ -99,8 +99,8 @@ class Exported(Options):
     VERB = "export"
 
     format: str = option(..., "hdf5, mat, flatcam, deepinv, torch or png", metavar="FORMAT")
-    output: Path | str = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE", kind=Path)
-    calibration: Path | str | None = option(
+    output: FilePath = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE", kind=Path)
+    calibration: FilePath | None = option(
         None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", panel=WHAT, kind=Path
     )
     overwrite: bool = option(False, "replace the file")
@@ -359,7 +359,7 @@ class Pictures(Options):
     PANEL = DEVICES
     VERB = "pattern_pictures"
 
-    projector: Path | str = option(
+    projector: FilePath = option(
         "mp_cl1",
         "projector of known rows and columns: name or TOML file",
         metavar="NAME|FILE",
@@ -373,7 +373,7 @@ class Pictures(Options):
         metavar="first|uniform",
         panel=WHAT,
     )
-    camera: Path | str | None = option(
+    camera: FilePath | None = option(
         None,
         "of stripes: camera electronics, name or TOML file",
         metavar="NAME|FILE",

@@ -14,7 +14,7 @@ from mitsim.bench.request import Exposure, ExposureKeys, Request
 from mitsim.core.configuration import Configuration, load_model, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.imagelist import PRINTS
-from mitsim.core.options import Options, option
+from mitsim.core.options import FilePath, Options, option
 from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 
@@ -72,7 +72,7 @@ class PairOptions(Options):
 
     count: int = option(..., "pairs to make", metavar="N", ge=1, le=MOST_PAIRS)
     idealised: bool = option(False, "frames of the paper's separable model, not rendered")
-    pictures: Path | str | None = option(
+    pictures: FilePath | None = option(
         None, "folder of pictures; drawn by code if not given", metavar="FOLDER", kind=Path
     )
     vary: Variation | None = option(

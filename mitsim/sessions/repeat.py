@@ -24,7 +24,7 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.reconstruct import MADE_OF, read_result
 from mitsim.reconstruct.request import METHODS, RESULT_FILE
-from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, TABLES, read_session, session_text, value_of
+from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, fields_of, read_session, session_text, value_of
 from mitsim.studies.framework.campaign import read_scope
 
 _PLANNED = "patterns", "accuracy", "seed", "effects"
@@ -161,7 +161,7 @@ class _Found:
             self._warn(f"{folder} does not tell its devices' files: the usual ones are taken")
         where = f"{folder}/{MANIFEST}"
         files, scene = validate(_Opened, dict(opened or {}), where), validate(_Scene, dict(conf), where)
-        if own := scene.defines.keys() & TABLES["scene"].model_fields.keys():
+        if own := scene.defines.keys() & fields_of("scene").keys():
             raise MitsimError(f"{where}: defines.{min(own)} is no parameter of a scene; remove it")
         devices = {name: _short_name(getattr(files, name), "calibration") for name in ("camera", "projector")}
         usual = spectral_of(DEFAULT_VARIANT) if coloured else DEFAULT_VARIANT
