@@ -110,7 +110,7 @@ class Light(SampledLight):
         MitsimError
             for patterns that do not fit, an output that cannot be written, or a field that would need other light.
         """
-        return expose(self, patterns, output, job, **request)
+        return expose(self, patterns, output, job, **Request(**request).given)
 
     @check_arguments
     def check_serves(self, patterns: str) -> None:

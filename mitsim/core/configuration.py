@@ -174,13 +174,19 @@ def _complaint(model: type[pydantic.BaseModel], one: Any, field: str) -> str:
     return f"{field or 'contents'}: got {value}; {rule_of(one['msg'])}"
 
 
+_PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
+"""Kinds of values as pydantic calls them, and in plain words."""
+
+
 def rule_of(message: str) -> str:
     """Return a rule of pydantic as a request."""
     rule = message.removeprefix("Value error, ")
-    if rule.startswith("Input should be "):
-        rule = rule.removeprefix("Input should be ")
-        return f"give a number {rule}" if rule.startswith(("greater", "less")) else f"give {rule}"
-    return rule[0].lower() + rule[1:]
+    if not rule.startswith("Input should be "):
+        return rule[0].lower() + rule[1:]
+    rule = re.split(", (?:got|unable)", rule.removeprefix("Input should be "))[0]
+    if rule.startswith(("greater", "less")):
+        return f"give a number {rule}"
+    return f"give {_PLAINER.get(rule, rule.replace(' valid ', ' '))}"
 
 
 def _model_at(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.BaseModel] | None:

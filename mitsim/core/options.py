@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, ParamSpec, TypeVar
@@ -57,7 +58,7 @@ class _Refused(ValueError):
     def of(self, name: str) -> ArgumentError:
         """Return the refusal as one of the option ``name``."""
         (error,) = self.args
-        return error if isinstance(error, ArgumentError) else ArgumentError(name, str(error).removeprefix(f"{name}: "))
+        return error if isinstance(error, ArgumentError) else ArgumentError(name, re.sub(f"^{name}:? ", "", str(error)))
 
 
 def checked(check: Callable[[Any], Any]) -> AfterValidator:
@@ -125,7 +126,7 @@ class Options(BaseModel):
                 rule, limits = " or ".join(dict.fromkeys(rules)), limits_of(cls.model_fields[name])
                 if limits:
                     kind = "a number" if one["type"].startswith(("greater", "less")) else rule
-                    rule = f"{kind}, {limits}"
+                    rule = f"{kind} {limits}"
                 found[name] = ArgumentError(name, f"{short_text(one['input'])}: give {rule}")
         return [*found.values()]
 
@@ -160,11 +161,13 @@ def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> Non
 
 def limits_of(field: FieldInfo) -> str:
     """Return the range of a number that a ``field`` states, in words; empty without one."""
-    words = {"ge": "{:g}", "gt": "above {:g}", "le": "to {:g}", "lt": "to below {:g}"}
-    limits = {name: getattr(mark, name) for mark in field.metadata for name in words if hasattr(mark, name)}
-    if limits and not limits.keys() & {"le", "lt"}:
-        words["ge"] = "at least {:g}"
-    return " ".join(words[name].format(limits[name]) for name in words if name in limits)
+    ends = {
+        name: getattr(mark, name) for mark in field.metadata for name in ("ge", "gt", "le", "lt") if hasattr(mark, name)
+    }
+    if {"ge", "le"} <= ends.keys():
+        return f"from {ends['ge']:g} to {ends['le']:g}"
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    return ", ".join(f"{words[name]} {end:g}" for name, end in ends.items())
 
 
 def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]], Callable[P, R]]:

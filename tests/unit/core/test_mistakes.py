@@ -47,8 +47,8 @@ def test_all_mistakes_are_reported_together(tmp_path: Path) -> None:
         "  line 3: names: got 'a', no such field; did you mean name?",
         "  line 4: bits: got 30; give a number less than or equal to 24",
         "  line 5: list: got [1], no such field; known fields: name, bits, kind, part, parts",
-        "  line 9: part.side: got 1.5; give a valid integer",
-        "  line 10: part.gap_um: got 'wide'; give a valid number",
+        "  line 9: part.side: got 1.5; give a whole number",
+        "  line 10: part.gap_um: got 'wide'; give a number",
         "  line 11: parts.0.gap_um: is missing",
         "  name: is missing",
     ]
