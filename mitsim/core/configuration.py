@@ -81,17 +81,15 @@ class Table(dict[str, Any]):
         for number, line in enumerate(self.text.split("\n"), 1):
             if not (found := _NAMED.match(line)):
                 continue
-            here: Place = tuple(part.strip(" \"'") for part in (found[2] or found[3]).split("."))
-            if found[1] == "[[":
-                counts[here] = counts.get(here, -1) + 1
-            if found[1]:
-                for end in range(len(here), 0, -1):
-                    if here[:end] in counts:
-                        here = (*here[:end], counts[here[:end]], *here[end:])
-                        break
-                table = here
-            else:
-                here = (*table, *here)
+            parts = [part.strip(" \"'") for part in (found[2] or found[3]).split(".")]
+            here: Place = () if found[1] else table
+            for part in parts:
+                here = (*here, part)
+                if found[1] == "[[" and part is parts[-1]:
+                    counts[here] = counts.get(here, -1) + 1
+                if found[1] and here in counts:
+                    here = (*here, counts[here])
+            table = here if found[1] else table
             if here == wanted[: len(here)] and len(here) > best[0]:
                 best = len(here), number
         return best[1]

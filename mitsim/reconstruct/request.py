@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
-from pydantic import Field
-
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
-from mitsim.core.options import QUALITY, Options, option
+from mitsim.core.options import QUALITY, Options, checked, option
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
@@ -26,8 +24,6 @@ MOST_REDUCED = 1024
 """Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
 _MOST = 1e100
 """Largest number of a request: far beyond any lambda, depth or reflectance, and its square is finite."""
-Two = Annotated[tuple[float, float], Field(strict=False)]
-"""Two numbers, which files and programs may give as a list."""
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
@@ -60,6 +56,19 @@ def _two(name: str, rule: str, low: float | None = None, high: float | None = No
     return read
 
 
+def _two_numbers(ends: Any) -> tuple[float, float] | None:
+    """Return two ``ends`` as a pair; MitsimError for anything but two numbers."""
+    if ends is None:
+        return None
+    real = isinstance(ends, (tuple, list)) and [type(end) in (int, float) for end in ends] == [True, True]
+    if not real:
+        raise MitsimError(f"{short_text(ends)}: give two numbers, the smaller one first")
+    return float(ends[0]), float(ends[1])
+
+
+Two = Annotated[Any, checked(_two_numbers)]
+
+
 class ImageRequest(Options):
     """How an image is solved for."""
 
@@ -75,14 +84,14 @@ class ImageRequest(Options):
         "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
         metavar="auto|MM|map",
     )
-    depth_range: Two | None = option(
+    depth_range: Two = option(
         None,
         "nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's if not "
         "given",
         metavar="A:B",
         read=_two("depth_range", "give the nearest and the farthest depth [mm], such as 350:450"),
     )
-    bounds: Two | None = option(
+    bounds: Two = option(
         None,
         "least and largest number of the image, by nonnegative and tv; either may be left out; if not given, 0: of "
         "nonnegative and with --psf",
@@ -121,7 +130,7 @@ class ImageRequest(Options):
             raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto or map")
         if ends := self.depth_range:
             if not 0 < ends[0] < ends[1] <= _MOST:
-                raise ArgumentError("depth_range", f"{ends}: give two depths above 0 mm, the nearer one first")
+                raise ArgumentError("depth_range", f"{ends}: give two depths above 0 mm, the smaller one first")
             if not self.looks_for_depth:
                 raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
         if ends := self.bounds:
