@@ -16,6 +16,7 @@ from mitsim.bench.request import (
     MOSAIC,
     NO,
     Exposure,
+    Family,
     Irradiance,
     Opening,
     OpeningKeys,
@@ -183,13 +184,7 @@ def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task)
 # ---- the demo --------------------------------------------------------------------------------------------------------
 
 
-class MainFamily(Sampled):
-    """The demo's main family of patterns."""
-
-    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
-
-
-class DemoRequest(Opening, MainFamily):
+class DemoRequest(Opening, Sampled, Family):
     """How the demo is made."""
 
     VERB = "demo"

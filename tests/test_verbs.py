@@ -20,7 +20,7 @@ import pytest
 import mitsim as ms
 from mitsim.bench import request
 from mitsim.bench.request import Request
-from mitsim.cli.options import message_of
+from mitsim.cli.commands import message_of
 from mitsim.core.errors import ArgumentError
 from mitsim.core.options import Options
 from mitsim.exchange.capture_list import FrameKeys

@@ -215,12 +215,22 @@ class RequestKeys(ExposureKeys, total=False):
     patterns: str
 
 
-class Sampled(Seeded):
-    """How finely light is sampled."""
+class Family(Options):
+    """Patterns that the projector shows."""
+
+    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+
+
+class Accurate(Options):
+    """How well light is known."""
 
     accuracy: Annotated[float, checked(check_accuracy)] = option(
         1e-3, "relative rms error of the expected frames", panel=QUALITY
     )
+
+
+class Sampled(Seeded, Accurate):
+    """How finely light is sampled."""
 
 
 class Timed(Seeded):
@@ -234,16 +244,20 @@ class Timed(Seeded):
         super().model_post_init(context)
         self.timing  # noqa: B018 - checks itself
 
+    def refuse_idle(self) -> None:
+        """Refuse a part of the full well beside an exposure in seconds."""
+        if self.exposure != "auto":
+            self.refuse(["exposure_fraction"], "on an exposure in seconds")
+
     @property
     def timing(self) -> Exposure:
         """How the exposure time is found."""
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
 
 
-class Planned(Sampled):
+class Planned(Sampled, Family):
     """Which light is simulated, and how finely."""
 
-    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
     seconds: float | None = option(
         None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
@@ -260,7 +274,7 @@ class Planned(Sampled):
             )
 
 
-class Request(Planned, Timed):
+class Request(Timed, Planned):
     """Which shots of a scene are wanted, and how well."""
 
     noise_fraction: float | None = option(
@@ -289,8 +303,7 @@ class Request(Planned, Timed):
 
     def refuse_idle(self) -> None:
         """Refuse options that have no effect beside others that are given."""
-        if self.exposure != "auto":
-            self.refuse(["exposure_fraction"], "on an exposure in seconds")
+        super().refuse_idle()
         if self.ambient_frame == "no":
             self.refuse(["ambient_shots"], "with ambient_frame no")
 

@@ -11,7 +11,7 @@ import typer
 
 import mitsim
 from mitsim.bench.request import AUTO, NO, Coloured, LitScene, Opening, Planned, Request, by_line
-from mitsim.cli.options import (
+from mitsim.cli.commands import (
     Common,
     KnownPlan,
     Limited,

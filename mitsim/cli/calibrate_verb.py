@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
-from mitsim.cli.options import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
+from mitsim.cli.commands import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
 from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
 from mitsim.core.options import OUTPUT, option

@@ -9,7 +9,7 @@ import typer
 
 import mitsim
 from mitsim.bench.request import Irradiance
-from mitsim.cli.options import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, shown, verb
+from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, shown, verb
 from mitsim.cli.screen import finish, finish_folder, finish_frame, page_line, page_of
 from mitsim.core.configuration import CAMERA
 from mitsim.core.errors import MitsimError

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from mitsim.cli.options import Pictured, message_of
+from mitsim.cli.commands import Pictured, message_of
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.files import PICTURES
 from mitsim.core.options import OUTPUT, PANELS

@@ -18,7 +18,7 @@ import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from mitsim.cli.options import Common, completing, verb
+from mitsim.cli.commands import Common, completing, verb
 from mitsim.cli.screen import finish
 from mitsim.core.configuration import (
     CAMERA,

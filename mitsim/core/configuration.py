@@ -136,7 +136,7 @@ def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
 def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationError, data: object) -> list[Mistake]:
     """Return pydantic's errors as mistakes, misspelt names first and one for each place."""
     above = data.place if isinstance(data, Table) else ()
-    found: dict[Place, Mistake] = {}
+    found, meant = dict[Place, Mistake](), set[Place]()
     errors = error.errors(include_url=False)
     for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
         place, kind = one["loc"], one["type"]
@@ -153,7 +153,12 @@ def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationErro
                 break
         field = ".".join(cut(str(part)) for part in (*above, *place))
         line = data.line(place) if isinstance(data, Table) else 0
-        found.setdefault(place, (line, _complaint(model, one, field)))
+        text = _complaint(model, one, field)
+        if kind == "extra_forbidden" and "did you mean " in text:
+            meant.add((*place[:-1], text.rpartition("did you mean ")[2].removesuffix("?")))
+        elif place in meant:  # a misspelt name is both unknown and missing
+            continue
+        found.setdefault(place, (line, text))
     return [*found.values()]
 
 
@@ -179,6 +184,8 @@ _PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a va
 def rule_of(message: str) -> str:
     """Return a rule of pydantic as a request."""
     rule = message.removeprefix("Value error, ")
+    if "pattern '^[^/" in rule:
+        return "give a name without folders"
     if not rule.startswith("Input should be "):
         return rule[0].lower() + rule[1:]
     rule = re.split(", (?:got|unable)", rule.removeprefix("Input should be "))[0]

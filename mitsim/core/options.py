@@ -161,13 +161,13 @@ def refuse_unused(given: Iterable[str], names: Iterable[str], where: str) -> Non
 
 def limits_of(field: FieldInfo) -> str:
     """Return the range of a number that a ``field`` states, in words; empty without one."""
-    ends = {
-        name: getattr(mark, name) for mark in field.metadata for name in ("ge", "gt", "le", "lt") if hasattr(mark, name)
-    }
+    names = "ge", "gt", "le", "lt"
+    found = {name: getattr(mark, name) for mark in field.metadata for name in names if hasattr(mark, name)}
+    ends = {name: f"{end:g}" if isinstance(end, float) else str(end) for name, end in found.items()}
     if {"ge", "le"} <= ends.keys():
-        return f"from {ends['ge']:g} to {ends['le']:g}"
+        return f"from {ends['ge']} to {ends['le']}"
     words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-    return ", ".join(f"{words[name]} {end:g}" for name, end in ends.items())
+    return ", ".join(f"{words[name]} {end}" for name, end in ends.items())
 
 
 def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]], Callable[P, R]]:

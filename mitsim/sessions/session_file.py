@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import tomli_w
 from pydantic.fields import FieldInfo
 
-from mitsim.bench.request import NO, FixedColour, Opening, Planned, Request, SessionRequest
+from mitsim.bench.request import NO, Family, FixedColour, Opening, Planned, Request, Sampled, SessionRequest
 from mitsim.core.configuration import (
     Mistake,
     Place,
@@ -34,7 +34,7 @@ from mitsim.core.options import FilePath, Options, checked, option
 from mitsim.devices.session import SessionRecipe
 from mitsim.exchange.formats import Exported, check_format
 from mitsim.reconstruct.request import MODEL, ImageRequest
-from mitsim.verbs import MainFamily, StudyOptions
+from mitsim.verbs import StudyOptions
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -98,7 +98,7 @@ class _Image(_Placed, ImageRequest):
     chart: FilePath | None = None
 
 
-class _Demo(_Placed, MainFamily):
+class _Demo(_Placed, Sampled, Family):
     pass
 
 

@@ -28,6 +28,12 @@ class Procedure(Lit, Seeded):
         """Wavelength of the light [nm]."""
         return self.wavelength
 
+    @property
+    def stated(self) -> dict[str, float]:
+        """What JSON states of the procedure."""
+        sizes = {name: getattr(self, name) for name in ("pixels", "steps", "frames", "seed")}
+        return {**sizes, "wavelength_nm": self.wavelength}
+
 
 class ProcedureKeys(SeedKeys, total=False):
     """Keywords of :class:`Procedure`, without the frames."""

@@ -154,7 +154,7 @@ class School:
         train_network(
             store,
             factors,
-            Training(cell.method, steps=self.budget.steps, seed=cell.seed),
+            Training(method=cell.method, steps=self.budget.steps, seed=cell.seed),
             place,
             resume=True,
             sums=sums,

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from mitsim.bench.request import Seeded
 from mitsim.cli import app
-from mitsim.cli.options import shown, verb
+from mitsim.cli.commands import shown, verb
 from mitsim.cli.screen import parts_of
 from mitsim.core.errors import ArgumentError
 from mitsim.core.options import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
