@@ -69,9 +69,8 @@ if TYPE_CHECKING:
 
 @check_arguments
 def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
-    """What works on this machine: checks, each with ``ok``, what was found, and the command that mends it.
-
-    Some ten seconds; what can crash or hang runs in child processes.
+    """Check this machine; each check has ``ok``, what was found, and the command that mends it. It takes some ten
+    seconds. Checks that can crash or hang run in child processes.
 
     Parameters
     ----------
@@ -89,7 +88,7 @@ def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
 
 
 def scenes() -> dict[str, str]:
-    """What each shipped scene shows, a sentence, by the name that :func:`mitsim.open_bench` takes.
+    """Return a sentence on each shipped scene, by the name that :func:`mitsim.open_bench` takes.
 
     Examples
     --------
@@ -203,7 +202,7 @@ def demo(
     job: Job | None = None,
     **options: Unpack[DemoKeys],
 ) -> DemoResult:
-    """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html.
+    """Plan, capture, calibrate and reconstruct one scene under five pattern families, and write report.html.
 
     Parameters
     ----------
@@ -269,7 +268,7 @@ class StudyOptions(Opening, Seeded):
 
     @property
     def varied(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Names and values of what is varied; MitsimError for what cannot be read."""
+        """Names and values that are varied."""
         from mitsim.bench.apparatus import spelling
         from mitsim.studies.framework.experiment import values_of
 
@@ -306,7 +305,7 @@ def study(
     job: Job | None = None,
     **options: Unpack[StudyKeys],
 ) -> StudyResult | CampaignResult:
-    """An experiment with figures, CSV and JSON in a folder.
+    """Run an experiment, and write its figures, CSV and JSON to a folder.
 
     Parameters
     ----------
@@ -350,7 +349,7 @@ def prepare_study(
     asked: StudyOptions,
     job: Job | None,
 ) -> Study:
-    """What :func:`study` does once it is called; before that it refuses what that refuses before work.
+    """Check a study as :func:`study` does before work, and return the function that runs it.
 
     Parameters
     ----------
@@ -379,7 +378,6 @@ def prepare_study(
 
 
 def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
-    """The scenes, or folders of parts, that are named."""
     each: list[Any] = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
     if wrong := [one for one in each if not isinstance(one, (str, Path))]:
         raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
@@ -389,7 +387,8 @@ def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | s
 def _study_of_points(
     name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
 ) -> Study:
-    """A study of many points: eight test images on the photograph's sheet (two, where it is quick), or one scene."""
+    """Prepare a study of many points, on eight test images on the photograph's sheet (two if ``quick``) or on one
+    scene."""
     from mitsim.studies.framework.campaign import Where, run_experiment
     from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
     from mitsim.studies.framework.run import Shard
@@ -416,7 +415,7 @@ def _study_of_points(
 def scope_of(
     name: str, scope: Scope, patterns: str, varied: Sequence[tuple[str, tuple[str, ...]]], measure: str
 ) -> Scope:
-    """The ``scope`` of a study with what a sweep varies and shows; other studies take nothing of it.
+    """Return the ``scope`` of a study with what a sweep or a drift varies; other studies vary nothing.
 
     Parameters
     ----------
@@ -448,8 +447,8 @@ def scope_of(
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:
-    """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
-    without a ``scene`` of its own may take others."""
+    """Refuse files of a ``scope`` that cannot be used, before the renderer is imported. A study without a ``scene`` of
+    its own may use others."""
     from mitsim.bench.apparatus import check_devices, check_scene
     from mitsim.studies.framework.experiment import NO_SCENE
 
@@ -469,7 +468,6 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
 def _study_of_a_bench(
     name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
 ) -> Study:
-    """A study of one bench, or of none."""
     from mitsim.studies.framework.run import check_study_folder, find_study
 
     if name in OF_NO_SCENE:

@@ -47,7 +47,7 @@ def open_bench(
     for_render: bool = False,
     **parameters: object,
 ) -> Bench:
-    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
+    """Load a scene with its camera and projector, and select the Mitsuba variant of the process.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Bench(Apparatus):
 
     @takes(Request, without="patterns")
     def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
-        """What will be simulated, why, and what it costs, by a short look at the scene.
+        """Plan what is simulated, by a short look at the scene, with reasons and cost.
 
         Parameters
         ----------
@@ -112,8 +112,7 @@ class Bench(Apparatus):
 
     @takes(Request, without="patterns")
     def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Unpack[ExposureKeys]) -> Light:
-        """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
-        :meth:`plan`.
+        """Trace the light of the scene by projector pixel, once, so that any family can be exposed in it.
 
         Parameters
         ----------
@@ -145,7 +144,7 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[RequestKeys],
     ) -> Capture:
-        """One noisy frame for each shot of a pattern family.
+        """Take one noisy frame for each shot of a pattern family.
 
         Parameters
         ----------
@@ -183,10 +182,8 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[ExposureKeys],
     ) -> dict[str, Capture]:
-        """Sequential colour: a capture of each spectral line of the projector, by its name, as ``638nm``.
-
-        All lines are traced on the same paths; each capture is what a projector of this line alone would give, and has
-        the accuracy. Needs a spectral variant.
+        """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``. All lines are
+        traced on the same paths. Each capture has the accuracy that is asked for. Needs a spectral variant.
 
         Parameters
         ----------
@@ -212,9 +209,9 @@ class Bench(Apparatus):
 
     @takes(Request, without="patterns")
     def choose_colour(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Coloured[Self]:
-        """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
-
-        Looks at the scene in this variant and in the spectral one, and sets that of the bench that it returns.
+        """Choose the cheapest of mono, bands and lines that is predicted to leave at most half of the accuracy as error
+        of colours. It looks at the scene in this variant and in the spectral one, and sets the variant of the bench
+        that it returns.
 
         Parameters
         ----------
@@ -232,8 +229,8 @@ class Bench(Apparatus):
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:
-        """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
-        not be used with it. MitsimError as :func:`mitsim.open_bench`."""
+        """Load the bench into a ``variant``, which is then the current one; objects of the earlier variant must not be
+        used with it."""
         return reopen(self, variant)
 
     @takes(SessionRequest)
@@ -244,7 +241,7 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
-        """Sequential colour: the camera's factors at each spectral line of the projector, by its name.
+        """Estimate the camera's factors at each spectral line of the projector, by the line's name.
 
         Parameters
         ----------
@@ -273,9 +270,8 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[ExposureKeys],
     ) -> MosaicCapture:
-        """All lines of the projector at once, seen by a camera under a mosaic of colour filters: one frame a shot.
-
-        Needs a spectral variant, and a camera whose file has a ``mosaic``.
+        """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot. Needs
+        a spectral variant, and a camera whose file has a ``mosaic``.
 
         Parameters
         ----------
@@ -307,11 +303,10 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
-        """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
-
-        One session a line, by the shipped recipe with four shots of each pattern if none is given. The filters dim its
-        light; each pixel's reading is divided by what its filter passes of
-        the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
+        """Estimate the factors of a camera under colour filters at each spectral line of the projector, by the line's
+        name. Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is
+        given. Each pixel's number is divided by the stated transmission of its filter, so that the factors are those of
+        pixels without filters, one electron a photon.
 
         Parameters
         ----------
@@ -339,7 +334,7 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[SessionKeys],
     ) -> Factors:
-        """The camera's two factors, from a rendered Hadamard session on a white board.
+        """Estimate the camera's two factors from a rendered Hadamard session on a white board.
 
         Parameters
         ----------
@@ -369,8 +364,7 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[SessionKeys],
     ) -> dict[float, Factors]:
-        """The camera's two factors at each of a recipe's depths, by depth [mm]. MitsimError as :meth:`calibrate`, and
-        for a recipe without depths, or with one at which the mask is.
+        """Estimate the camera's two factors at each of a recipe's depths, by depth [mm].
 
         Parameters
         ----------
@@ -391,9 +385,8 @@ class Bench(Apparatus):
         job: Job | None = None,
         **request: Unpack[SessionKeys],
     ) -> Factors:
-        """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
-        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe
-        with depths, and a folder that holds something or has no room.
+        """Calibrate as :meth:`calibrate` does, and write the session's frames as a user of a real camera has them, so
+        that :func:`mitsim.calibrate_frames` makes the same factors of them.
 
         Parameters
         ----------
@@ -409,8 +402,8 @@ class Bench(Apparatus):
     # ---- The bench to look at, renderings, and the same devices before a board ----
 
     def view(self) -> BenchView:
-        """A drawing of the bench to scale, with its distances and what the camera sees of it, before any light is
-        simulated: it shows itself in a notebook, and is saved to a picture or to a page on which it can be turned."""
+        """Draw the bench to scale, with its distances and what the camera sees, before any light is simulated. The
+        drawing shows itself in a notebook, and is saved as a picture or as a page on which it can be turned."""
         from mitsim.report.bench_view import view
 
         return view(self)
@@ -425,7 +418,7 @@ class Bench(Apparatus):
         effects: Mapping[str, bool] | None = None,
         job: Job | None = None,
     ) -> Rendered:
-        """The expected irradiance under the scene's own light.
+        """Estimate the expected irradiance under the scene's own light.
 
         Parameters
         ----------
@@ -451,7 +444,7 @@ class Bench(Apparatus):
 
     @check_arguments
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
-        """The same devices before a diffuse board. MitsimError for a reflectance or a depth that no board has.
+        """Place the devices before a diffuse board.
 
         Parameters
         ----------
@@ -475,7 +468,7 @@ _LIT_MM = 120.0
 
 @check_arguments
 def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.0, **options: Any) -> Bench:
-    """The scene ``photograph`` with a picture of yours on its sheet.
+    """Open the scene ``photograph`` with your own picture on its sheet.
 
     Parameters
     ----------
@@ -508,7 +501,7 @@ def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.
 def shelf_scene(
     mesh: Path | str, size_mm: float = 60.0, reflectance: float = 0.7, turn_deg: float = 0.0, **options: Any
 ) -> Bench:
-    """The scene ``shelf`` with an object of yours.
+    """Open the scene ``shelf`` with your own object.
 
     Parameters
     ----------
@@ -536,7 +529,8 @@ _ALLOWED = "give a file, or an array of real numbers 0 to 1 or of unsigned ones,
 
 
 def _write_array(picture: object) -> Path:
-    """A file that holds an array, by its content: who opens the same scene again, in another process, finds it."""
+    """Write an array to a file that is named by its content, so that another process finds it when it opens the
+    scene."""
     import numpy as np
 
     try:

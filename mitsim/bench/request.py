@@ -71,7 +71,7 @@ class Task:
 
     @classmethod
     def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
-        """Of the Python face's arguments.
+        """Return the value that the arguments of a Python function describe.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Task:
 
     @contextmanager
     def importing(self) -> Iterator[None]:
-        """The stage "imports" of the job's clock."""
+        """Count the time of this context as the stage "imports" of the job's clock."""
         with self.job.clock.stage("imports"), pause_collector():
             yield
 
@@ -132,18 +132,18 @@ def _check_range(name: str, value: float, least: float, most: float, rule: str) 
 
 
 def check_accuracy(accuracy: float) -> float:
-    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
+    """Return the ``accuracy``; ArgumentError if no estimator can promise it."""
     return _check_range("accuracy", accuracy, LOWEST_ACCURACY, HIGHEST_ACCURACY, "a relative error from {}")
 
 
 def check_psnr(psnr: float) -> float:
-    """``psnr`` [dB], or ArgumentError when no image of worth has it."""
+    """Return the ``psnr`` [dB]; ArgumentError if no useful image has it."""
     return _check_range("psnr", psnr, *PSNR_DB, "{} dB")
 
 
 def check_samples(estimator: str, spp: int | None) -> None:
-    """ArgumentError for an ``estimator`` that there is not, or too few or too many samples ``spp`` a pixel of the
-    reference; None: those of the scene."""
+    """Refuse an unknown ``estimator``, and too few or too many samples ``spp`` a pixel of the reference; None stands
+    for those of the scene."""
     if estimator not in ESTIMATORS:
         raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
     if estimator == REFERENCE and spp is not None and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
@@ -151,7 +151,7 @@ def check_samples(estimator: str, spp: int | None) -> None:
 
 
 def check_untimed(seconds: float | None) -> None:
-    """ArgumentError where a run in colour is to take so many ``seconds``."""
+    """Refuse ``seconds`` for a run in colour."""
     if seconds is not None:
         raise ArgumentError(
             "seconds", f"{seconds:g}: runs in colour are not planned by time; give an accuracy, or leave colour out"
@@ -294,11 +294,11 @@ class Request(Timed, Planned):
 
     @classmethod
     def of(cls, **values: Any) -> Request:
-        """Return the request of these ``values``; MitsimError for one that cannot be served."""
+        """Return the request of these ``values``; effects may be written ``"+ambient,-diffraction"``."""
         return cls(**values)
 
     def with_values(self, **values: object) -> Request:
-        """The same request with other ``values``; MitsimError as :meth:`of`."""
+        """Return the request with other ``values`` of some fields."""
         return Request.of(**{**self.model_dump(exclude_unset=True), **values})
 
     def refuse_idle(self) -> None:
@@ -309,7 +309,8 @@ class Request(Timed, Planned):
 
     @property
     def deciding(self) -> dict[str, Any]:
-        """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
+        """The fields that decide frames, as the manifest's configuration holds them, with either an accuracy or
+        seconds."""
         unused = {"accuracy" if self.seconds is not None else "seconds"}
         # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
         return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
@@ -536,21 +537,21 @@ class IrradianceKeys(SeedKeys, total=False):
 
 
 def check_image(path: Path) -> None:
-    """MitsimError for a ``path`` that no image is read from."""
+    """Refuse a ``path`` that no image is read from."""
     if path.suffix.lower() not in IMAGES:
         raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
     check_plain(path, "image")
 
 
 def check_view(path: Path | str) -> Path:
-    """The ``path`` of a bench's drawing; ArgumentError for one that is neither a picture nor a page."""
+    """Return the ``path`` of a bench's drawing; ArgumentError if it is neither a picture nor a page."""
     if Path(path).suffix.lower() not in VIEWS:
         raise ArgumentError("output", f"{path}: give a name that ends in {' or '.join(VIEWS)}")
     return Path(path)
 
 
 def check_ending(path: Path, sensor: SensorModel) -> None:
-    """MitsimError for a ``path`` that no frame is written to, or whose kind cannot hold a ``sensor``'s numbers."""
+    """Refuse a ``path`` that no frame is written to, or whose kind cannot hold the ``sensor``'s numbers."""
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")

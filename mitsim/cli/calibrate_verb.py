@@ -189,7 +189,6 @@ def _calibrate(
 
 
 def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
-    """What is said of a simulated session, by its ``payload``, as ``common`` options have it."""
     names = "separability_residual", "noise_free_residual", "phi_error", "condition"
     residual, clean, error, condition = _finite(payload, *names)
     shadow = payload["shadow_residual"]
@@ -206,7 +205,7 @@ def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
 
 
 def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
-    """JSON and lines of text of a coloured calibration: its ``factors`` by line, in the folder ``output``."""
+    """Return the JSON and the lines of text of a coloured calibration, by its ``factors``."""
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
         for name, each in factors.items()
@@ -226,7 +225,7 @@ def _percent(part: float | None) -> str:
 
 
 def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
-    """Numbers of a ``payload``; JSON has none beyond the finite ones."""
+    """Return numbers of a ``payload``, where JSON has null for infinite ones."""
     return [math.inf if payload[name] is None else payload[name] for name in names]
 
 
@@ -388,7 +387,6 @@ def _fit(
 
 
 def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
-    """What people read of a fit's ``result``, in the folder ``output``."""
     numbers = [
         f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"
         for name, number in result["parameters"].items()

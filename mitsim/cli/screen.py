@@ -45,7 +45,7 @@ five of 40; chosen."""
 
 
 def parts_of(text: str | None) -> tuple[str, str, tuple[str, ...]]:
-    """A docstring's ``text`` in three: its first line, all else that is said, and the commands, its lines after a $."""
+    """Split the ``text`` of a docstring into its first line, its other prose, and its commands, the lines after a $."""
     prose, *examples = re.split(r"\n\s*\$ ", (text or "").rstrip())
     summary, _, more = prose.partition("\n")
     return summary, more.strip(), tuple(examples)
@@ -129,7 +129,7 @@ class Program(_Page, TyperGroup):
 
 
 def _write_panels(panels: Mapping[str, Sequence[tuple[str, str]]], formatter: Any) -> None:
-    """Write rows of names and meanings below a heading each, with the same columns in all of them."""
+    """Write rows of names and meanings under their headings, with the same columns for all headings."""
     most = int(_FIRST_COLUMN * formatter.width)
     width = max((len(name) for rows in panels.values() for name, _ in rows if len(name) <= most), default=0)
     for heading, rows in panels.items():
@@ -151,7 +151,7 @@ def _panel(holder: Any) -> Any:
 
 
 def _name(parameter: Any) -> str:
-    """What is typed for a parameter: its names, shortest first, and what stands for its value."""
+    """Return what a user types for a parameter: its names, the shortest first, and the word for its value."""
     if not _is_option(parameter):
         return str(parameter.metavar)
     names = ", ".join(sorted(parameter.opts, key=len))
@@ -159,7 +159,6 @@ def _name(parameter: Any) -> str:
 
 
 def _meaning(parameter: Any) -> str:
-    """What the help says of a parameter, with its default."""
     least, most = (getattr(parameter, end, None) for end in ("min", "max"))
     allowed = f"{least} to {most}" if most is not None else f"at least {least}" if least is not None else ""
     needed = "required" if parameter.required and _is_option(parameter) else ""
@@ -183,11 +182,9 @@ _COLUMNS = 80
 
 
 def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
-    """What people read of a ``plan``: first what it comes to, then what it is made of.
-
-    What is left out is named where its error is within two decades of the accuracy, or not known; ``everything`` tells
-    all rows and their whole reasons. Rows that a screen has no room for are named at its end.
-    """
+    """Return the lines that the terminal shows of a ``plan``: its result, then its effects. An effect that is left out
+    is shown if its error is unknown or within two decades of the accuracy; ``everything`` shows all effects with their
+    whole reasons. Effects without room on the screen are named at its end."""
     most = math.hypot(plan.systematic_bound, plan.sampling_target)
     gist = f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}"
     stages = ", ".join(f"{name} {seconds:.3g}" for name, seconds in plan.predicted.items())
@@ -229,7 +226,7 @@ def _row_text(row: PlanRow, words: str) -> str:
 
 
 def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tuple[list[str], list[PlanRow]]:
-    """Lines of the ``rows`` that have ``room`` under a ``heading`` and that of their ``words``, and the other rows."""
+    """Return the lines of the ``rows`` for which there is ``room`` under two headings, and the other rows."""
     indent, lines = " " * len(_HEAD.format("", "", "", "")), [_HEAD.format(heading, "error if off", "seconds", words)]
     for number, row in enumerate(rows):
         text = wrap_text(_row_text(row, row.gist), indent)
@@ -240,8 +237,7 @@ def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tupl
 
 
 def wrap_text(text: str, indent: str = "") -> list[str]:
-    """A ``text`` in lines as wide as the terminal, or of 80 characters, after the first behind an ``indent``; names and
-    paths stay whole."""
+    """Wrap a ``text`` to the width of the terminal. Further lines follow an ``indent``; names and paths stay whole."""
     width = shutil.get_terminal_size((_COLUMNS, _SCREEN_LINES)).columns
     indent = indent or text[: len(text) - len(text.lstrip())] or "  "
     lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
@@ -249,7 +245,7 @@ def wrap_text(text: str, indent: str = "") -> list[str]:
 
 
 def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
-    """Print the result; exit status 1 when there are warnings.
+    """Print a result; return exit status 1 if there are warnings.
 
     Parameters
     ----------
@@ -276,7 +272,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
 
 
 def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
-    """JSON of a coloured run or calibration.
+    """Return the JSON of a coloured run or calibration.
 
     Parameters
     ----------
@@ -299,28 +295,27 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
 
 
 def kernel_lines(kernels: Mapping[str, float]) -> list[str]:
-    """The line that is said of compiled ``kernels``: their number and seconds; none where there are none."""
+    """Return the line on compiled ``kernels``, if there are any."""
     if not kernels["number"]:
         return []
     return [f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache keeps them"]
 
 
 def memory_line(payload: Mapping[str, Any]) -> str:
-    """The line that is said of the memory that a capture or calibration took, by its ``payload``."""
+    """Return the line on the memory that a capture or calibration used."""
     taken = f"Memory {payload['memory_bytes'] / 2**30:.2g} GiB"
     most = payload.get("predicted_memory_bytes")  # of real frames nothing is predicted
     return taken if most is None else f"{taken} of at most {most / 2**30:.2g} predicted"
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:
-    """The first line of text of a ``payload`` as of :func:`payload_of_lines`."""
     return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
 
 
 @contextmanager
 def write_at_end() -> Iterator[None]:
-    """What is printed in this context is written when it ends. Where nobody reads any more, the program ends as by
-    SIGPIPE, quietly; MitsimError where standard output takes no more for another reason, such as a full disk."""
+    """Write what is printed in this context at its end. If nobody reads standard output any more, end the program
+    quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason, such as a full disk."""
     try:
         yield
         sys.stdout.flush()
@@ -337,7 +332,7 @@ def write_at_end() -> Iterator[None]:
 def finish_folder(
     options: Pictured, folder: Path, payload: dict[str, Any], lines: Sequence[str], warnings: Sequence[str]
 ) -> int:
-    """Make the pictures and the page of a folder whose work is done, and print the result; the exit status.
+    """Make the pictures and the page of a finished folder, and print the result; return the exit status.
 
     Parameters
     ----------
@@ -361,7 +356,7 @@ def finish_frame(
     lines: Sequence[str],
     warnings: Sequence[str],
 ) -> int:
-    """Make a picture beside a file of one frame, and print the result; the exit status.
+    """Make a picture next to a file of one frame, and print the result; return the exit status.
 
     Parameters
     ----------
@@ -386,7 +381,7 @@ def finish_frame(
 
 
 def page_of(folder: Path) -> dict[str, Any]:
-    """The page of a ``folder`` and its pictures, for JSON."""
+    """Make the page and the pictures of a ``folder``, and return their JSON."""
     started = time.perf_counter()
     from mitsim.report.folders import report_folder
 
@@ -402,7 +397,8 @@ def page_line(made: dict[str, Any]) -> str:
 def _attempt(
     options: Pictured, make: Callable[[], dict[str, Any]], kept: str
 ) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
-    """What is to be made, unless nobody wants it; where that fails, nothing, and a warning with what is ``kept``."""
+    """Return what ``make`` makes, unless pictures are not wanted. If it fails, return nothing and a warning that states
+    what is ``kept``."""
     if options.no_pictures:
         return None, ()
     try:

@@ -85,7 +85,7 @@ def _masks() -> Iterator[Entry]:
 
 
 def _studies() -> Iterator[Entry]:
-    """Read from the source, for to import all studies takes three seconds."""
+    """Read the studies from their source, because importing all of them takes three seconds."""
     from mitsim.studies import EXPERIMENTS, SHARED, STUDIES
 
     for name in EXPERIMENTS:
@@ -105,7 +105,7 @@ def _effects() -> Iterator[Entry]:
 
 
 def _methods() -> Iterator[Entry]:
-    """Those of the solver, and those that are learned, read from the source, for torch may be missing."""
+    """Iterate over the solver's methods and the learned ones, read from the source because torch may be missing."""
     from mitsim.learn.training_request import METHODS
     from mitsim.reconstruct.solvers import SOLVERS
 
@@ -138,7 +138,6 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
 
 
 def _source(module: str) -> ast.Module:
-    """The text of a ``module``, which is not run."""
     found = importlib.util.find_spec(module)
     assert found is not None and found.origin is not None, module
     return ast.parse(Path(found.origin).read_text(encoding="utf-8"))
@@ -149,7 +148,7 @@ def _first_line(node: ast.Module | ast.ClassDef) -> str:
 
 
 def _clause(text: str) -> str:
-    """What a docstring says before its first colon or full stop, as a part of a sentence."""
+    """Return the start of a docstring, up to its first colon or full stop, as a part of a sentence."""
     first = " ".join(text.split("\n\n")[0].split()).split(": ")[0].split(". ")[0].removesuffix(".")
     return first[0].lower() + first[1:] if first[1:2].islower() or first[1:2] == " " else first
 
@@ -183,7 +182,7 @@ def list_(
 
 
 def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
-    """Names, and what each is and serves for beside them, as wide as the terminal."""
+    """Iterate over the lines of ``entries``: names, and what each is for, wrapped to the terminal."""
     first = max(len(each.name) for each in entries) + indent + 2
     width = max(shutil.get_terminal_size().columns, first + 20)
     for each in entries:
@@ -262,7 +261,6 @@ def _projector(name: str, like: Path) -> Iterator[str]:
 
 
 def _session(_: str, like: Path) -> Iterator[str]:
-    """Below the line that says what the shipped one is."""
     yield from like.read_text(encoding="utf-8").splitlines()[1:]
 
 
@@ -285,12 +283,12 @@ def _study(name: str, _: Path) -> Iterator[str]:
 
 
 def _begun_as(like: Path, model: BaseModel, **more: str) -> dict[str, Any]:
-    """Fields of a file: those that the file ``like`` sets, of the ``model`` in it, and ``more``."""
+    """Return the fields that the file ``like`` of a ``model`` sets, and ``more``."""
     return {**model.model_dump(exclude_unset=True), **more, "source": f"as the shipped {like.stem}, to be replaced"}
 
 
 def _captures(like: Path) -> bool:
-    """Whether the camera of the file ``like`` says what light makes of electrons."""
+    """Return True if the camera of the file ``like`` states its quantum efficiency."""
     from mitsim.devices.sensor import load_sensor
 
     return load_sensor(like).states_efficiency
@@ -395,8 +393,8 @@ _WIDTH = 100
 
 
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """What each field of a ``model`` is: the first paragraph of the docstring below it, as tables and refusals have it;
-    nothing where the source is not there."""
+    """Return the meaning of each field of a ``model``: the first paragraph of the docstring below the field. Without
+    the source it is empty."""
     found: dict[str, str] = {}
     for base in reversed([one for one in model.__mro__ if issubclass(one, BaseModel) and one.model_fields]):
         try:
@@ -414,7 +412,7 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
 
 
 def default_text(value: object) -> str:
-    """A field's default ``value`` in words."""
+    """Return a field's default ``value`` in words."""
     if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
         return "none"
     if isinstance(value, bool):
@@ -423,7 +421,7 @@ def default_text(value: object) -> str:
 
 
 def allowed_text(rules: Mapping[str, Any]) -> str:
-    """What a field takes, from the ``rules`` of its JSON schema."""
+    """Return the values that a field may have, from the ``rules`` of its JSON schema."""
     if "anyOf" in rules:
         choices = rules["anyOf"]
         return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
@@ -450,7 +448,7 @@ def allowed_text(rules: Mapping[str, Any]) -> str:
 
 
 def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:
-    """Lines of a file of a ``model``: every field with what it is and may be, those without a value after a #.
+    """Iterate over the lines of a file of a ``model``, which explain every field; fields without a value follow a #.
 
     Parameters
     ----------
@@ -489,7 +487,7 @@ def _comment(text: str) -> list[str]:
 
 
 def _model_of(kind: Any) -> type[BaseModel] | None:
-    """The model of a table, where a field of a ``kind`` is one; None of other fields, lists of tables among them."""
+    """Return the model of a table, if a field of a ``kind`` is one; None for other fields and for lists of tables."""
     kinds = [kind, *get_args(kind)]
     found = (each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
     return next(found, None)

@@ -212,10 +212,8 @@ def _model_at(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.Ba
 
 
 def shipped_path(*parts: str) -> Path:
-    """A file or folder that comes with mitsim, for example ``shipped_path("calibration", "imx249.toml")`` of ``parts``.
-
-    A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
-    """
+    """Return the path of a file or folder that comes with mitsim, for example ``shipped_path("calibration",
+    "imx249.toml")``. A wheel carries them inside the package, a source tree beside it."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "_shipped"
     path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
@@ -225,7 +223,7 @@ def shipped_path(*parts: str) -> Path:
 
 
 def read_toml(path: Path | str) -> Table:
-    """The table in the TOML file ``path`` of at most 64 KiB. MitsimError when it cannot be read or is not TOML."""
+    """Return the table in the TOML file ``path`` of at most 64 KiB."""
     try:
         text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
@@ -239,8 +237,7 @@ def read_toml(path: Path | str) -> Table:
 
 
 def read_table(path: Path, what: str) -> Table:
-    """The table in the TOML or JSON file ``path`` of a person's; MitsimError, which calls it ``what``, for a file that
-    cannot be read or holds something else."""
+    """Return the table in a person's TOML or JSON file ``path``, which messages call ``what``."""
     if path.suffix.lower() != ".json":
         return read_toml(path)
     data = read_json(path)
@@ -250,12 +247,12 @@ def read_table(path: Path, what: str) -> Table:
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
-    """The TOML file ``path`` as a ``model``. MitsimError naming field, value and rule when it breaks one."""
+    """Return the TOML file ``path`` as a ``model``; MitsimError if it breaks a rule."""
     return validate(model, read_toml(path), f"file {path}")
 
 
 def validate(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
-    """A dictionary as a checked model.
+    """Return a dictionary as a checked model.
 
     Parameters
     ----------
@@ -286,7 +283,7 @@ known of frames."""
 
 
 def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> Path:
-    """The path of a file: that of a shipped one by its bare name, else ``name`` itself.
+    """Return the path of a file: of a shipped one by its bare name, else ``name`` itself.
 
     Parameters
     ----------
@@ -342,8 +339,8 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 
 
 def opening_words(path: Path) -> tuple[str, str]:
-    """What the comment that opens the scene or TOML file ``path`` says: its first sentence, and what follows "Serves:"
-    in it; empty where it does not."""
+    """Return the first sentence of the comment that opens the scene or TOML file ``path``, and what follows "Serves:"
+    in that comment."""
     opening = _OPENING.match(path.read_text(encoding="utf-8"))
     if opening is None:
         return "", ""

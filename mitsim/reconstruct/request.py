@@ -149,28 +149,28 @@ class ImageRequest(Options):
 
     @property
     def iterative(self) -> dict[str, Any]:
-        """Those of ``bounds`` and ``iterations`` that are given, as methods by iterations take them."""
+        """Those of ``bounds`` and ``iterations`` that are given."""
         given = {"bounds": self.bounds, "iterations": self.iterations}
         return {name: value for name, value in given.items() if value is not None}
 
     @property
     def plain(self) -> dict[str, Any]:
-        """What of an image's inputs JSON holds for these."""
+        """The iterative options as JSON holds them."""
         return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
     def name(self) -> str:
-        """The method's."""
+        """Name of the method."""
         return str(self.method if isinstance(self.method, str) else self.method.name)
 
     @property
     def looks_for_depth(self) -> bool:
-        """Whether depths are found from the frames."""
+        """True if depths are found from the frames."""
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
-        """ArgumentError for what no image by a point spread function is made by, or where not ``reduce`` x ``reduce``
-        pixels, a whole number of them, can become one."""
+        """Refuse options that an image by a point spread function does not have, and a ``reduce`` that is no number of
+        pixels."""
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
         for name, neutral in (("focus", None), ("margin", 0)):
@@ -185,7 +185,7 @@ class ImageRequest(Options):
             )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
-        """What decides an image: this, and fingerprints of its ``shots`` and ``factors``."""
+        """Return all that decides an image: these options, and fingerprints of its ``shots`` and ``factors``."""
         asked: dict[str, Any] = {
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
@@ -214,7 +214,7 @@ def plain_bounds(bounds: Bounds) -> list[float | None]:
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
-    """The ``parallax`` that a ``calibration`` states; MitsimError where it states none."""
+    """Return the ``parallax`` of a ``calibration``; MitsimError if it states none."""
     if parallax is None:
         raise MitsimError(
             f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
@@ -224,7 +224,7 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 
 
 def check_joint(lam: float | str) -> None:
-    """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
+    """Refuse a lambda ``lam`` by which runs behind colour filters are not solved."""
     if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
         raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
@@ -259,7 +259,7 @@ class ImageCost:
 
 
 def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
-    """What the Tikhonov image of ``shots`` by ``factors`` takes, at the calibrated depth."""
+    """Predict the time and memory of the Tikhonov image of ``shots`` by ``factors``, at the calibrated depth."""
     pixels = float(len(factors.left) * len(factors.right))
     count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
     measured = left.shape[1] * right.shape[1]
@@ -279,8 +279,7 @@ def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
 
 
 def keeps_frames(shots: Capture, factors: Factors) -> bool:
-    """Whether the measurements of ``shots`` are so few numbers that they are not read twice; ``factors`` tell the
-    sensor's pixels."""
+    """Return True if the measurements of ``shots`` are so few that they are kept instead of read twice."""
     left, right = shots.patterns
     return bool(left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= KEPT_NUMBERS)
 

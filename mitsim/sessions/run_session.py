@@ -117,15 +117,13 @@ class SessionResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Of all steps, each with its folder."""
+        """Warnings of all steps, each with its folder."""
         return tuple(dict.fromkeys(f"{step.output}: {text}" for step in self.steps for text in step.warnings))
 
     def payload(self) -> dict[str, Any]:
-        """As JSON."""
         return {**asdict(self), "warnings": self.warnings}
 
     def lines(self) -> list[str]:
-        """For people."""
         each = [f"{step.output}: {step.says}{' (finished before)' if step.left_alone else ''}" for step in self.steps]
         return [*each, f"Page: {self.page}" if self.page else f"Session: {self.output}"]
 
@@ -138,7 +136,7 @@ def run(
     job: Job | None = None,
     **options: Unpack[RunKeys],
 ) -> SessionResult:
-    """Take all steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its folder.
+    """Run the steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its own folder.
 
     Parameters
     ----------
@@ -178,7 +176,7 @@ def run(
         results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note() -> None:
-            """Keep what is done, and what is at work, so that a killed session goes on."""
+            """Write what is finished and what is at work, so that a killed session can be resumed."""
             kept = {**steps.earlier.by_output, **{each.output: each for each in results}}
             told = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
             write_json(folder / SUMMARY, {**head, **told})
@@ -218,12 +216,11 @@ class _Earlier(BaseModel):
 
     @property
     def by_output(self) -> dict[str, StepResult]:
-        """The steps by their outputs."""
         return {step.output: step for step in self.steps}
 
 
 def _earlier(folder: Path) -> _Earlier:
-    """What an earlier run in a ``folder`` came to; MitsimError where it holds none of a session."""
+    """Return the state of an earlier run in a ``folder``; MitsimError if the folder holds no session."""
     found = read_json(folder / SUMMARY)
     if not isinstance(found, dict) or found.get("kind") != KIND:
         raise MitsimError(f"resume=True: {folder / SUMMARY} is not that of a session; use another folder")
@@ -231,7 +228,7 @@ def _earlier(folder: Path) -> _Earlier:
 
 
 def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
-    """Take a ``step`` by its ``task``, unless it is ``finished``, and write its page."""
+    """Run the ``task`` of a ``step``, unless it is ``finished``, and write the step's page."""
     started, folder, pictures = time.perf_counter(), steps.folder, steps.asked.pictures
     place = folder / step.output
     if finished:
@@ -251,7 +248,7 @@ def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
 
 
 def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: Job | None) -> str:
-    """Write the page of a session, whose file has this text, in its ``folder``, of its ``results``; its path."""
+    """Write the page of a session into its ``folder``, and return the page's path."""
     from mitsim.report.pages import render_page
 
     images = [step.output for step in results if (folder / step.output / "image.png").is_file()]
@@ -329,11 +326,11 @@ class _Steps:
     light: Light | None = field(default=None, init=False)
 
     def makes(self, step: Step) -> bool:
-        """Whether a ``step`` makes anything itself: beside a sweep some are values of its points."""
+        """Return True if a ``step`` makes files itself; next to a sweep, some steps only state values of its points."""
         return self.session.step("sweep") is None or step.verb not in FOLDERS
 
     def prepare(self, step: Step) -> _Task:
-        """A ``step`` that is checked; MitsimError for what it would refuse, before any work."""
+        """Check a ``step`` before any work, and return its task."""
         shared = step.verb == "sweep" or (step.verb == "study" and is_experiment(step.values["name"]))
         if not shared:
             idle = self.asked.without("resume", "pictures")
@@ -365,8 +362,8 @@ class _Steps:
         return hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
 
     def is_finished(self, step: Step, task: _Task) -> bool:
-        """Return True if an earlier run took a ``step`` with the same inputs and its files are what they were; what
-        later steps need of it is then read by its ``task``."""
+        """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed; the
+        ``task`` then loads what later steps need."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
             known = step.output in self.earlier.by_output
@@ -381,18 +378,17 @@ class _Steps:
         return same
 
     def begin(self, step: Step) -> None:
-        """Note that a ``step`` is at work: its files are no longer those of before."""
+        """Note that a ``step`` is at work, so that its earlier files no longer count as finished."""
         self.before = self.made.get(step.output)
         self.made[step.output] = _Made(inputs="")
 
     def end(self, step: Step) -> None:
-        """Note the files of a ``step`` that was taken."""
         self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(self.folder / step.output))
 
     @contextmanager
     def earlier_aside(self, step: Step) -> Iterator[None]:
-        """Keep what an image or an export was before beside it, until it is made anew; where that is refused it is
-        what it was. MitsimError where files of somebody else are among it."""
+        """Keep an earlier image or export aside until it is made again, and restore it if that is refused. MitsimError
+        if the folder has files that the session did not make."""
         place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
         _remove(aside)
         if self.before is None or step.verb not in ("reconstruct", "export") or not place.exists():
@@ -416,7 +412,7 @@ class _Steps:
     # ---- the bench ----
 
     def check_bench(self) -> None:
-        """Open the scene, if a step needs it, and refuse what only that shows."""
+        """Open the scene if a step needs it, and refuse what only the opened scene shows."""
         if self.checks:
             self.bench  # noqa: B018 - opens it
         for check in self.checks:
@@ -424,14 +420,12 @@ class _Steps:
 
     @cached_property
     def opening(self) -> Opening:
-        """How the scene is opened."""
         scene = {name: value for name, value in self.session.scene.items() if name != "scene"}
         own = {name: scene.pop(name) for name in [*scene] if name in Opening.model_fields}
         return Opening(**own, parameters=scene)
 
     @cached_property
     def bench(self) -> Bench:
-        """The scene with its devices."""
         colours = {step.values.get("colour", NO) for step in self.session.steps} - {NO}
         return open_as(self.session.scene["scene"], self.opening, self.job, min(colours, default=NO))
 
@@ -694,6 +688,5 @@ def _of_calibration(result: Mapping[str, Any]) -> Said:
 
 
 def _of_lines(each: Mapping[str, Said]) -> Said:
-    """What is said of several folders, by their names."""
     warnings = [f"{name}: {text}" for name, (_, texts) in each.items() for text in texts]
     return "; ".join(f"{name} {says}" for name, (says, _) in each.items()), warnings

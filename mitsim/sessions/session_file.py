@@ -211,7 +211,7 @@ class Session:
     where: str = "session"
 
     def step(self, verb: str) -> Step | None:
-        """The first step of a ``verb``."""
+        """Return the first step of a ``verb``."""
         return next((step for step in self.steps if step.verb == verb), None)
 
 
@@ -390,7 +390,7 @@ def _change(data: Table, name: str, value: Any, where: str) -> Place:
 
 
 def value_of(text: str) -> Any:
-    """The value in a ``text`` as TOML has it; the text itself, where it is none."""
+    """Return the TOML value in a ``text``; the text itself if it has none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
@@ -525,7 +525,7 @@ def _check_export(session: Session, step: Step, place: Place, found: _Mistakes) 
 
 
 def calibration_for(session: Session, step: Step) -> str | None:
-    """The calibration that an export ``step`` takes of its own ``session``: that which its format can hold."""
+    """Return the session's own calibration if the format of an export ``step`` can hold it."""
     from mitsim.exchange.formats import FORMATS
 
     chosen = FORMATS.get(step.values["format"])
@@ -546,7 +546,7 @@ def _check_sweep(session: Session, step: Step, place: Place, found: _Mistakes) -
 
 
 def sweep_options(session: Session, step: Step) -> dict[str, Any]:
-    """Arguments of the study that a sweep is.
+    """Return the options of the study that a sweep is.
 
     Parameters
     ----------
@@ -576,7 +576,7 @@ def sweep_options(session: Session, step: Step) -> dict[str, Any]:
 
 
 def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What is ``swept``, values or a range of them by name, as values; MitsimError for a range of too many."""
+    """Return the values that are ``swept``, by name, with ranges as lists of values."""
     from mitsim.studies.framework.experiment import values_of
 
     def values(name: str, each: Any) -> list[Any]:
