@@ -116,7 +116,7 @@ def run_(
     $ mitsim run --from out/image -o figure.toml
     """
     if running.repeated is not None:
-        return _repeat(session, running, limited)
+        return _repeat(session, running.repeated, running, limited)
     if session is None:
         raise MitsimError("run: give a session file, or --from FOLDER to write one")
     values = {}
@@ -145,17 +145,17 @@ def run_(
     return finish(limited.as_json, done.payload(), done.lines(), done.warnings)
 
 
-def _repeat(session: str | None, running: Running, limited: LimitedPictured) -> int:
+def _repeat(session: str | None, folder: Path, running: Running, limited: LimitedPictured) -> int:
     """Print the session file that repeats a folder, or write it."""
     if session is not None:
-        raise MitsimError(f"--from {running.repeated}: writes a session file, and {session} is one; give one of both")
+        raise MitsimError(f"--from {folder}: writes a session file, and {session} is one; give one of both")
     others = "values", "resume", "shard", "scheduler", "no_pictures", "variant", "max_seconds", "max_memory"
     refuse_unused({**running.given, **limited.given}, others, "with --from, which runs nothing")
     from mitsim.core.files import check_output
 
     if running.output is not None:
         check_output(running.output, kind="file")
-    found = mitsim.session_of(running.repeated)
+    found = mitsim.session_of(folder)
     written = None if running.output is None else str(found.save(running.output))
     payload = {"session": found.text, "output": written, "warnings": found.warnings}
     lines = [found.text.rstrip()] if written is None else [f"Session file: {written}"]

@@ -126,7 +126,7 @@ def _own_hint(kind: Any, marks: Sequence[Any]) -> Any:
     """Return the annotation of an argument that is no model, with a word for its value."""
     for mark in marks:
         mark.metavar = mark.metavar or _metavar(kind)
-    return Annotated[(kind, *marks)] if marks else kind  # type: ignore[return-value]
+    return Annotated[(kind, *marks)] if marks else kind
 
 
 def _extra(model: type[Options], name: str) -> Mapping[str, Any]:
@@ -185,7 +185,7 @@ def _reader(model: type[Options], name: str, extra: Mapping[str, Any]) -> Callab
     kinds, read = [*_kinds(model.model_fields[name].annotation)], extra.get("read")
     words = [kind for kind in kinds if isinstance(kind, str)]
     if read or not (float in kinds and words):
-        return read or (lambda value: value)  # type: ignore[no-any-return]
+        return read or (lambda value: value)
     return lambda text: read_number(name, text, words)
 
 

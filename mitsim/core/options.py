@@ -46,8 +46,8 @@ def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any)
         ``complete``, which lists words; ``read``, which makes the value of the word; and limits of a number: ``ge``,
         ``gt``, ``le`` and ``lt``, or ``min`` and ``max`` where the help states them.
     """
-    limits = {name: shown.pop(name) for name in ("ge", "gt", "le", "lt") if name in shown}
-    limits |= {name: shown[shown_as] for name, shown_as in (("ge", "min"), ("le", "max")) if shown_as in shown}
+    limits: Any = {name: shown.pop(name) for name in ("ge", "gt", "le", "lt") if name in shown}
+    limits |= {name: shown[own] for name, own in (("ge", "min"), ("le", "max")) if own in shown}
     extra: Any = {"names": names, "kind": kind, **shown}
     return Field(default, description=help, json_schema_extra=extra, **limits)
 

@@ -160,8 +160,8 @@ def export(
         from mitsim.exchange.packed import calibration_content, run_content
 
         shots, calibrated = run_content(folder), None if factors is None else calibration_content(factors)
-        options = {"projector": projector} if chosen.calibration == "none" else {"calibration": calibrated}
-        notes = _function(chosen.writer)(place, shots, **options)
+        more = {"projector": projector} if chosen.calibration == "none" else {"calibration": calibrated}
+        notes = _function(chosen.writer)(place, shots, **more)
     return {
         "format": format,
         "frames": _frames_of(shots),

@@ -236,7 +236,9 @@ class Plan:
 
     def as_text(self) -> str:
         """The plan as its file has it; ArgumentError for one that was decided without a request."""
-        asked = self.known_request.model_dump(mode="json", exclude_unset=True)
+        known = self.known_request
+        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
+        asked |= known.model_dump(mode="json", exclude_unset=True)
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
         own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
         return json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
