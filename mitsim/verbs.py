@@ -36,7 +36,7 @@ from mitsim.core.configuration import CAMERA, load_model, locate, opening_words,
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, FilePath, Options, checked, option, takes
+from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, FilePath, Options, option, takes, validated_by
 from mitsim.core.spectral_manifests import BANDS, LINES, RUN, bands_of
 from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
@@ -249,7 +249,7 @@ class StudyOptions(Opening, Seeded):
     PANEL = WHAT
     VERB = "study"
 
-    patterns: Annotated[str, checked(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
+    patterns: Annotated[str, validated_by(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
     recipe: FilePath | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
     data: FilePath | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
     experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")

@@ -21,7 +21,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
 from mitsim.core.manifests import MOST_SHOTS
-from mitsim.core.options import DEVICES, LIMITS, QUALITY, FilePath, Options, checked, option, shipped_names
+from mitsim.core.options import DEVICES, LIMITS, QUALITY, FilePath, Options, option, shipped_names, validated_by
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.core.worker import pause_collector
@@ -175,7 +175,7 @@ def family_of(patterns: str) -> str:
 class Seeded(Options):
     """The root of all random streams."""
 
-    seed: Annotated[int, checked(check_root)] = option(0, "root of every random stream", panel=QUALITY)
+    seed: Annotated[int, validated_by(check_root)] = option(0, "root of every random stream", panel=QUALITY)
 
 
 class SeedKeys(TypedDict, total=False):
@@ -218,13 +218,13 @@ class RequestKeys(ExposureKeys, total=False):
 class Family(Options):
     """Patterns that the projector shows."""
 
-    patterns: Annotated[str, checked(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+    patterns: Annotated[str, validated_by(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
 
 
 class Accurate(Options):
     """How well light is known."""
 
-    accuracy: Annotated[float, checked(check_accuracy)] = option(
+    accuracy: Annotated[float, validated_by(check_accuracy)] = option(
         1e-3, "relative rms error of the expected frames", panel=QUALITY
     )
 
@@ -261,7 +261,7 @@ class Planned(Sampled, Family):
     seconds: float | None = option(
         None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
     )
-    effects: Annotated[Any, checked(_switches)] = option(
+    effects: Annotated[Any, validated_by(_switches)] = option(
         {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
     )
 
@@ -370,7 +370,7 @@ class OpeningKeys(TypedDict, total=False):
 class Variant(Options):
     """The variant of Mitsuba."""
 
-    variant: Annotated[str, checked(check_variant)] = option(
+    variant: Annotated[str, validated_by(check_variant)] = option(
         DEFAULT_VARIANT,
         "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
         metavar="VARIANT",
@@ -424,7 +424,6 @@ class Opening(LitScene):
             Which light is told apart, and how long a capture is to take.
         """
         from mitsim.bench.apparatus import check_devices, check_scene
-        from mitsim.devices.projector import ProjectorModel
 
         camera, projector = check_devices(self.camera, self.projector)
         sensor = load_sensor(camera)
@@ -444,7 +443,9 @@ class Opening(LitScene):
             check_untimed(seconds)
         if colour == AUTO:
             check_undecided(self.variant)
-        elif by_line(colour) or colour == MOSAIC:
+        elif colour != NO:
+            from mitsim.devices.projector import ProjectorModel  # here: it imports numpy
+
             light = load_model(projector, ProjectorModel)
             (light.in_bands(bands_of(colour)) if colour.startswith(BANDS) else light).traced_lines  # noqa: B018
         if timing is not None and colour != MOSAIC:
@@ -480,7 +481,7 @@ def _known_colour(colour: str) -> None:
 class Coloured(Options):
     """Which of the projector's light is told apart."""
 
-    colour: Annotated[str, checked(_known_colour)] = option(
+    colour: Annotated[str, validated_by(_known_colour)] = option(
         NO,
         "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
         "its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or lines, as the "

@@ -22,7 +22,7 @@ from mitsim.cli.commands import (
     check_work,
     complete_scene,
     completing,
-    shown,
+    show,
     verb,
 )
 from mitsim.cli.screen import (
@@ -201,7 +201,7 @@ def view(
 @verb
 def plan(
     scene: Scene,
-    asked: Annotated[Planned, shown(accuracy=_ACCURACY)],
+    asked: Annotated[Planned, show(accuracy=_ACCURACY)],
     coloured: Coloured,
     opening: Opening,
     overwritten: Overwritten,
@@ -259,7 +259,7 @@ def capture(
     output: Annotated[Path, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")],
     asked: Annotated[
         Request,
-        shown(
+        show(
             f"patterns exposure exposure_fraction noise_fraction ambient_frame ambient_shots closing_frame {_SAMPLING}",
             patterns={"default": None, "help": f"{pattern_names()}; needed without --plan"},
             accuracy=_ACCURACY,
@@ -407,7 +407,7 @@ def render(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.exr")],
     estimating: Estimating,
-    sampled: Annotated[Request, shown("accuracy seed effects")],
+    sampled: Annotated[Request, show("accuracy seed effects")],
     lit: LitScene,
     limited: LimitedPictured,
 ) -> int:
@@ -451,7 +451,7 @@ def render(
 def transport(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="HDF5 file to make", metavar="FILE.h5")],
-    asked: Annotated[Planned, shown(accuracy=_ACCURACY)],
+    asked: Annotated[Planned, show(accuracy=_ACCURACY)],
     planned: KnownPlan,
     overwritten: Overwritten,
     opening: Opening,
@@ -495,7 +495,7 @@ def pairs(
     asked: PairOptions,
     frames: Annotated[
         Request,
-        shown(
+        show(
             "patterns accuracy seed effects exposure exposure_fraction ambient_frame ambient_shots",
             exposure={"help": "seconds a frame, or auto: each pair for itself"},
         ),
@@ -524,11 +524,11 @@ def pairs(
     with limited.job() as job:
         from mitsim.learn.pairs import make_pairs
 
-        def opened(drawn: Mapping[str, str]) -> mitsim.Bench:
+        def open_drawn(drawn: Mapping[str, str]) -> mitsim.Bench:
             parameters = {**opening.parameters, **drawn}
             return open_as(scene, opening.model_copy(update={"parameters": parameters}), job)
 
-        made, cost = make_pairs(opened, wanted, Task(output, resumed.resume, job))
+        made, cost = make_pairs(open_drawn, wanted, Task(output, resumed.resume, job))
         payload = {**made.summary(), "predicted_seconds": cost.seconds, "predicted_bytes": cost.disk_bytes}
         payload |= {"seconds": job.clock.seconds(), "kernels": job.clock.kernels()}
     rows, columns = payload["shape"]
@@ -566,7 +566,7 @@ def study(
         Path, typer.Option("-o", "--output", help="folder of the study", metavar="DIR", rich_help_panel=OUTPUT)
     ] = Path("study-output"),
     *,
-    asked: Annotated[StudyOptions, shown(patterns={"default": "dots:7"})],
+    asked: Annotated[StudyOptions, show(patterns={"default": "dots:7"})],
     common: Common,
 ) -> int:
     """An experiment with figures, CSV and JSON.

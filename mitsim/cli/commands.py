@@ -62,7 +62,7 @@ class Shown:
     changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-def shown(only: str = "", **changes: Mapping[str, Any]) -> Shown:
+def show(only: str = "", **changes: Mapping[str, Any]) -> Shown:
     """Return how a verb shows a model, as an annotation of it; names of fields have spaces between."""
     return Shown(tuple(only.split()), changes)
 

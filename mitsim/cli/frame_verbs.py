@@ -9,7 +9,7 @@ import typer
 
 import mitsim
 from mitsim.bench.request import Irradiance
-from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, shown, verb
+from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, show, verb
 from mitsim.cli.screen import finish, finish_folder, finish_frame, page_line, page_of
 from mitsim.core.configuration import CAMERA
 from mitsim.core.errors import MitsimError
@@ -79,8 +79,8 @@ def reconstruct(
         typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given", metavar="DIR"),
     ] = None,
     *,
-    asked: Annotated[ImageRequest, shown(method={"read": _method})],
-    inputs: Annotated[ImageInputs, shown(overwrite={"help": "replace an earlier image in the folder", "panel": ""})],
+    asked: Annotated[ImageRequest, show(method={"read": _method})],
+    inputs: Annotated[ImageInputs, show(overwrite={"help": "replace an earlier image in the folder", "panel": ""})],
     common: Pictured,
 ) -> int:
     """Recover the image from frames and a calibration alone.
@@ -344,7 +344,7 @@ def import_(
     source: Annotated[
         Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
     ],
-    facts: Annotated[FrameFacts, shown(seed={"default": 0}, byte_order={"default": "little"})],
+    facts: Annotated[FrameFacts, show(seed={"default": 0}, byte_order={"default": "little"})],
     pictured: Pictured,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
     calibration_output: Annotated[
@@ -390,7 +390,7 @@ def patterns(
         str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
-    asked: Annotated[Pictures, shown(seed={"default": 0}, signed_capture={"default": "pair"})],
+    asked: Annotated[Pictures, show(seed={"default": 0}, signed_capture={"default": "pair"})],
     common: Common,
 ) -> int:
     """Draw patterns as pictures for a real projector.

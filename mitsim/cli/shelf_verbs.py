@@ -34,7 +34,7 @@ from mitsim.core.configuration import (
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.options import WHAT, refuse_unused
 
-# ---- `mitsim list` ---------------------------------------------------------------------------------------------------
+# ---- What is shipped -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
         yield from textwrap.wrap(name + text, width, subsequent_indent=" " * first, break_on_hyphens=False)
 
 
-# ---- `mitsim new` ----------------------------------------------------------------------------------------------------
+# ---- Files to begin with ---------------------------------------------------------------------------------------------
 
 _NAME = re.compile(r"[A-Za-z][\w-]*")
 _MASKS: dict[str, dict[str, Any]] = {

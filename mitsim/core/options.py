@@ -61,7 +61,7 @@ class _Refused(ValueError):
         return error if isinstance(error, ArgumentError) else ArgumentError(name, re.sub(f"^{name}:? ", "", str(error)))
 
 
-def checked(check: Callable[[Any], Any]) -> AfterValidator:
+def validated_by(check: Callable[[Any], Any]) -> AfterValidator:
     """Return a validator of a field by a ``check``, which raises MitsimError, and returns the value or nothing."""
 
     def validate(value: Any) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
-from mitsim.core.options import QUALITY, Options, checked, option
+from mitsim.core.options import QUALITY, Options, option, validated_by
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
@@ -66,7 +66,7 @@ def _two_numbers(ends: Any) -> tuple[float, float] | None:
     return float(ends[0]), float(ends[1])
 
 
-Two = Annotated[Any, checked(_two_numbers)]
+Two = Annotated[Any, validated_by(_two_numbers)]
 
 
 class ImageRequest(Options):

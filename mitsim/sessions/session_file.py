@@ -30,7 +30,7 @@ from mitsim.core.configuration import (
 )
 from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, short_text
 from mitsim.core.files import PAGE, PICTURES, resolve
-from mitsim.core.options import FilePath, Options, checked, option
+from mitsim.core.options import FilePath, Options, option, validated_by
 from mitsim.devices.session import SessionRecipe
 from mitsim.exchange.formats import Exported, check_format
 from mitsim.reconstruct.request import MODEL, ImageRequest
@@ -89,7 +89,7 @@ class _Capture(_Placed, Request, FixedColour):
 
 
 class _Calibration(_Placed, SessionRequest, FixedColour):
-    recipe: Annotated[Any, checked(_recipe)] = None
+    recipe: Annotated[Any, validated_by(_recipe)] = None
 
 
 class _Image(_Placed, ImageRequest):

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from mitsim.bench.request import Seeded
 from mitsim.cli import app
-from mitsim.cli.commands import shown, verb
+from mitsim.cli.commands import show, verb
 from mitsim.cli.screen import parts_of
 from mitsim.core.errors import ArgumentError
 from mitsim.core.options import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
@@ -185,7 +185,7 @@ def of_a_group(group: Group) -> int:
     return 0
 
 
-def of_some(group: Annotated[Group, shown("seed name", seed={"help": "another"})]) -> int:
+def of_some(group: Annotated[Group, show("seed name", seed={"help": "another"})]) -> int:
     return 0
 
 
