@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from mitsim.cli.report_verb import finish_folder, finish_frame
+from mitsim.cli.screen import finish_folder, finish_frame
 from PIL import Image
 
 from mitsim.cli.commands import Pictured, command_line
