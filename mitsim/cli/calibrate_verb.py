@@ -17,7 +17,7 @@ from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, Se
 from mitsim.cli.commands import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
 from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
-from mitsim.core.options import OUTPUT, option
+from mitsim.core.options import OUTPUT, WHAT, option
 from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
 from mitsim.verbs import calibrate_in, open_as
@@ -32,10 +32,10 @@ _OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose", "no_pictu
 """Those that go with --known."""
 
 
-class Calibrating(Resumed):
-    """What factors are found from, and where they go."""
+class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed):
+    """What factors are found from, how, and where they go."""
 
-    PANEL = "What"
+    PANEL = WHAT
 
     output: Path | None = option(
         None,
@@ -81,8 +81,9 @@ class Calibrating(Resumed):
         frames = {} if self.frames_used is None else {"frames": self.frames_used}
         return Modelling(model, **frames, fitted=names, accuracy=accuracy)
 
-    def refuse_others(self, given: set[str], allowed: set[str], reason: str) -> None:
-        """Refuse, for a ``reason``, the first option that is ``given`` and not ``allowed``."""
+    def refuse_others(self, scene: str | None, allowed: set[str], reason: str) -> None:
+        """Refuse, for a ``reason``, a ``scene`` and the first option that is given and not ``allowed``."""
+        given = {*self.given, *(() if scene is None else ("scene",))}
         if others := sorted(given - allowed):
             raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
 
@@ -98,12 +99,6 @@ def calibrate(
             autocompletion=complete_scene,
         ),
     ] = None,
-    *,
-    session: SessionRequest,
-    coloured: FixedColour,
-    opening: Opening,
-    limited: LimitedPictured,
-    given: set[str],
 ) -> int:
     """Estimate the camera's two factors, simulated or real.
 
@@ -114,40 +109,37 @@ def calibrate(
     $ mitsim calibrate photograph -o few --model wave
     $ mitsim calibrate --frames session -o cal --camera imx249
     """
-    colour = coloured.colour
     if asked.known is not None:
-        asked.refuse_others(given, _OF_KNOWN, f"--known {asked.known}: runs and their list decide")
-        return _calibrate_known(asked.known, asked.aged, asked.folder, limited)
+        asked.refuse_others(scene, _OF_KNOWN, f"--known {asked.known}: runs and their list decide")
+        return _calibrate_known(asked.known, asked)
     if asked.aged is not None:
         raise MitsimError(f"--from {asked.aged}: is mended by captures of known pictures; give --known LIST too")
     if asked.model is not None and not asked.planning:
-        return _fit(scene, asked, session, opening, limited, given)
+        return _fit(scene, asked)
     for name in ("frames_used", "fit", "model"):
         if (value := getattr(asked, name)) is not None:
             raise MitsimError(f"{option_name(name)} {value}: is for --model without --plan; leave it out")
     if asked.frames is not None:
-        asked.refuse_others(given, _OF_FRAMES, f"--frames {asked.frames}: frames and their list decide")
-        return _calibrate_frames(asked.frames, asked.folder, opening.camera, limited)
+        asked.refuse_others(scene, _OF_FRAMES, f"--frames {asked.frames}: frames and their list decide")
+        return _calibrate_frames(asked.frames, asked)
     if scene is None:
         raise MitsimError(
             "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
         )
     if asked.planning:
-        return _plan(scene, asked, session, colour, opening, limited)
-    return _calibrate(scene, asked, session, colour, opening, limited)
+        return _plan(scene, asked)
+    return _calibrate(scene, asked)
 
 
 # ---- a simulated session ---------------------------------------------------------------------------------------------
 
 
-def _calibrate(
-    scene: str, asked: Calibrating, session: SessionRequest, colour: str, opening: Opening, limited: LimitedPictured
-) -> int:
+def _calibrate(scene: str, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.session import load_recipe
 
-    recipe, folder = session.recipe or load_recipe(), asked.folder
+    recipe, folder, colour = asked.recipe or load_recipe(), asked.folder, asked.colour
     if asked.write_frames is not None or colour != NO:
         recipe.of_one_depth()
     if asked.write_frames is not None:
@@ -162,10 +154,11 @@ def _calibrate(
     check_work(folder, asked.resume, "calibration", several=colour != NO or bool(recipe.depths))
     if asked.write_frames is not None:
         check_output(asked.write_frames)
-    opening.check(scene, None, Exposure(None, recipe.exposure_fraction), colour)
+    asked.check(scene, None, Exposure(None, recipe.exposure_fraction), colour)
     advise(RESUME)
-    with limited.job() as job:
-        bench = open_as(scene, opening, job, colour)
+    session = asked.part(SessionRequest)
+    with asked.job() as job:
+        bench = open_as(scene, asked, job, colour)
         held = memory_from_here()
         if asked.write_frames is not None:
             found: Mapping[str, Factors] = {"": bench.write_session(asked.write_frames, folder, job, **session.given)}
@@ -175,17 +168,17 @@ def _calibrate(
     if colour != NO:
         payload, lines = _of_lines(found, folder)
         payload["memory_bytes"] = taken
-        return finish_folder(limited, folder, payload, lines, payload["warnings"])
+        return finish_folder(asked, folder, payload, lines, payload["warnings"])
     payloads = [
         {**factors.manifest.result, "memory_bytes": taken, "output": str(folder / name)}
         for name, factors in found.items()
     ]
-    lines = [line for payload in payloads for line in _session_lines(payload, limited)]
+    lines = [line for payload in payloads for line in _session_lines(payload, asked)]
     warnings = [text for factors in found.values() for text in factors.warnings]
     if not recipe.depths:
-        return finish_folder(limited, folder, payloads[0], lines, warnings)
+        return finish_folder(asked, folder, payloads[0], lines, warnings)
     whole = {"depths": payloads, "output": str(folder), "warnings": warnings}
-    return finish_folder(limited, folder, whole, lines, warnings)
+    return finish_folder(asked, folder, whole, lines, warnings)
 
 
 def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
@@ -232,47 +225,47 @@ def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
 # ---- frames of a real session ----------------------------------------------------------------------------------------
 
 
-def _calibrate_frames(folder: Path, output: Path, camera: Path | str | None, limited: LimitedPictured) -> int:
+def _calibrate_frames(folder: Path, asked: Calibrating) -> int:
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
-    session = load_frames(folder)  # refused before the estimator is imported
+    session, output = load_frames(folder), asked.folder  # refused before the estimator is imported
     from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
     held = memory_from_here()
-    with limited.job() as job:
+    with asked.job() as job:
         if session.planes != ("",):
-            payload, lines = _of_lines(calibrate_planes(session, output, job, camera), output)
+            payload, lines = _of_lines(calibrate_planes(session, output, job, asked.camera), output)
             payload["memory_bytes"] = memory_since(held)
-            return finish_folder(limited, output, payload, lines, payload["warnings"])
-        factors = calibrate_frames(session, output, job, camera)
+            return finish_folder(asked, output, payload, lines, payload["warnings"])
+        factors = calibrate_frames(session, output, job, asked.camera)
     payload = {**factors.manifest.result, "memory_bytes": memory_since(held), "output": str(output)}
     residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
         f"Factor error {error:.1e} by its noise, separability residual {residual:.2%}",
-        *limited.details(f"Condition {condition:.2e}", memory_line(payload)),
+        *asked.details(f"Condition {condition:.2e}", memory_line(payload)),
         *([] if payload["divided_by"] == 1 else [f"Numbers are divided by {payload['divided_by']}, which all have"]),
         *(f"Not known: {text}" for text in payload["not_known"]),
     ]
-    return finish_folder(limited, output, payload, lines, factors.warnings)
+    return finish_folder(asked, output, payload, lines, factors.warnings)
 
 
 # ---- captures of known pictures --------------------------------------------------------------------------------------
 
 
-def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: LimitedPictured) -> int:
+def _calibrate_known(listed: Path, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.knownlist import load_known
 
-    captures = load_known(listed)  # refused before the fit is imported
+    captures, output, aged = load_known(listed), asked.folder, asked.aged  # refused before the fit is imported
     check_output(output)
     from mitsim.reconstruct.aged_calibration import moved_in_words
     from mitsim.reconstruct.known_pictures import calibrate_known
 
     held = memory_from_here()
-    with limited.job() as job:
+    with asked.job() as job:
         found = calibrate_known(captures, output, job, aged)
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
@@ -288,7 +281,7 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
     if aged is not None:
         left = f"Left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
         moved = f"Moved: {moved_in_words(first['moved'])}"
-        return finish_folder(limited, output, payload, [said, moved, left], warnings)
+        return finish_folder(asked, output, payload, [said, moved, left], warnings)
     rows, columns = first["scale"]
     planes = dict[str, list[str]]()
     for name, each in results.items():
@@ -304,25 +297,23 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
         "columns of pixels",
         *(f"{', '.join(names)}: {text}" if any(names) else text for text, names in planes.items()),
     ]
-    return finish_folder(limited, output, payload, lines, warnings)
+    return finish_folder(asked, output, payload, lines, warnings)
 
 
 # ---- `mitsim calibrate --plan` ---------------------------------------------------------------------------------------
 
 
-def _plan(
-    scene: str, asked: Calibrating, session: SessionRequest, colour: str, opening: Opening, limited: LimitedPictured
-) -> int:
+def _plan(scene: str, asked: Calibrating) -> int:
     from mitsim.bench.request import check_psnr
     from mitsim.core.files import output_file, prepare_output, write_text
     from mitsim.devices.session import load_recipe, recipe_text
 
-    recipe, output = session.recipe or load_recipe(), asked.output
+    recipe, output, colour = asked.recipe or load_recipe(), asked.output, asked.colour
     recipe.of_one_depth()
     for given, reason in (
         (asked.write_frames is not None, f"--write-frames {asked.write_frames}: --plan takes no frames"),
         (colour != NO, f"--colour {colour}: --plan is for light that is not told apart"),
-        (limited.no_pictures, "--no-pictures: a plan has none"),
+        (asked.no_pictures, "--no-pictures: a plan has none"),
         (asked.resume, "--resume: a plan writes no parts to go on with"),
     ):
         if given:
@@ -332,58 +323,49 @@ def _plan(
     if output is not None:
         prepare_output(output, kind="file")
     patterns, psnr = Request(patterns=asked.patterns or "dots:7").patterns, check_psnr(asked.psnr)
-    opening.check(scene, patterns, Exposure(None, recipe.exposure_fraction))
-    with limited.job() as job:
-        bench = open_as(scene, opening, job)
+    asked.check(scene, patterns, Exposure(None, recipe.exposure_fraction))
+    with asked.job() as job:
+        bench = open_as(scene, asked, job)
         from mitsim.calibrate.session_plan import plan_calibration
 
         with nullcontext() if output is None else output_file(output):
-            found = plan_calibration(
-                bench, psnr, patterns, recipe, seed=session.seed, accuracy=session.accuracy, job=job
-            )
+            found = plan_calibration(bench, psnr, patterns, recipe, seed=asked.seed, accuracy=asked.accuracy, job=job)
             lines = found.lines()
             if output is not None:
                 write_text(output, recipe_text(found.recipe))
                 lines.append(f"Recipe: {output}")
     payload = {**found.payload(), "output": None if output is None else str(output)}
-    return finish(limited.as_json, payload, lines, found.warnings)
+    return finish(asked.as_json, payload, lines, found.warnings)
 
 
 # ---- `mitsim calibrate --model` --------------------------------------------------------------------------------------
 
 
-def _fit(
-    scene: str | None,
-    asked: Calibrating,
-    session: SessionRequest,
-    opening: Opening,
-    limited: LimitedPictured,
-    given: set[str],
-) -> int:
+def _fit(scene: str | None, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.devices.framelist import load_frames
     from mitsim.devices.session import load_recipe
 
-    modelling, folder = asked.modelling(session.accuracy), asked.folder
+    modelling, folder = asked.modelling(asked.accuracy), asked.folder
     if scene is None:
         raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
     of_frames_alone = ("recipe", "seed", "accuracy") if asked.frames else ()
     for name in ("resume", "write_frames", "colour", *of_frames_alone):
-        if name in given:
+        if name in asked.given:
             other = " of --frames" if name in of_frames_alone else ""
             raise MitsimError(f"{option_name(name)}: is of no use with --model{other}; leave it out")
-    recipe, frames = session.recipe or load_recipe(), asked.frames and load_frames(asked.frames)
+    recipe, frames = asked.recipe or load_recipe(), asked.frames and load_frames(asked.frames)
     check_output(folder)
     if frames is None:
-        opening.check(scene, None, Exposure(None, recipe.exposure_fraction))
-    with limited.job() as job:
-        bench = open_as(scene, opening, job)
+        asked.check(scene, None, Exposure(None, recipe.exposure_fraction))
+    with asked.job() as job:
+        bench = open_as(scene, asked, job)
         from mitsim.calibrate.model import calibrate_model
 
-        factors = calibrate_model(bench, modelling, frames, recipe, session.seed, folder, job)
+        factors = calibrate_model(bench, modelling, frames, recipe, asked.seed, folder, job)
     result = factors.manifest.result
     lines = _model_lines(result, folder)
-    return finish_folder(limited, folder, {**result, "output": str(folder)}, lines, factors.warnings)
+    return finish_folder(asked, folder, {**result, "output": str(folder)}, lines, factors.warnings)
 
 
 def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:

@@ -26,6 +26,7 @@ PANELS = WHAT, QUALITY, DEVICES, OUTPUT, LIMITS
 
 P = ParamSpec("P")
 R = TypeVar("R")
+M = TypeVar("M", bound="Options")
 
 
 def option(default: Any, help: str, *names: str, kind: Any = None, **shown: Any) -> Any:
@@ -134,6 +135,10 @@ class Options(BaseModel):
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
         return {name: getattr(self, name) for name in type(self).model_fields if name in self.model_fields_set}
+
+    def part(self, model: type[M]) -> M:
+        """Return the options that were given of those that another ``model`` has, as that model."""
+        return model(**{name: value for name, value in self.given.items() if name in model.model_fields})
 
     def without(self, *names: str) -> dict[str, Any]:
         """Return the options that were given, but for those of some ``names``."""

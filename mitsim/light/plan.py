@@ -237,7 +237,7 @@ class Plan:
     def as_text(self) -> str:
         """The plan as its file has it; ArgumentError for one that was decided without a request."""
         known = self.known_request
-        asked = {name: getattr(known, name) for name in ("patterns", "seed", "effects")}
+        asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
         asked |= known.model_dump(mode="json", exclude_unset=True)
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
         own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})

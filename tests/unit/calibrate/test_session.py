@@ -279,7 +279,7 @@ def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
     if ending == ".npy":
         bench = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"bits": None})))
     own = recipe("pair").model_copy(update=more)
-    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", 3, recipe=own)
+    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", seed=3, recipe=own)
     found = calibrate_frames(tmp_path / "frames")
     assert np.array_equal(found.left, simulated.left) and np.array_equal(found.right, simulated.right)
     assert simulated.manifest.result["frames"] == files == len(list((tmp_path / "frames").glob(f"*{ending}")))

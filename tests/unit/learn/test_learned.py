@@ -418,7 +418,7 @@ def test_trainings_that_are_refused(tmp_path: Path) -> None:
         training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
     for device in ("abacus", "meta"):
         with pytest.raises(ArgumentError, match=f"device '{device}': cannot be used"):
-            train_network(FakeStore(8), factors, replace(request, device=device), tmp_path / "m.pt")
+            train_network(FakeStore(8), factors, request.model_copy(update={"device": device}), tmp_path / "m.pt")
     with pytest.raises(MitsimError, match="ran away at step"):
         train_network(HotStore(8), factors, request, tmp_path / "m.pt")
     assert not (tmp_path / "m.pt").exists()

@@ -167,7 +167,7 @@ SCENE = '[scene]\nscene = "photograph"\n'
     [
         ("[captur]\n", "captur: got {}, no such field; did you mean capture?"),
         ('[capture]\npatern = "dots:4"\n', "capture.patern: got 'dots:4', no such field; did you mean patterns?"),
-        (SCENE + "[capture]\nseed = 1.5\n", "session.toml:4: capture.seed: 1.5: give a valid integer"),
+        (SCENE + "[capture]\nseed = 1.5\n", "session.toml:4: capture.seed: 1.5: give a whole number"),
         ("[capture]\n", "capture: is of a scene, and there is none; add a table [scene]"),
         (SCENE, "asks for nothing; add a table, such as [capture]"),
         (SCENE + "[reconstruct]\n", "reconstruct.0.run: is missing, and there is no [capture]"),
