@@ -294,7 +294,7 @@ def test_an_interrupted_training_goes_on_bit_equal(
         train_network(store, factors, request, tmp_path / "c.pt", Job(progress=stop))
     assert not (tmp_path / "c.pt").exists() and parts == [step / 6 for step in (1, 2, 3, 4)]
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
-        train_network(store, factors, replace(request, seed=2), tmp_path / "c.pt", resume=True)
+        train_network(store, factors, request.model_copy(update={"seed": 2}), tmp_path / "c.pt", resume=True)
     with monkeypatch.context() as patch, pytest.raises(MitsimError, match="numbers of other precision"):
         patch.setattr(training, "has_half", lambda device: not has_half(device))
         train_network(store, factors, request, tmp_path / "c.pt", resume=True)

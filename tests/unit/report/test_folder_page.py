@@ -13,10 +13,10 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from mitsim.cli.screen import finish_folder, finish_frame
 from PIL import Image
 
 from mitsim.cli.commands import Pictured, command_line
+from mitsim.cli.screen import finish_folder, finish_frame
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json
