@@ -9,9 +9,9 @@ import functools
 import inspect
 import os
 import reprlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 _LONGEST = 1500
 """Characters of a message: a screen of 80 x 20."""
@@ -81,6 +81,7 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 100
 _LONGEST_PATH, _LONGEST_NAME = 4095, 255
 """Bytes of a path, and of a name in it, that Linux takes."""
+_SEVERAL = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 Kind = tuple[str, Callable[[object], bool]]
 """What an annotation allows, in words and as a test."""
 _KINDS: dict[str, Kind] = {
@@ -100,19 +101,27 @@ _KINDS: dict[str, Kind] = {
 
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
-    with the argument, the value and what is allowed. Numbers of NumPy come to it as Python's."""
+    """Make a public ``function`` refuse arguments of another kind than it is annotated with, by ArgumentError.
+
+    Numbers of NumPy are passed on as Python's. Further keywords are checked by what the function makes of them.
+    """
     signature = inspect.signature(function)
-    annotated = {name: each.annotation for name, each in signature.parameters.items()}
-    kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
+    several = {name for name, each in signature.parameters.items() if each.kind in _SEVERAL}
+    kinds = {
+        name: _kinds(each.annotation, function)
+        if isinstance(each.annotation, str) and each.kind != inspect.Parameter.VAR_KEYWORD
+        else []
+        for name, each in signature.parameters.items()
+    }
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
-        for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
-            allowed = kinds.get(name)
-            if allowed and not any(allows(value) for _, allows in allowed):
-                words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                raise ArgumentError(name, f"{short_text(value)}: give {words}")
+        for name, bound in signature.bind(*arguments, **named).arguments.items():
+            allowed = kinds[name]
+            for value in bound if name in several else (bound,):
+                if allowed and not any(allows(value) for _, allows in allowed):
+                    words = " or ".join(dict.fromkeys(words for words, _ in allowed))
+                    raise ArgumentError(name, f"{short_text(value)}: give {words}")
         plain = {name: plain_number(value) for name, value in named.items()}
         return function(*map(plain_number, arguments), **plain)  # type: ignore[arg-type]
 
@@ -125,18 +134,6 @@ def plain_number(value: object) -> object:
         return value
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     return value.item() if kind in tuple("biuf") else value  # type: ignore[attr-defined]
-
-
-def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    """Name and value of every argument that is ``bound`` to a ``signature``, further ones one by one."""
-    for name, value in bound.items():
-        kind = signature.parameters[name].kind
-        if kind == inspect.Parameter.VAR_KEYWORD:
-            yield from value.items()
-        elif kind == inspect.Parameter.VAR_POSITIONAL:
-            yield from ((name, each) for each in value)
-        else:
-            yield name, value
 
 
 def checked_fields(made: C) -> C:
