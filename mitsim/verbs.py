@@ -277,8 +277,6 @@ class StudyOptions(Opening, Seeded):
                 name: values if isinstance(values, (list, tuple)) else [values] for name, values in self.over.items()
             }
             return tuple((name, tuple(spelling(value) for value in values)) for name, values in each.items())
-        if wrong := [text for text in self.over if not isinstance(text, str)]:
-            raise ArgumentError("over", f"{wrong[0]!r}: give texts such as NAME=VALUE,VALUE, or values by name")
         return tuple(values_of(text) for text in self.over)
 
 
