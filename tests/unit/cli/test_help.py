@@ -178,7 +178,8 @@ def test_a_verb_shows_some_fields_as_it_needs() -> None:
             if each.name != "context"
         }
         assert help_ == {"seed": "another", "name": "of it"}
-    assert Group.model_fields["seed"].description == "root of every random stream"
+    plain = inspect.signature(verb(of_a_group)).parameters["seed"].annotation
+    assert plain.__metadata__[0].help == Group.model_fields["seed"].description == "root of every random stream"
 
 
 def of_a_group(group: Group) -> int:
