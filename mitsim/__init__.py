@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from mitsim.acquire.capture import Light as Light
     from mitsim.acquire.reference import Rendered as Rendered
     from mitsim.api.bench import Bench as Bench
+    from mitsim.api.bench import flat_scene as flat_scene
     from mitsim.api.bench import open_bench as open_bench
-    from mitsim.api.scenes import flat_scene as flat_scene
-    from mitsim.api.scenes import shelf_scene as shelf_scene
+    from mitsim.api.bench import shelf_scene as shelf_scene
     from mitsim.bench.request import Request as Request
     from mitsim.calibrate.model import calibrate_model as calibrate_model
     from mitsim.calibrate.session_plan import CalibrationPlan as CalibrationPlan
@@ -76,8 +76,7 @@ _HOMES = {
     for home, names in {
         "acquire.capture": "Light",
         "acquire.reference": "Rendered",
-        "api.bench": "Bench open_bench",
-        "api.scenes": "flat_scene shelf_scene",
+        "api.bench": "Bench flat_scene open_bench shelf_scene",
         "bench.request": "Request",
         "calibrate.model": "calibrate_model",
         "calibrate.session_plan": "CalibrationPlan plan_calibration",

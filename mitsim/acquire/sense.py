@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
+from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
 from mitsim.core.arrays import FloatArray, Npy
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -160,7 +160,7 @@ def sense(
         for an image that is no frame of numbers from 0, no light where the exposure is to follow from it, or a camera
         whose file has no quantum efficiency.
     """
-    check_wavelength(wavelength_nm)
+    Irradiance(wavelength=wavelength_nm)
     if sensor.mosaic is not None:
         raise MitsimError(
             f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
@@ -236,5 +236,5 @@ def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
     f_number
         N, 0.5 or more; ArgumentError otherwise.
     """
-    check_f_number(f_number)
+    Irradiance(f_number=f_number)
     return np.asarray(radiance * (math.pi / (4 * f_number**2)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -138,11 +138,6 @@ def is_coloured(folder: Path | str) -> bool:
     return (Path(folder) / COLOUR).is_file()
 
 
-def is_mosaic(folder: Path | str) -> bool:
-    """Return True if ``folder`` is a run behind colour filters; MitsimError for a damaged colour.json."""
-    return is_coloured(folder) and _kind(read_json(Path(folder) / COLOUR)) == MOSAIC
-
-
 @dataclass(frozen=True)
 class SpectralFolder:
     """A run, calibration or image, and its spectral lines.
@@ -204,11 +199,6 @@ def read_colours(folder: Path | str, kind: str) -> ColourManifest:
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
     return checked_colours(read_json(Path(folder) / COLOUR), kind, Path(folder))
-
-
-def read_mosaic(folder: Path | str) -> MosaicManifest:
-    """Return the lines and filters of a run behind colour filters; MitsimError as :func:`read_colours`."""
-    return cast("MosaicManifest", read_colours(folder, MOSAIC))
 
 
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:

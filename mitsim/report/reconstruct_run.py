@@ -103,7 +103,7 @@ def reconstruct(
     MitsimError
         For folders that do not fit each other, options that are not allowed, or an output that cannot be written.
     """
-    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam, **options)
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam=lam, **options)
     with job.clock.stage("read"):
         shots, factors = load_run(run), load_calibration(calibration)
         factors.check_fit(shots)

@@ -121,7 +121,7 @@ def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     plan = plan_request(colours.whole, request)
     lighting = colours.whole.family(request.patterns, seed).lighting
     lights = trace_lines(colours.whole, colours.benches, plan, lighting, seed)
-    factors = calibrate_lines(colours.whole, SessionRequest(seed, setup.accuracy), Task())
+    factors = calibrate_lines(colours.whole, SessionRequest(seed=seed, accuracy=setup.accuracy), Task())
     return tuple(
         LitLine(name, light.bench.projector.effective_wavelength_nm, LitScene(light), factors[name])
         for name, light in zip(colours.names, lights, strict=True)

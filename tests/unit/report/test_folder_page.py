@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.cli.options import Pictured, command_line
-from mitsim.cli.report_verb import finish_folder, finish_frame
+from mitsim.cli.commands import Pictured, command_line
+from mitsim.cli.screen import finish_folder, finish_frame
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json

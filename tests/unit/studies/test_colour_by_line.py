@@ -112,7 +112,7 @@ def test_folders_that_do_not_belong_together_are_refused(pair: tuple[Path, Path]
 def test_a_chart_of_a_grey_run_is_refused(pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     run, calibration = (str(folder / "638nm") for folder in pair)
     assert main(["reconstruct", run, "--calibration", calibration, "--chart", "colour_checker"]) == 2
-    assert "is not coloured; leave out --chart" in capsys.readouterr().err
+    assert "which is not coloured; leave it out" in capsys.readouterr().err
 
 
 def test_a_calibration_of_another_line_is_refused(

@@ -152,7 +152,7 @@ def test_folders_that_do_not_fit_are_refused(
         solved((run, tmp_path / "cal"), tmp_path / "image")
     line = calibration / "638nm"
     assert main(["reconstruct", str(line), "--calibration", str(line), "--mosaic", "joint"]) == 2
-    assert "is not coloured; leave out --mosaic" in capsys.readouterr().err
+    assert "which is not coloured; leave it out" in capsys.readouterr().err
 
 
 def test_a_manifest_has_a_weight_for_each_line(pair: tuple[Path, Path], tmp_path: Path) -> None:
