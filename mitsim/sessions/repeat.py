@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import checksum
 from mitsim.core.files import plain, read_json, write_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.spectral_manifests import COLOUR, IMAGE, MOSAIC, checked_colours, is_coloured, spectral_of
+from mitsim.core.spectral_manifests import COLOUR, IMAGE, KINDS, is_coloured, open_lines, spectral_of
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
@@ -144,11 +144,8 @@ class _Found:
                 yield path
 
     def _first(self, folder: Path) -> Path:
-        """Return the folder whose manifest describes a ``folder``; for a folder of lines, that of the first line."""
-        data = read_json(folder / COLOUR) if is_coloured(folder) else {}
-        if not data or data.get("kind") == MOSAIC:
-            return folder
-        return folder / checked_colours(data, str(data.get("kind")), folder).names[0]
+        """Return the folder whose manifest describes a ``folder``: of several lines, that of the first."""
+        return next(iter(open_lines(folder, *KINDS).parts.values()))
 
     def _scene(self, conf: Mapping[str, Any], opened: Mapping[str, Any] | None, folder: Path, coloured: bool) -> None:
         """Add the table of the scene that a manifest's ``conf`` describes; raise MitsimError if another scene is there
@@ -228,12 +225,10 @@ class _Found:
 
     def _colour(self, folder: Path) -> dict[str, str]:
         """Return the word of the colours of a ``folder``; nothing if none are told apart."""
-        if not is_coloured(folder):
-            return {}
-        data = read_json(folder / COLOUR)
-        if data["kind"] == MOSAIC:
-            return {"colour": "mosaic"}
-        count = len(checked_colours(data, data["kind"], folder).names)
+        lines = open_lines(folder, *KINDS)
+        if lines.colours is None or lines.filters:
+            return {"colour": "mosaic"} if lines.filters else {}
+        count = len(lines.names)
         _, projector = check_devices(None, self.tables["scene"].get("projector"))
         several = load_model(projector, ProjectorModel).wavelengths_nm or ()
         return {"colour": "lines" if count == len(several) else f"bands:{count}"}
@@ -263,7 +258,7 @@ class _Found:
         made_of = _made_of(folder)
         if "calibration" not in made_of:
             raise MitsimError(f"{folder}: does not tell the calibration that it is made of")
-        first = self._first(folder) if is_coloured(folder) else folder
+        first = self._first(folder)
         stated = read_result(first).get("inputs") if (first / RESULT_FILE).is_file() else {}
         inputs = {
             name: value for name, value in (stated if isinstance(stated, dict) else {}).items() if name not in made_of
