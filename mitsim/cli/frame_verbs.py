@@ -110,12 +110,13 @@ def reconstruct(
         options = {"lam": asked.lam, "way": inputs.mosaic or JOINT} if lines.filters else asked.given
         where: Any = {"output": output, "overwrite": inputs.overwrite, "job": job, **options}
         found: Any
+        calibration: Any = inputs.calibration
         if inputs.psf is not None:
             found = reconstruct_run.reconstruct_psf(run, inputs.psf, reduce=inputs.reduce, **where)
         elif lines.colours:
-            found = reconstruct_run.reconstruct_colours(run, inputs.calibration, chart=chart, page=False, **where)
+            found = reconstruct_run.reconstruct_colours(run, calibration, chart=chart, page=False, **where)
         else:
-            found = reconstruct_run.reconstruct(run, inputs.calibration, **where)
+            found = reconstruct_run.reconstruct(run, calibration, **where)
     payload = {**found.summary(), "memory_bytes": memory_since(held)}
     shown = _colours_lines(found, common) if lines.colours else _image_lines(found, payload, common)
     return finish_folder(common, output, payload, shown, payload["warnings"])

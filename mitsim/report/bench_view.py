@@ -362,11 +362,11 @@ class BenchView:
         extents = ends[:, :, 1].max(axis=0) - ends[:, :, 0].min(axis=0)
         # Plotly makes the sides' geometric mean 1: of a high room the longest is far more, and the eye goes back.
         back = max(1.0, float(extents.max() / np.cbrt(extents.prod())) / _IN_SIGHT)
-        eye = dict(zip("xyz", (-2.1 * back, -1.45 * back, 1.0 * back), strict=True))
+        view_from = dict(zip("xyz", (-2.1 * back, -1.45 * back, 1.0 * back), strict=True))
         titles = {"xaxis": "z, from the sensor [mm]", "yaxis": "x, to the left [mm]", "zaxis": "y, up [mm]"}
         scene = {name: {"title": {"text": title}} for name, title in titles.items()}
         figure.update_layout(
-            scene={**scene, "aspectmode": "data", "camera": {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.15}}},
+            scene={**scene, "aspectmode": "data", "camera": {"eye": view_from, "center": {"x": 0, "y": 0, "z": -0.15}}},
             legend={"orientation": "h", "y": 0, "yanchor": "top"},
             margin={"l": 0, "r": 0, "t": 0, "b": 0},
             height=560,

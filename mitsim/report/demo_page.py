@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -257,10 +258,10 @@ def render_html(report: ReportData) -> str:
         if f.idealised is not None and f.rendered is not None
     }
     positive = {row.name: row.value for row in report.budget if row.value}
-    drawn = {
-        "singular_values": (curves, lambda: plots.singular_values(curves)),
-        "quality": (both, lambda: plots.quality_bars(both)),
-        "budget": (positive, lambda: plots.error_bars(positive, report.accuracy)),
+    figures = {
+        "singular_values": plots.singular_values(curves) if curves else None,
+        "quality": plots.quality_bars(both) if both else None,
+        "budget": plots.error_bars(positive, report.accuracy) if positive else None,
     }
     trust = next((f.rendered.trust for f in report.families if f.rendered and f.name == report.main), None)
     return render_page(
@@ -268,7 +269,7 @@ def render_html(report: ReportData) -> str:
         _FILTERS,
         report=report,
         best=best,
-        figures={name: _picture(draw()) for name, (data, draw) in drawn.items() if data},
+        figures={name: _picture(figure) for name, figure in figures.items() if figure is not None},
         frames=[Picture.of(name, name, _finite(dn, name), Scale.of(dn, "DN")) for name, dn in report.frames.items()],
         errors=trust.pictures() if trust else (),
         plan=PlanChart.of(report.effects, report.accuracy) if report.effects else None,
@@ -278,7 +279,7 @@ def render_html(report: ReportData) -> str:
     )
 
 
-def _picture(figure: plots.Figure) -> str:
+def _picture(figure: Figure) -> str:
     return figure_uri(figure, _FIGURE_DPI)
 
 
@@ -305,9 +306,17 @@ def _trouble(status: str) -> str:
     return "" if status.startswith("Solved: ") else sentence(re.split(r"; |\. ", status)[0])
 
 
-_FILTERS = {
-    "chi": lambda value: DASH if value is None else chi_square_text(value),
-    "db": lambda value: DASH if value is None else f"{value:.1f} dB",
+def _chi_square(value: float | None) -> str:
+    return DASH if value is None else chi_square_text(value)
+
+
+def _decibel(value: float | None) -> str:
+    return DASH if value is None else f"{value:.1f} dB"
+
+
+_FILTERS: dict[str, Callable[..., str]] = {
+    "chi": _chi_square,
+    "db": _decibel,
     "rms": reflectance,
     "trouble": _trouble,
     "reflectance": _reflectance,

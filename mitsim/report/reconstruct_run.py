@@ -330,10 +330,10 @@ class _AllAtOnce:
         unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
         board, qualities = _board_of(self.calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
         truth, steps = self.mosaic.truth(board), solved.joint and solved.joint.iterations
-        for number, name in enumerate(lines.names if truth is not None else ()):
-            known = self.mosaic.truths[name]
-            error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
-            qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
+        if truth is not None:
+            for number, (name, known) in enumerate(self.mosaic.truths.items()):
+                error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
+                qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
         for name, image in zip(lines.names, solved.images, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
