@@ -234,6 +234,12 @@ class ColourImage:
         return card("Image in colour", pictures, self.sentences)
 
 
+def begin_image(folder: Path, lines: ColourManifest, **inputs: Any) -> None:
+    """State in colour.json that an image of ``lines`` is being made, so that the same work can replace a killed one."""
+    remove_page(folder)
+    write_colours(folder, ColourManifest(kind="colour-image", channels=lines.channels), status="incomplete", **inputs)
+
+
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None

@@ -379,6 +379,8 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     folder, colours = lines.folder, lines.colours
     assert colours is not None
     data = read_json(folder / COLOUR)
+    if data.get("status") == "incomplete":
+        raise MitsimError(f"{folder / COLOUR}: holds no result of a finished image; reconstruct it again")
     verify_files(folder, data.get("checksums"), "reconstruct it again")
     parts = {name: _of_image(folder / name) for name in lines.names if (folder / name / RESULT_FILE).is_file()}
     files = [folder / name / IMAGE_FILE for name in lines.names]

@@ -56,7 +56,7 @@ from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solution import Solution, Status
 from mitsim.reconstruct.solver import prepare
-from mitsim.report.colour_image import ColourImage
+from mitsim.report.colour_image import ColourImage, begin_image
 from mitsim.report.folder_page import report_folder
 
 # -------- The image of one line
@@ -232,17 +232,18 @@ class _OneByOne:
         return is_coloured(output) and (read_colours(output, IMAGE).names == self.lines.names or self.overwrite)
 
     def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
-        images = {
-            name: reconstruct(
-                self.run / name,
-                self.calibration / name,
-                folder / name,
-                overwrite=self.overwrite,
-                job=self.job.apart(f"{name} "),
-                **self.options,
-            )
-            for name in self.lines.names
-        }
+        begins = not is_coloured(folder)
+        if begins:
+            begin_image(folder, self.lines)
+        images = {}
+        try:
+            for name in self.lines.names:
+                own = {"overwrite": self.overwrite, "job": self.job.apart(f"{name} "), **self.options}
+                images[name] = reconstruct(self.run / name, self.calibration / name, folder / name, **own)
+        except BaseException:
+            if begins and not any((folder / name).is_dir() for name in self.lines.names):  # refused before any image
+                (folder / COLOUR).unlink()
+            raise
         solved = {name: judged.reconstruction for name, judged in images.items()}
         shapes = {each.image.shape for each in solved.values()}
         if len(shapes) > 1:
@@ -334,6 +335,7 @@ class _AllAtOnce:
             for number, (name, known) in enumerate(self.mosaic.truths.items()):
                 error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
                 qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
+        begin_image(folder, lines, inputs=self.inputs)
         for name, image in zip(lines.names, solved.images, strict=True):
             with output_folder(folder / name, overwrite=True) as place:
                 write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
