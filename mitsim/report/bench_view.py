@@ -75,17 +75,7 @@ def view(bench: Apparatus) -> BenchView:
 
 @dataclass(frozen=True, eq=False)
 class BenchView:
-    """Places of all parts of a bench, which show themselves in a notebook.
-
-    Attributes
-    ----------
-    bench
-        The bench.
-    layout
-        Its devices and surfaces [mm], in the camera's frame.
-    previews
-        Pictures by a pinhole camera at the sensor's place, and at a free place.
-    """
+    """Places of all parts of a bench [mm] in the camera's frame, and pictures from the sensor's and a free place."""
 
     bench: Apparatus
     layout: Layout

@@ -27,32 +27,20 @@ class ColourImage:
 
     Attributes
     ----------
-    lines
-        Spectral lines and their names.
     images : (n, n', lines) array
-        Reflectances, 1 = the calibration's board.
-    board
-        Reflectance of that board.
+        Reflectances, 1 = the calibration's board, whose own reflectance is ``board``.
     model
         Conversion of reflectances at the lines to colours.
     truth : (n, n', lines) array
         What perfect images would show, relative to the board; None for a real camera.
     chart
-        Place of a colour chart in the image; None where there is none, or it is not known.
-    qualities
-        Quality of each line's image; None without a truth.
+        Place of a colour chart in the image, where it is known.
     facts
         How the images were found, in words, for the page.
-    warnings
-        What is wrong with the images.
-    seconds
-        Wall time by stage.
-    output
-        The folder that holds all files.
     solution, of_lines
         Numbers of one solve for all lines, or of the solve of each line, by the keys of the command line's JSON.
     inputs
-        What one solve for all lines was made of: an image of other inputs is not replaced.
+        Source of one solve for all lines: an image of other inputs is not replaced.
     """
 
     lines: ColourManifest
@@ -76,17 +64,7 @@ class ColourImage:
     ) -> ColourImage:
         """Convert images to colours, by a matrix fitted on the chart where its place is known, else by the fixed one.
 
-        Parameters
-        ----------
-        lines, images, chart, **more
-            As the attributes.
-        board
-            Reflectance of the calibration's board; None is taken for 1.
-
-        Raises
-        ------
-        MitsimError
-            Where the chart lies outside the image.
+        A ``board`` of None is taken for 1. MitsimError where the chart lies outside the image.
         """
         model, board = ColourModel.of_lines(lines.wavelengths_nm), board or 1.0
         if chart is not None:

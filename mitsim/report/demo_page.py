@@ -55,16 +55,10 @@ COVERED = 1.96
 
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """What an image states of its errors, beside the actual errors.
+    """The stated standard ``uncertainty`` of an image's pixels beside their actual ``error``, (n, n') reflectance.
 
-    Attributes
-    ----------
-    uncertainty, error : (n, n') arrays
-        Stated standard uncertainty of each pixel, and actual absolute error [reflectance, 1 = the board].
-    chi_square
-        Misfit a datum; None where there are no more data than unknowns.
-    cause
-        Finding that flags the misfit; empty where the frames fit.
+    ``chi_square`` is the misfit a datum, None where there are no more data than unknowns; ``cause`` is the finding that
+    flags the misfit.
     """
 
     uncertainty: FloatArray
@@ -133,18 +127,9 @@ class Recovery:
 class FamilyResult:
     """A pattern family, e.g. name "dots:7" and label "49 dots".
 
-    Attributes
-    ----------
-    shots
-        Number of frames; a signed pattern takes two.
-    patterns
-        Some (n, n) examples, 0..1 or -1..1.
-    singular_values
-        Of the family's system.
-    idealised, rendered
-        Images of the paper's model with its own factors, and of rendered frames with calibrated factors.
-    by_exposure
-        PSNR [dB] of rendered frames by exposure convention.
+    ``shots`` counts frames, of which a signed pattern takes two. ``patterns`` are some (n, n) examples, 0..1 or -1..1.
+    ``idealised`` solves the paper's model with its own factors, ``rendered`` rendered frames with calibrated factors,
+    whose PSNR [dB] by exposure convention is ``by_exposure``.
     """
 
     name: str
@@ -169,24 +154,10 @@ class BudgetRow(NamedTuple):
 class ReportData:
     """Content of the demo's page.
 
-    Attributes
-    ----------
-    truth, render : (n, n) array, and array of any size
-        Reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
-    families, main
-        Pattern families, and the name of the one whose errors are shown; the tiles compare the best with the first.
-    frames
-        (m, m) frames [DN] by caption.
-    exposure
-        Exposure convention of the reconstructions.
-    calibration
-        What `calibrate --json` reports, and its ``status``.
-    accuracy, effects
-        Of the plan.
-    error
-        Relative error of the expected frames, from all sources.
-    kernels
-        ``number`` of kernels that were compiled, and ``seconds`` of that.
+    ``truth`` (n, n) and ``render`` are reflectances, 1 = calibration board, as seen along +z, row 0 at the top.
+    ``main`` is the family whose errors are shown; the tiles compare the best family with the first. ``frames`` are in
+    DN by caption, ``error`` is the relative error of the expected frames, and ``calibration`` what `calibrate --json`
+    reports.
     """
 
     title: str

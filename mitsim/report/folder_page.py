@@ -63,22 +63,8 @@ _SHOWN_PERCENT = 99.0
 class Shown:
     """Content of a folder's page.
 
-    Attributes
-    ----------
-    kind
-        Kind of folder, in a word.
-    verdict, detail, warnings, command
-        Head of the page; a command of None is unknown.
-    pictures, plan
-        Pictures in order, and the plan as bars.
-    seconds, kernels
-        Wall time by stage; number and seconds of kernels that were compiled.
-    numbers, camera, configuration, versions
-        Lines of tables, by name.
-    parts
-        Pages of the folders in it, by name.
-    colours, facts
-        An image in colour, and how it was found.
+    ``kernels`` are number and seconds of compiled kernels; numbers, camera, configuration and versions are lines of
+    tables by name; ``parts`` are the pages of the folders in it; ``facts`` say how an image in colour was found.
     """
 
     kind: str
@@ -112,11 +98,6 @@ def report_folder(folder: Path | str) -> Path:
     -------
     Path
         The page, ``report.html``; its pictures are in the folder ``pictures`` beside it.
-
-    Raises
-    ------
-    MitsimError
-        For another or a damaged folder, and one that cannot be written.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -76,16 +76,9 @@ class LitScene:
     def expected_frames(
         self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Apparatus | None = None
     ) -> ExpectedFrames:
-        """Return frames without noise.
+        """Return frames without noise, of one of :data:`mitsim.report.MODELS`.
 
-        Parameters
-        ----------
-        model, family
-            One of :data:`mitsim.report.MODELS`, and the patterns.
-        plane
-            Place of the idealised scene; None for the plane of the calibration.
-        bench
-            A bench with another mask in the same light; None for the scene's own.
+        ``plane`` is the place of an idealised scene, None for the calibrated one; ``bench`` may have another mask.
         """
         if model == RENDERED:
             light = self._merged if bench is None else self._merged.behind(bench)
@@ -127,16 +120,8 @@ class LitScene:
 class Unexposed:
     """Frames of a scene under a family before any exposure, and the factors that solve them.
 
-    Attributes
-    ----------
-    lit, model, family
-        The scene, one of :data:`mitsim.report.MODELS`, and the patterns.
-    sides, centre
-        Left and right factor, and whether means are subtracted from frames.
-    seed
-        Seed of the sensor's noise.
-    plane
-        Place of an idealised scene; None for the plane of the factors.
+    ``model`` is one of :data:`mitsim.report.MODELS`; ``centre`` is True where means are subtracted from frames;
+    ``plane`` is the place of an idealised scene, None for the plane of the factors.
     """
 
     lit: LitScene
@@ -255,12 +240,7 @@ def accumulate(
 ) -> list[Accumulator]:
     """Expose a family's frames once, subtract ambient light where there is some, and accumulate them for each model.
 
-    Parameters
-    ----------
-    exposer, family, expected, models
-        The camera and its exposure, patterns, their frames without noise, and the factorised models.
-    binning
-        Pixels a side that are averaged after the exposure.
+    Pixels are averaged ``binning`` x ``binning`` after the exposure.
     """
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
@@ -332,14 +312,8 @@ class IdealCamera:
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
         """Return the frames of a family.
 
-        Parameters
-        ----------
-        family
-            The patterns.
-        flux : (n, n) array
-            Irradiance by each projector pixel on the sensor without the mask [W m^-2].
-        plane
-            Place of the scene; None for the calibrated plane.
+        ``flux`` (n, n) is the irradiance by each projector pixel on the sensor without the mask [W m^-2]; a ``plane``
+        of None is the calibrated one.
         """
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
         optics = self._optics if plane is None else self._optics_at(plane)

@@ -36,17 +36,7 @@ _SHOWN_DPI = 110
 
 
 def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
-    """Render a page.
-
-    Parameters
-    ----------
-    template
-        File of ``mitsim/report/templates``.
-    filters
-        Filters of this template by name, beside ``sci``, ``seconds``, ``typeset`` and ``sentence``.
-    **shown
-        Variables of the template; a missing one is an error.
-    """
+    """Render a template of ``mitsim/report/templates``, with ``filters`` of its own; a missing variable is an error."""
     return _environment(tuple((filters or {}).items())).get_template(template).render(**shown)
 
 
@@ -177,16 +167,10 @@ class EffectBar(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanChart:
-    """A plan as bars.
+    """A plan as bars: effects that are on or would change frames, and idle rows.
 
-    Attributes
-    ----------
-    bars, idle
-        Effects that are on or would change frames, and rows of all others.
-    decades
-        Powers of ten at the ends of the logarithmic scale of errors.
-    accuracy, mark
-        Accuracy that was asked for, and its place on that scale [%]; None where nobody asked.
+    ``decades`` are the powers of ten at the ends of the scale of errors, on which ``mark`` [%] is the place of the
+    accuracy.
     """
 
     bars: tuple[EffectBar, ...]
@@ -343,15 +327,7 @@ class Picture:
 
 
 def write_beside(path: Path, values: npt.NDArray[Any], unit: str) -> tuple[Path, str]:
-    """Write a picture beside a frame's file, as ``FRAME.exr.png``, and return its path and caption.
-
-    Parameters
-    ----------
-    path
-        The frame's file.
-    values, unit
-        Its numbers (rows, columns), or (rows, columns, 3) in colour.
-    """
+    """Write a picture beside a frame's file, as ``FRAME.exr.png``, and return its path and caption."""
     picture = Picture.of(path.name, path.name, values, Scale.of(values, unit))
     return picture.write(path.parent), picture.caption
 
@@ -363,10 +339,8 @@ def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[in
     ----------
     read
         Returns frame number i less the black level, (rows, columns) [DN].
-    count, shape
-        Number of frames, and (rows, columns) of each.
-    columns
-        Frames a row, as the patterns have them; frames that do not fit so are laid out in a square.
+    count, shape, columns
+        Number of frames, (rows, columns) of each, and frames a row as the patterns have them.
     """
     most = max(1, min(_MOST_FRAMES, _MOST_READ // (shape[0] * shape[1])))
     chosen = [number * count // most for number in range(most)] if count > most else [*range(count)]

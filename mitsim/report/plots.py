@@ -93,14 +93,10 @@ def curves(
     ----------
     panels
         Curves by name, by the panels' titles. A curve without a name is not in the legend.
-    x, y
-        Names of the axes, with units.
     log
         True for a logarithmic x axis even where the numbers span less than :func:`spans_decades` asks for.
     ticks
         True for a tick at every x that was measured, as far as there is room.
-    title
-        Title of the figure.
     """
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     found = {panel: {name: _points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
@@ -168,15 +164,7 @@ def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
-    """Draw (n, n) images [reflectance] with a caption below each, cut to 0..1 for display only.
-
-    Parameters
-    ----------
-    rows
-        Images and captions by the rows' names.
-    columns, title
-        Titles of the columns and of the figure.
-    """
+    """Draw (n, n) images [reflectance] with captions below, by the rows' names, cut to 0..1 for display only."""
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
@@ -201,15 +189,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
 
 
 def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
-    """Draw two means for each name, the first as a bar, the second as a dot, the largest on top.
-
-    Parameters
-    ----------
-    values, labels
-        Both means by name, and what they are.
-    x
-        Name of the axis, with its unit.
-    """
+    """Draw two means for each name, the first as a bar, the second as a dot, the largest on top."""
     ordered = sorted(values.items(), key=lambda item: item[1][0].value)
     figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
     rows = np.arange(len(ordered))
@@ -225,15 +205,7 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
 
 
 def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
-    """Draw a bar with its error for each value, the largest on top.
-
-    Parameters
-    ----------
-    kinds
-        Values by name, for at most two kinds, each in its colour.
-    x
-        Name of the axis, with its unit.
-    """
+    """Draw a bar with its error for each value by name, for at most two kinds, the largest on top."""
     values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
     ordered = sorted(values, key=lambda value: value[0].value)
     figure, axes = figure_of(1.2 + _rows_height(name for _, name, _ in ordered), _BARS)
@@ -252,15 +224,7 @@ def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
 
 
 def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
-    """Draw a bar for each row, the first on top, stacked from its parts in their order.
-
-    Parameters
-    ----------
-    rows
-        Values >= 0 of the parts by name, by the rows' names.
-    x
-        Name of the axis, with its unit.
-    """
+    """Draw a bar for each row, the first on top, stacked from its parts (values >= 0) in their order."""
     parts = list(dict.fromkeys(part for row in rows.values() for part in row))
     figure, axes = figure_of(1.6 + ROW * len(rows), _BARS)
     places, ends = np.arange(len(rows))[::-1], np.zeros(len(rows))
@@ -316,15 +280,7 @@ def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
 
 
 def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
-    """Draw a map of a factor's errors.
-
-    Parameters
-    ----------
-    values, largest
-        (m, n) errors in predicted deviations, and the end of the scale for either sign.
-    title
-        Title of the figure.
-    """
+    """Draw a map of a factor's errors (m, n) in predicted deviations, on a scale to ``largest`` of either sign."""
     figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
     axes.set_title(title, fontsize=FONT)
     drawn = axes.imshow(
@@ -339,15 +295,7 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
 
 
 def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
-    """Draw the PSNR [dB] by family, a pair of bars each, with one standard error where it is known.
-
-    Parameters
-    ----------
-    quality
-        PSNR in the idealised model, and with rendered light.
-    title
-        Title of the figure.
-    """
+    """Draw the PSNR [dB] by family in the idealised model and with rendered light, with one standard error."""
     figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
     looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
@@ -431,14 +379,7 @@ class Cost:
 def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
     """Draw error against time, in panels below each other, with rings around the Pareto front.
 
-    Parameters
-    ----------
-    panels
-        Points by the panels' titles, one at least each.
-    error
-        Name of the axis of errors, with its unit.
-    levels
-        Errors for comparison, by name.
+    ``levels`` are errors for comparison, by name.
     """
     figure, places = panels_of(len(panels), 1, 1.3 + 2.8 * len(panels), _BARS, sharex=True)
     names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
@@ -589,20 +530,9 @@ def panels_of(
 def draw_shot(
     shots: Capture, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None
 ) -> Axes:
-    """Draw a frame of a capture, or its truth, and return the axes.
+    """Draw a frame of a capture in digital numbers or expected electrons, or its truth, and return the axes.
 
-    Parameters
-    ----------
-    shots, shot, quantity
-        The capture, the number of the frame from 0, and digital numbers, expected electrons, or the truth's
-        reflectance.
-    ax
-        Axes to draw on; None for those of a new figure.
-
-    Raises
-    ------
-    MitsimError
-        For a shot that does not exist, and for a quantity that a real camera does not know.
+    MitsimError for a shot that does not exist, and for a quantity that a real camera does not know.
     """
     name = shots.manifest.patterns.family or "patterns"
     if quantity == "truth":

@@ -133,17 +133,12 @@ def reconstruct_psf(
 
     Parameters
     ----------
-    run, psf, output
-        RUN folder, picture of the light of a scene point, and a folder for the image, as for :func:`reconstruct`.
+    psf
+        Picture of the light of a scene point.
     reduce
         Pixels a side, of frames and picture, that become one.
-    overwrite, job, **options
+    run, output, overwrite, job, **options
         As for :func:`reconstruct`; the options are ``lam``, ``method``, ``bounds`` and ``iterations``.
-
-    Raises
-    ------
-    MitsimError
-        As :func:`mitsim.reconstruct.point_spread_image.reconstruct_psf`, and for an output that cannot be written.
     """
     from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
 
@@ -429,16 +424,10 @@ Lambda = float | Literal["auto"]
 
 @dataclass(frozen=True, eq=False)
 class MosaicCamera:
-    """A camera under a mosaic of colour filters.
+    """A camera under a ``mosaic`` of 2 x 2 colour filters, such as ``RGGB``.
 
-    Attributes
-    ----------
-    lefts, rights : (lines, m, n) and (lines, m', n') arrays
-        Factors of each line, of pixels without filters.
-    weights : (4, lines) array
-        Response of the pixels of each plane of 2 x 2 to each line.
-    mosaic
-        Colours of these four, such as ``RGGB``.
+    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are the factors of each line for pixels without filters, and
+    ``weights`` (4, lines) the responses of the four pixels to each line.
     """
 
     lefts: FloatArray
@@ -455,18 +444,10 @@ class MosaicCamera:
 
 @dataclass(frozen=True, eq=False)
 class LineImages:
-    """Images of all lines by one way.
+    """Images (lines, n, n') of all lines by one way.
 
-    Attributes
-    ----------
-    images : (lines, n, n') array
-        Reflectances.
-    lam
-        Lambda of the joint solve, or the geometric mean of those of the planes or channels.
-    residual
-        ||Y - model|| / ||Y|| over all frames, of planes or channels as they were solved.
-    joint
-        The joint solution; None for the other ways.
+    ``lam`` is the lambda of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y -
+    model|| / ||Y|| over all frames, as planes or channels were solved. ``joint`` is the joint solution.
     """
 
     images: FloatArray
@@ -476,17 +457,10 @@ class LineImages:
 
 
 class Solver:
-    """Images of all lines from frames behind a camera's filters.
+    """Images of all lines from frames behind a camera's filters, by one of the ways.
 
     Each plane, or channel of demosaiced frames, is solved by itself. The joint way adds one model of all lines, and
-    needs the planes for lambda alone.
-
-    Parameters
-    ----------
-    way
-        One of :data:`mitsim.core.spectral_manifests.WAYS`.
-    camera, patterns
-        The camera, and the pattern columns P_L (n, K) and P_R (n', K').
+    needs the planes for lambda alone. Patterns are the columns P_L (n, K) and P_R (n', K').
     """
 
     def __init__(self, way: str, camera: MosaicCamera, patterns: Patterns) -> None:
