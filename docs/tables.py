@@ -13,8 +13,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from mitsim.cli.shelf_verbs import KINDS
-from mitsim.core.field_docs import allowed_text, default_text, meanings
+from mitsim.cli.shelf_verbs import KINDS, allowed_text, default_text, meanings
 from mitsim.core.imagelist import Crop, Preparation, Raw
 from mitsim.core.manifests import (
     AmbientFile,

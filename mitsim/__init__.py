@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from mitsim.acquire.capture import Light as Light
     from mitsim.acquire.reference import Rendered as Rendered
     from mitsim.api.bench import Bench as Bench
+    from mitsim.api.bench import flat_scene as flat_scene
     from mitsim.api.bench import open_bench as open_bench
-    from mitsim.api.scenes import flat_scene as flat_scene
-    from mitsim.api.scenes import shelf_scene as shelf_scene
+    from mitsim.api.bench import shelf_scene as shelf_scene
     from mitsim.bench.request import Request as Request
     from mitsim.calibrate.model import calibrate_model as calibrate_model
     from mitsim.calibrate.session_plan import CalibrationPlan as CalibrationPlan
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.point_spread_image import reconstruct_psf as reconstruct_psf
     from mitsim.reconstruct.reconstruct import Reconstruction as Reconstruction
     from mitsim.reconstruct.reconstruct import reconstruct as reconstruct
-    from mitsim.report.folders import report_folder as report_folder
-    from mitsim.report.quality import reconstruct_colours as reconstruct_colours
+    from mitsim.report.folder_page import report_folder as report_folder
+    from mitsim.report.reconstruct_run import reconstruct_colours as reconstruct_colours
     from mitsim.sessions.repeat import session_of as session_of
     from mitsim.sessions.run_session import run as run
     from mitsim.verbs import characterise as characterise
@@ -76,8 +76,7 @@ _HOMES = {
     for home, names in {
         "acquire.capture": "Light",
         "acquire.reference": "Rendered",
-        "api.bench": "Bench open_bench",
-        "api.scenes": "flat_scene shelf_scene",
+        "api.bench": "Bench flat_scene open_bench shelf_scene",
         "bench.request": "Request",
         "calibrate.model": "calibrate_model",
         "calibrate.session_plan": "CalibrationPlan plan_calibration",
@@ -96,8 +95,8 @@ _HOMES = {
         "reconstruct.known_pictures": "calibrate_known",
         "reconstruct.point_spread_image": "reconstruct_psf",
         "reconstruct.reconstruct": "Reconstruction reconstruct",
-        "report.folders": "report_folder",
-        "report.quality": "reconstruct_colours",
+        "report.folder_page": "report_folder",
+        "report.reconstruct_run": "reconstruct_colours",
         "sessions.repeat": "session_of",
         "sessions.run_session": "run",
         "verbs": "characterise demo doctor scenes sense study",

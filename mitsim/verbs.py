@@ -5,30 +5,59 @@ Each is a verb of the command line, which calls it: what is asked is checked her
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
-from mitsim.api.bench import open_bench
-from mitsim.bench.apparatus import check_devices, check_scene, spelling
-from mitsim.bench.request import Exposure, Request, check_f_number, check_image, check_wavelength
+from mitsim.bench.request import (
+    AUTO,
+    MOSAIC,
+    NO,
+    Exposure,
+    Family,
+    Irradiance,
+    Opening,
+    OpeningKeys,
+    Planned,
+    Request,
+    Sampled,
+    SampledKeys,
+    Seeded,
+    SeedKeys,
+    SessionRequest,
+    Task,
+    by_line,
+    check_image,
+    family_of,
+)
 from mitsim.core.configuration import CAMERA, load_model, locate, opening_words, shipped_files
 from mitsim.core.environment import DEFAULT_VARIANT, Check
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.seeds import check_root
+from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, FilePath, Options, option, takes, validated_by
+from mitsim.core.spectral_manifests import BANDS, LINES, RUN, bands_of
+from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
+from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.studies import EXPOSED, OF_CAPTURES, OF_NO_SCENE
+from mitsim.studies.emva_options import Procedure
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from mitsim.acquire.sense import Sensed
     from mitsim.api.bench import Bench
+    from mitsim.bench.request import IrradianceKeys
     from mitsim.core.arrays import FloatArray
+    from mitsim.core.runs import Capture
+    from mitsim.light.light import SampledLight
+    from mitsim.light.plan import Plan
+    from mitsim.reconstruct.factors import Factors
     from mitsim.studies.demo import DemoResult
+    from mitsim.studies.emva_options import ProcedureKeys
     from mitsim.studies.emva_results import Characterisation
     from mitsim.studies.framework.experiment import Scope
     from mitsim.studies.framework.run import StudyResult
@@ -39,9 +68,8 @@ if TYPE_CHECKING:
 
 @check_arguments
 def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
-    """What works on this machine: checks, each with ``ok``, what was found, and the command that mends it.
-
-    Some ten seconds; what can crash or hang runs in child processes.
+    """Check this machine; each check has ``ok``, what was found, and the command that mends it. It takes some ten
+    seconds. Checks that can crash or hang run in child processes.
 
     Parameters
     ----------
@@ -59,7 +87,7 @@ def doctor(warm: bool = False, variant: str = DEFAULT_VARIANT) -> list[Check]:
 
 
 def scenes() -> dict[str, str]:
-    """What each shipped scene shows, a sentence, by the name that :func:`mitsim.open_bench` takes.
+    """Return a sentence on each shipped scene, by the name that :func:`mitsim.open_bench` takes.
 
     Examples
     --------
@@ -75,72 +103,105 @@ def scenes() -> dict[str, str]:
 # ---- a scene with its devices ----------------------------------------------------------------------------------------
 
 
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class Opening:
-    """What opens a bench beside its scene.
+def open_as(scene: Path | str, opening: Opening, job: Job, colour: str = NO) -> Bench:
+    """Open the bench of a ``scene`` as ``opening`` states, for a ``colour``, in a stage of the ``job``."""
+    from mitsim.api.bench import open_bench
 
-    Attributes
+    variant = opening.traced_in(colour)
+    with job.clock.stage("open scene"):
+        return open_bench(
+            scene, variant, opening.camera, opening.projector, opening.allow_outside_files, **opening.parameters
+        )
+
+
+def in_colour(bench: Bench, colour: str) -> Bench:
+    """Return the ``bench`` with the lines that ``colour`` names; ArgumentError for more bands than it has lines."""
+    return bench.in_bands(bands_of(colour)) if colour.startswith(BANDS) else bench
+
+
+def plan_in(bench: Bench, colour: str, request: Planned) -> Plan:
+    """Return the plan of a ``request`` on a ``bench``, for light in a ``colour``."""
+    if colour == AUTO:
+        return bench.choose_colour(**request.given).plan
+    if colour == NO:
+        return bench.plan(**request.given)
+    from mitsim.acquire.spectral import SpectralBench
+
+    return SpectralBench.of(in_colour(bench, colour), MOSAIC_RUN if colour == MOSAIC else RUN).plan(
+        Request(**request.given)
+    )
+
+
+def capture_in(
+    bench: Bench,
+    colour: str,
+    what: Plan | str,
+    request: Mapping[str, Any],
+    task: Task,
+    light: SampledLight | None = None,
+) -> Capture | Mapping[str, Capture]:
+    """Return the capture of a family, or of a plan, in a ``colour``; of lines, one for each by name.
+
+    Parameters
     ----------
-    variant, camera, projector, allow_outside_files
-        as for :func:`mitsim.open_bench`.
-    parameters
-        values of the scene's, by name.
+    bench, colour
+        Bench, and the word of its light that is told apart.
+    what, request
+        Family or plan, and the fields of a request beside it.
+    task, light
+        Where frames go; and light that is traced already, of whose patterns ``what`` is one.
     """
+    output, resume, job = task.output, task.resume, task.job
+    if light is not None:
+        from mitsim.acquire.capture import expose
 
-    variant: str = DEFAULT_VARIANT
-    camera: Path | str | None = None
-    projector: Path | str | None = None
-    allow_outside_files: bool = False
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+        return expose(light, str(what), output, job, resume, **request)
+    if colour == AUTO:
+        from mitsim.light.memory import first_shadow
 
-    @property
-    def texts(self) -> dict[str, str]:
-        """The parameters as a scene spells them."""
-        return {name: spelling(value) for name, value in self.parameters.items()}
+        with job.planning(str(what), first_shadow(bench, Request(**request).effects)):
+            chosen = bench.choose_colour(str(what), **request)
+        bench, what, request, colour = chosen.bench, chosen.plan, {}, NO if chosen.mono else LINES
+    if by_line(colour):
+        return in_colour(bench, colour).capture_lines(what, output, resume, job, **request)
+    take: Any = bench.capture_mosaic if colour == MOSAIC else bench.capture
+    return take(what, output, resume, job, **request)  # type: ignore[no-any-return]
 
-    def check(self, scene: Path | str, patterns: str, timing: Exposure | None) -> None:
-        """Refuse, before the renderer is imported, what cannot be.
 
-        Parameters
-        ----------
-        scene, patterns
-            of the bench.
-        timing
-            how it is exposed; None: it is not.
-
-        Raises
-        ------
-        MitsimError
-            for files that cannot be used, patterns that do not fit, and an exposure that the camera cannot have.
-        """
-        if timing is not None:
-            camera, _ = check_devices(self.camera, None)
-            timing.check(load_sensor(camera), camera)
-        check_scene(scene, self.texts, self.allow_outside_files, [patterns])
-
-    def open(self, scene: Path | str, job: Job) -> Bench:
-        """The bench of a ``scene``, opened in a stage of the ``job``."""
-        with job.clock.stage("open scene"):
-            return open_bench(
-                scene, self.variant, self.camera, self.projector, self.allow_outside_files, **self.parameters
-            )
+def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task) -> Mapping[str, Factors]:
+    """Return the factors of a calibration session in a ``colour``: by line, by depth, or of the name "" alone."""
+    where: Any = {"output": task.output, "resume": task.resume, "job": task.job, **request.given}
+    if colour != NO:
+        seen = in_colour(bench, colour)
+        return (seen.calibrate_mosaic if colour == MOSAIC else seen.calibrate_lines)(**where)
+    if request.recipe is not None and request.recipe.depths:
+        return {f"{depth:g}": each for depth, each in bench.calibrate_depths(**where).items()}
+    return {"": bench.calibrate(**where)}
 
 
 # ---- the demo --------------------------------------------------------------------------------------------------------
 
 
-@check_arguments
+class DemoRequest(Opening, Sampled, Family):
+    """How the demo is made."""
+
+    VERB = "demo"
+
+
+class DemoKeys(OpeningKeys, SampledKeys, total=False):
+    """Keywords of :class:`DemoRequest`."""
+
+    patterns: str
+
+
+@takes(DemoRequest)
 def demo(
     scene: Path | str = "photograph",
     output: Path | str = "demo-output",
-    patterns: str = "dots:7",
-    accuracy: float = 1e-3,
-    seed: int = 0,
     job: Job | None = None,
-    **devices: Any,
+    **options: Unpack[DemoKeys],
 ) -> DemoResult:
-    """The main job: plan, capture, calibrate and reconstruct under five pattern families, and report.html.
+    """Plan, capture, calibrate and reconstruct one scene under five pattern families, and write report.html.
 
     Parameters
     ----------
@@ -148,13 +209,8 @@ def demo(
         name of a shipped one, or a path.
     output
         folder that is made, or of an earlier demo, which is replaced.
-    patterns, accuracy, seed
-        of the main family's capture.
     job
         clock, progress and limits.
-    **devices
-        ``variant``, ``camera``, ``projector`` and ``allow_outside_files`` as for :func:`mitsim.open_bench`, and
-        ``parameters`` of the scene by name.
 
     Raises
     ------
@@ -164,11 +220,11 @@ def demo(
     """
     from mitsim.studies.framework.run import check_study_folder
 
-    opening, job = Opening(**options_of(Opening, devices, "demo")), job or Job()
-    request = Request.of(patterns=patterns, accuracy=accuracy, seed=seed)
+    asked, job = DemoRequest(**options), job or Job()
+    request = Request(patterns=asked.patterns, accuracy=asked.accuracy, seed=asked.seed)
     check_study_folder(output, "demo")
-    opening.check(scene, patterns, request.timing)
-    bench = opening.open(scene, job)
+    asked.check(scene, asked.patterns, request.timing)
+    bench = open_as(scene, asked, job)
     from mitsim.studies.demo import demo as run_demo  # only now: it takes seconds to import
 
     return run_demo(bench, output, request, job)
@@ -180,57 +236,39 @@ MERGE = "merge"
 """In the place of a study's name: joins the parts of one."""
 WHOLE = "1/1"
 """The only part of a study that is not shared."""
-_MAIN_PATTERNS, _MAIN_MEASURE = "dots:7", "psnr"
-"""What is studied where nothing is said."""
 _OF_SCENES = ("patterns", "camera", "projector", "parameters", "allow_outside_files")
 """Options of studies of a scene."""
 _OF_POINTS = ("over", "measure", "shard", "jobs", "scheduler")
 """Options of studies of many points."""
 
 
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class StudyOptions(Opening):
-    """How a study is made.
+class StudyOptions(Opening, Seeded):
+    """How a study is made."""
 
-    Attributes
-    ----------
-    seed
-        root of every random stream.
-    recipe
-        of calibration and drift: file of the session.
-    data
-        of twin and transfer: folder of real captures.
-    experiment
-        of merge: the module, where the study is one of the user's own.
-    quick
-        whether a few points are enough.
-    shard
-        "I/N": measure part I of N of the points.
-    jobs
-        processes; None: one a processor.
-    scheduler
-        of Dask, that measures the points.
-    over
-        what sweep and drift vary: values by name; or texts, "NAME=FIRST:LAST:COUNT" or "NAME=VALUE,VALUE".
-    measure
-        what sweep shows, names with commas between.
-    """
+    PANEL = WHAT
+    VERB = "study"
 
-    seed: int = 0
-    recipe: Path | str | None = None
-    data: Path | str | None = None
-    experiment: str | None = None
-    quick: bool = False
-    shard: str = WHOLE
-    jobs: int | None = None
-    scheduler: str | None = None
-    over: Mapping[str, Any] | Sequence[str] = ()
-    measure: str = _MAIN_MEASURE
+    patterns: Annotated[str, validated_by(family_of)] | None = option(None, pattern_names(), metavar="PATTERNS")
+    recipe: FilePath | None = option(None, "of calibration and drift: session recipe", metavar="FILE.toml")
+    data: FilePath | None = option(None, "of twin and transfer: folder of real captures", metavar="DIR")
+    experiment: str | None = option(None, "of merge: the module, where the study is one of your own", metavar="MODULE")
+    quick: bool = option(False, "a few points, for a first look", panel=QUALITY)
+    shard: str = option(WHOLE, "measure part I of N of the points", metavar="I/N", panel=LIMITS)
+    jobs: int | None = option(None, "processes; one a processor if not given", panel=LIMITS)
+    scheduler: str | None = option(None, "Dask scheduler that measures the points", metavar="ADDRESS", panel=LIMITS)
+    over: Mapping[str, Any] | Sequence[str] = option(
+        (),
+        "what sweep varies: a parameter of the scene, patterns, exposure, seed, accuracy, method; FIRST:LAST:COUNT or "
+        "VALUE,VALUE; may be given again",
+        metavar="NAME=VALUES",
+        kind=list[str],
+    )
+    measure: str = option("psnr", "what sweep shows: psnr, ssim, misfit, ...", metavar="NAME,...")
 
     @property
     def varied(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """Names and values of what is varied; MitsimError for what cannot be read."""
+        """Names and values that are varied."""
+        from mitsim.bench.apparatus import spelling
         from mitsim.studies.framework.experiment import values_of
 
         if isinstance(self.over, Mapping):
@@ -238,21 +276,33 @@ class StudyOptions(Opening):
                 name: values if isinstance(values, (list, tuple)) else [values] for name, values in self.over.items()
             }
             return tuple((name, tuple(spelling(value) for value in values)) for name, values in each.items())
-        if wrong := [text for text in self.over if not isinstance(text, str)]:
-            raise ArgumentError("over", f"{wrong[0]!r}: give texts such as NAME=VALUE,VALUE, or values by name")
         return tuple(values_of(text) for text in self.over)
 
 
-@check_arguments
+class StudyKeys(OpeningKeys, SeedKeys, total=False):
+    """Keywords of :class:`StudyOptions`."""
+
+    patterns: str | None
+    recipe: Path | str | None
+    data: Path | str | None
+    experiment: str | None
+    quick: bool
+    shard: str
+    jobs: int | None
+    scheduler: str | None
+    over: Mapping[str, Any] | Sequence[str]
+    measure: str
+
+
+@takes(StudyOptions)
 def study(
     name: str,
     scene: Path | str | Sequence[Path | str] | None = None,
     output: Path | str = "study-output",
-    patterns: str | None = None,
     job: Job | None = None,
-    **options: Any,
+    **options: Unpack[StudyKeys],
 ) -> StudyResult:
-    """An experiment with figures, CSV and JSON in a folder.
+    """Run an experiment, and write its figures, CSV and JSON to a folder.
 
     Parameters
     ----------
@@ -262,13 +312,8 @@ def study(
         name of a shipped one, or a path; None: the photograph, or the study's own. Of ``merge`` folders of parts.
     output
         folder that is made, or of an earlier run of the study, which goes on or is replaced.
-    patterns
-        of the frames; None: 49 dots, or the study's own.
     job
         clock, progress and limits.
-    **options
-        of :class:`mitsim.verbs.StudyOptions`: ``seed``, ``quick``, ``over`` and ``measure`` of a sweep, ``recipe``,
-        ``data``, ``shard``, ``jobs``, ``scheduler``; ``camera``, ``projector``, ``variant``, ``parameters``.
 
     Returns
     -------
@@ -287,7 +332,7 @@ def study(
     >>> found = ms.study("sweep", "photograph", "sweep", over={"sheet_z": [390, 400, 410]})  # doctest: +SKIP
     >>> [(row["sheet_z"], row["psnr_db"]) for row in found.rows]  # doctest: +SKIP
     """
-    return prepare_study(name, scene, output, patterns, job, **options)()
+    return prepare_study(name, scene, output, StudyOptions(**options), job)()
 
 
 Study = Callable[[], "StudyResult"]
@@ -298,60 +343,49 @@ def prepare_study(
     name: str,
     scene: Path | str | Sequence[Path | str] | None,
     output: Path | str,
-    patterns: str | None,
+    asked: StudyOptions,
     job: Job | None,
-    **options: Any,
 ) -> Study:
-    """What :func:`study` does once it is called; before that it refuses what that refuses before work.
+    """Check a study as :func:`study` does before work, and return the function that runs it.
 
     Parameters
     ----------
-    name, scene, output, patterns, job, options
+    name, scene, output, asked, job
         as there.
     """
     from mitsim.studies.framework.experiment import is_experiment
 
-    asked = StudyOptions(**options_of(StudyOptions, options, "study"))
-    given = {*options, *(() if patterns is None else ("patterns",))}
     if name == MERGE:
-        _refuse(given, [each for each in given if each not in ("experiment", "variant")],
-                "on parts, which say themselves what they are of")  # fmt: skip
+        asked.refuse(asked.without("experiment", "variant"), "on parts, which say themselves what they are of")
         from mitsim.studies.framework.campaign import merge
 
         return partial(merge, [Path(part) for part in _scenes_of(scene)], output, asked.experiment)
-    _refuse(given, ["experiment"], "but with merge; give the module as the study's name")
+    asked.refuse(["experiment"], "but with merge; give the module as the study's name")
     if name not in OF_CAPTURES:
-        _refuse(given, ["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
+        asked.refuse(["data"], f"but on the studies {' and '.join(OF_CAPTURES)}")
     if asked.recipe is not None and name not in ("calibration", "drift"):
         raise MitsimError(f"study {name}: has no session of its own; a recipe is for calibration and drift")
-    request = Request.of(patterns=patterns or _MAIN_PATTERNS, seed=asked.seed)
+    request = Request(patterns=asked.patterns or "dots:7", seed=asked.seed)
     named = _scenes_of(scene)
     if len(named) > 1:
         raise MitsimError(f"study {name}: got {len(named)} scenes, {' '.join(map(str, named))}; give one scene")
     place = str(named[0]) if named else None
     prepare = _study_of_points if is_experiment(name) else _study_of_a_bench
-    return prepare(name, place, Path(output), request, job or Job(), asked, given)
+    return prepare(name, place, Path(output), request, job or Job(), asked)
 
 
 def _scenes_of(scene: Path | str | Sequence[Path | str] | None) -> list[Path | str]:
-    """The scenes, or folders of parts, that are named."""
     each: list[Any] = [] if scene is None else [*scene] if isinstance(scene, (list, tuple)) else [scene]
     if wrong := [one for one in each if not isinstance(one, (str, Path))]:
         raise ArgumentError("scene", f"{wrong[0]!r}: give a path")
     return each
 
 
-def _refuse(given: set[str], names: Sequence[str], where: str) -> None:
-    """ArgumentError for the first of some ``names`` that is ``given`` and has no effect ``where``."""
-    for name in names:
-        if name in given:
-            raise ArgumentError(name, f"has no effect {where}; leave it out")
-
-
 def _study_of_points(
-    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions, given: set[str]
+    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
 ) -> Study:
-    """A study of many points: eight test images on the photograph's sheet (two, where it is quick), or one scene."""
+    """Prepare a study of many points, on eight test images on the photograph's sheet (two if ``quick``) or on one
+    scene."""
     from mitsim.studies.framework.campaign import Where, run_experiment
     from mitsim.studies.framework.experiment import QUICK_IMAGES, TEST_IMAGES, Scope, Setup
     from mitsim.studies.framework.run import Shard
@@ -367,9 +401,9 @@ def _study_of_points(
     scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe)
     scope = scope_of(name, scope, request.patterns, asked.varied, asked.measure)
     if name not in ("sweep", "drift"):
-        _refuse(given, ["patterns"], f"on the study {name}, which has its own")
+        asked.refuse(["patterns"], f"on the study {name}, which has its own")
     if asked.scheduler is not None:
-        _refuse(given, ["jobs"], "with a scheduler, whose machines have processes of their own")
+        asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(Shard.of(asked.shard), asked.jobs, asked.scheduler)
     _check_setup(scope, scene)
     return partial(run_experiment, name, scope, output, job, where)
@@ -378,7 +412,7 @@ def _study_of_points(
 def scope_of(
     name: str, scope: Scope, patterns: str, varied: Sequence[tuple[str, tuple[str, ...]]], measure: str
 ) -> Scope:
-    """The ``scope`` of a study with what a sweep varies and shows; other studies take nothing of it.
+    """Return the ``scope`` of a study with what a sweep or a drift varies; other studies vary nothing.
 
     Parameters
     ----------
@@ -399,19 +433,20 @@ def scope_of(
         check_sweep(tuple(varied), len(scope.pictures))
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), measures=measures_of(measure), patterns=patterns)
-    if name == "drift" and measure == _MAIN_MEASURE:
+    if name == "drift" and measure == "psnr":
         check_drifts(tuple(varied))
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), patterns=patterns)
-    if varied or patterns != _MAIN_PATTERNS or measure != _MAIN_MEASURE:
+    if varied or patterns != "dots:7" or measure != "psnr":
         others = "measure is for sweep, over and patterns for drift and sweep"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:
-    """MitsimError where the files that a ``scope`` names cannot be used, before the renderer is imported; a study
-    without a ``scene`` of its own may take others."""
+    """Refuse files of a ``scope`` that cannot be used, before the renderer is imported. A study without a ``scene`` of
+    its own may use others."""
+    from mitsim.bench.apparatus import check_devices, check_scene
     from mitsim.studies.framework.experiment import NO_SCENE
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
@@ -428,15 +463,14 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
 
 
 def _study_of_a_bench(
-    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions, given: set[str]
+    name: str, scene: str | None, output: Path, request: Request, job: Job, asked: StudyOptions
 ) -> Study:
-    """A study of one bench, or of none."""
     from mitsim.studies.framework.run import check_study_folder, find_study
 
     if name in OF_NO_SCENE:
         if scene is not None:
             raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
-        _refuse(given, _OF_SCENES, f"on the study {name}, which is of no scene")
+        asked.refuse(_OF_SCENES, f"on the study {name}, which is of no scene")
     settings: dict[str, Any] = {} if asked.recipe is None else {"recipe": load_recipe(asked.recipe)}
     if name in OF_CAPTURES:
         from mitsim.studies.twin_files import TwinFiles
@@ -444,68 +478,87 @@ def _study_of_a_bench(
         settings = {"files": TwinFiles.find(None if asked.data is None else Path(asked.data), name)}
         settings |= {"variant": asked.variant} if name == "twin" else {}
     run_study = find_study(name, **settings)
-    if asked.over or asked.measure != _MAIN_MEASURE or asked.shard != WHOLE or asked.jobs or asked.scheduler:
+    if asked.over or asked.measure != "psnr" or asked.shard != WHOLE or asked.jobs or asked.scheduler:
         raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")
-    _refuse(given, ["quick"], f"on the study {name}, which has no points to leave out")
+    asked.refuse(["quick"], f"on the study {name}, which has no points to leave out")
     if name in OF_NO_SCENE:
         check_study_folder(output, name)
         return partial(run_study, None, output, request, job)
     check_study_folder(output, name)
     place = scene or "photograph"
     asked.check(place, request.patterns, request.timing if name in EXPOSED else None)
-    return lambda: run_study(asked.open(place, job), output, request, job)
+    return lambda: run_study(open_as(place, asked, job), output, request, job)
+
+
+# ---- sessions --------------------------------------------------------------------------------------------------------
+
+
+class RunOptions(Options):
+    """How a session is run."""
+
+    VERB = "run"
+
+    resume: bool = option(False, "go on where an interrupted one of the same options stopped", panel=OUTPUT)
+    pictures: bool = option(True, "make pictures and pages", kind=False)
+    shard: str = option(WHOLE, "measure part I of N of a sweep's points", metavar="I/N")
+    scheduler: str | None = option(None, "Dask scheduler that measures a sweep's points")
+
+
+class RunKeys(TypedDict, total=False):
+    """Keywords of :class:`RunOptions`."""
+
+    resume: bool
+    pictures: bool
+    shard: str
+    scheduler: str | None
 
 
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------
 
 
-@check_arguments
+@takes(Procedure, without="frames")
 def characterise(
     camera: Path | str | None = None,
     output: Path | str | None = None,
     frames: int | Path | str = 100,
     job: Job | None = None,
-    **procedure: Any,
+    **options: Unpack[ProcedureKeys],
 ) -> Characterisation:
     """Measure a camera after EMVA 1288: on simulated frames, beside what its file sets, or on real frames.
 
     Parameters
     ----------
     camera
-        name or TOML file; None: a real one, by its frames.
+        Name or TOML file; None for a real camera, measured by its frames.
     output
-        folder of page, plots, JSON and the camera's file, or of an earlier characterisation, which is replaced; None
+        Folder of page, plots, JSON and the camera's file, or of an earlier characterisation, which is replaced; None
         writes nothing.
     frames
-        of each stack; without a camera, folder of a real one's frames under even light and in the dark.
+        Frames of each stack; without a camera, the folder of a real one's frames under even light and in the dark.
     job
-        clock, progress and limits.
-    **procedure
-        of simulated frames: ``pixels`` a side (256), ``steps`` of light (50), ``seed`` (0), ``wavelength`` (550 nm)
-        for a curve of quantum efficiency.
+        Clock, progress and limits.
 
     Raises
     ------
     MitsimError
         for a camera that light never saturates, a wavelength outside its curve, options that have no effect, frames
-        that cannot be read or tell nothing of the camera, or a folder that holds something else.
+        that cannot be read or that do not determine the camera, or a folder that holds something else.
 
     Examples
     --------
     >>> import mitsim as ms
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
-    from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
+    from mitsim.studies.emva_options import capacity_of, efficiency_of
     from mitsim.studies.framework.run import check_study_folder
 
-    asked = dict(options_of(_Simulated, procedure, "characterise"))
-    _Simulated(**asked)
+    asked = Procedure(**options)
     if camera is None:
         if not isinstance(frames, (str, Path)):
             raise MitsimError(
                 "characterise: got no camera; give one to simulate, or as frames the folder of a real one"
             )
-        _refuse({*asked}, [*asked], "on frames of a real camera")
+        asked.refuse(asked.given, "on frames of a real camera")
         from mitsim.devices.flatlist import load_flats
 
         listed = load_flats(Path(frames))
@@ -518,10 +571,8 @@ def characterise(
     if isinstance(frames, (str, Path)):
         raise ArgumentError("frames", f"{frames}: give the frames of each stack, or no camera, to measure a real one")
     if sensor.quantum_efficiency_curve is None:
-        _refuse({*asked}, ["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
-    if "wavelength" in asked:
-        asked["wavelength_nm"] = asked.pop("wavelength")
-    done = Procedure(frames=frames, **asked)
+        asked.refuse(["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
+    done = Procedure(frames=frames, **options)
     capacity_of(sensor)
     efficiency_of(sensor, done)
     if output is not None:
@@ -531,26 +582,12 @@ def characterise(
     return run_characterise(sensor, done, output, job)
 
 
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class _Simulated:
-    """How frames of a camera are simulated."""
-
-    pixels: int = 256
-    steps: int = 50
-    seed: int = 0
-    wavelength: float = 550.0
-
-
-@check_arguments
+@takes(Irradiance)
 def sense(
     image: Path | str | FloatArray,
     camera: Path | str,
     exposure: float | Literal["auto"] = "auto",
-    exposure_fraction: float = 0.8,
-    seed: int = 0,
-    wavelength: float = 550.0,
-    **irradiance: Any,
+    **options: Unpack[IrradianceKeys],
 ) -> Sensed:
     """Put an image of any renderer behind a camera's sensor: digital numbers with its noise.
 
@@ -559,18 +596,9 @@ def sense(
     image
         (rows, columns) irradiance [W/m^2], or a file of it, OpenEXR or NPY. Its pixels are the camera's (binned) ones.
     camera
-        name or TOML file of the electronics.
+        Name or TOML file of the electronics.
     exposure
-        seconds; ``auto``: so that the brightest pixel fills ``exposure_fraction`` of the full well.
-    exposure_fraction
-        of the full well.
-    seed
-        of the noise.
-    wavelength
-        of the light [nm].
-    **irradiance
-        ``f_number``: the image is radiance [W/m^2/sr] before a lens of it; ``scale``: what its numbers are multiplied
-        by; ``channel``: of several in a file, the one to take.
+        Seconds; ``auto``: so that the brightest pixel fills ``exposure_fraction`` of the full well.
 
     Raises
     ------
@@ -586,33 +614,16 @@ def sense(
     ((4, 6), dtype('uint32'))
     """
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
-    facts = _Irradiance(**options_of(_Irradiance, irradiance, "sense"))
-    asked = Exposure(None if exposure == "auto" else exposure, exposure_fraction)
-    if not 0 < facts.scale < math.inf:
-        raise ArgumentError("scale", f"{facts.scale:g}: give a finite number above 0")
-    check_wavelength(wavelength)
-    if facts.f_number is not None:
-        check_f_number(facts.f_number)
-    check_root(seed)
+    asked = Irradiance(exposure=exposure, **options)
     if isinstance(image, str | Path):
         check_image(Path(image))
-    elif facts.channel is not None:
-        raise ArgumentError("channel", f"{facts.channel!r}: an array has no channels; leave it out")
+    elif asked.channel is not None:
+        raise ArgumentError("channel", f"{asked.channel!r}: an array has no channels; leave it out")
     from mitsim.acquire.sense import irradiance_behind_lens, read_image
     from mitsim.acquire.sense import sense as run_sense
 
-    light, notes = read_image(image, facts.channel) if isinstance(image, str | Path) else (image, tuple[str, ...]())
-    light = light * facts.scale
-    if facts.f_number is not None:
-        light = irradiance_behind_lens(light, facts.f_number)
-    return run_sense(light, sensor, asked, seed, wavelength, notes)
-
-
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class _Irradiance:
-    """How an image's numbers are light on the sensor."""
-
-    f_number: float | None = None
-    scale: float = 1.0
-    channel: str | None = None
+    light, notes = read_image(image, asked.channel) if isinstance(image, str | Path) else (image, tuple[str, ...]())
+    light = light * asked.scale
+    if asked.f_number is not None:
+        light = irradiance_behind_lens(light, asked.f_number)
+    return run_sense(light, sensor, asked.timing, asked.seed, asked.wavelength, notes)

@@ -492,7 +492,7 @@ if "mitsuba" in sys.modules:
 BACKENDS = re.compile(r"llvm|cuda|thread_count", re.IGNORECASE)
 KNOWS_BACKENDS = {
     "mitsim.core.environment": "finds the library and chooses the variant",
-    "mitsim.cli.options": "says in the help what there is to choose",
+    "mitsim.bench.request": "names in the help which variants there are",
 }
 SUMS = {"sum", "mean", "prod", "prefix_sum", "cumsum", "block_sum", "block_reduce", "block_prefix_sum", "reduce"}
 OF_A_LANE = {

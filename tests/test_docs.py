@@ -227,7 +227,7 @@ def stored_pairs() -> dict[str, object]:
     from mitsim.learn.pairs import make_pairs
 
     scene = write_small_scene(Path("scenes"))
-    asked = PairsRequest(Request.of(patterns="uniform", accuracy=0.1), 2)
+    asked = PairsRequest(capture=Request.of(patterns="uniform", accuracy=0.1), count=2)
     make_pairs(lambda _: open_bench(scene), asked, Task(Path("pairs")))
     return {}
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import pydoc
+import typing
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,18 @@ import numpy as np
 import pytest
 
 import mitsim as ms
+from mitsim.bench import request
 from mitsim.bench.request import Request
-from mitsim.cli.options import message_of
+from mitsim.cli.commands import message_of
 from mitsim.core.errors import ArgumentError
-from mitsim.exchange.capture_list import FrameFacts
-from mitsim.exchange.formats import SessionFacts
-from mitsim.sessions.run_session import RunOptions
-from mitsim.verbs import Opening, StudyOptions, _Irradiance, _Simulated
+from mitsim.core.options import Options
+from mitsim.exchange.capture_list import FrameKeys
+from mitsim.exchange.formats import ExportKeys, PictureKeys
+from mitsim.learn.pair_request import PairKeys
+from mitsim.learn.training_request import TrainingKeys
+from mitsim.reconstruct.request import ImageKeys
+from mitsim.studies.emva_options import ProcedureKeys
+from mitsim.verbs import DemoKeys, RunKeys, StudyKeys
 from tests.exchanged import made
 
 CALLS = {
@@ -52,21 +58,9 @@ CALLS = {
     "doctor": ["doctor"],
 }  # fmt: skip
 """Python calls that do what a verb does, by its name."""
-FURTHER: dict[str, list[Any]] = {
-    "demo": [Opening],
-    "run": [RunOptions],
-    "study": [StudyOptions],
-    "import": [FrameFacts],
-    "patterns": [SessionFacts],
-    "characterise": [_Simulated],
-    "sense": [_Irradiance],
-    "doctor": [],
-    "export": [],
-}
-"""Classes whose fields a verb's call takes by name, of verbs that are one call with the same options."""
+ONE_CALL = ["demo", "run", "study", "import", "patterns", "characterise", "sense", "doctor", "export"]
+"""Verbs that are one call with the same options."""
 ALIKE = {
-    "define": "parameters",
-    "outside": "allow_outside_files",
     "scenes": "scene",
     "family": "patterns",
     "repeated": "folder",
@@ -107,12 +101,12 @@ def test_every_verb_has_a_python_call() -> None:
             called(name)
 
 
-@pytest.mark.parametrize("verb", FURTHER)
+@pytest.mark.parametrize("verb", ONE_CALL)
 def test_every_option_of_a_verb_is_an_argument(verb: str) -> None:
     """(Planted: an option that the call does not take.)"""
     known = {each for name in CALLS[verb] for each in inspect.signature(called(name)).parameters}
-    known |= {each.name for one in FURTHER[verb] for each in fields(one)}
     options = {ALIKE.get(each.name, each.name) for each in verbs()[verb].params} - OF_THE_COMMAND_LINE
+    options -= {"context"}
     missing = {name for name in options - known if (verb, name) not in ANYWAY}
     assert not missing, missing
 
@@ -264,7 +258,7 @@ def test_an_image_has_the_options_of_its_verb(results: dict[str, Any]) -> None:
 
 def test_a_misspelt_option_is_refused_with_what_was_meant() -> None:
     for call, line in (
-        (lambda: ms.study("patterns", quik=True), r"quik is no option of study; did you mean quick\? use variant"),
+        (lambda: ms.study("patterns", quik=True), r"quik is no option of study; did you mean quick\? use seed"),
         (
             lambda: ms.import_frames("x", "y", expsure=1),
             r"expsure is no option of import_frames; did you mean exposure\?",
@@ -275,13 +269,57 @@ def test_a_misspelt_option_is_refused_with_what_was_meant() -> None:
             call()
 
 
-def test_groups_of_options_are_checked() -> None:
-    """All of them, whatever is added. (Planted: a group that checks nothing.)"""
-    for group in (Opening, StudyOptions, RunOptions, FrameFacts, SessionFacts, _Simulated, _Irradiance):
-        assert is_dataclass(group)
-        for each in fields(group):
-            with pytest.raises(ms.ArgumentError, match=f"^{each.name} "):
-                group(**{each.name: object()})
+def models(one: type[Options] = Options) -> set[type[Options]]:
+    """Models of options, and those that derive from them."""
+    return {one}.union(*map(models, one.__subclasses__()))
+
+
+def test_options_of_every_model_are_checked() -> None:
+    """All of them, whatever is added. (Planted: a field of the kind Any without a check.)"""
+    found = [model for model in models() if model.__module__.startswith("mitsim")]
+    assert len(found) > 20
+    for model in found:
+        for name in model.model_fields:
+            if (model.__name__, name) in {("ImageRequest", "method"), ("_Image", "method")}:
+                continue
+            with pytest.raises(ms.ArgumentError) as refused:
+                model(**{name: object()})
+            named = {each.argument for each in (refused.value, *refused.value.others)}
+            assert name in named, (model, name, refused.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "keys"),
+    [
+        (ms.Bench.capture, request.RequestKeys),
+        (ms.Bench.capture_lines, request.ExposureKeys),
+        (ms.Bench.calibrate, request.SessionKeys),
+        (ms.reconstruct, ImageKeys),
+        (ms.demo, DemoKeys),
+        (ms.study, StudyKeys),
+        (ms.run, RunKeys),
+        (ms.characterise, ProcedureKeys),
+        (ms.sense, request.IrradianceKeys),
+        (ms.export, ExportKeys),
+        (ms.import_frames, FrameKeys),
+        (ms.pattern_pictures, PictureKeys),
+        (ms.make_pairs, PairKeys),
+        (ms.train, TrainingKeys),
+    ],
+    ids=lambda each: each.__name__,
+)
+def test_type_checkers_see_the_keywords_of_a_call(call: Callable[..., Any], keys: Any) -> None:
+    """The signature has the models' fields, and type checkers read the same names. (Planted: a keyword that a model
+    lacks; a field without a keyword.)"""
+    named = {each.name for each in inspect.signature(call).parameters.values() if each.kind == each.KEYWORD_ONLY}
+    assert named == keys.__annotations__.keys() == typing.get_type_hints(keys).keys()
+
+
+def test_help_of_a_call_states_its_options() -> None:
+    """(Planted: a docstring without them.)"""
+    text = pydoc.render_doc(ms.Bench.calibrate, renderer=pydoc.plaintext)
+    assert "accuracy: float = 0.001" in text and "relative rms error of the expected frames" in text
+    assert "**" not in str(inspect.signature(ms.Bench.calibrate))
 
 
 # ---- what is shipped, and this machine -------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import ClosingFile, Patterns, RunHead, RunManifest
+from mitsim.core.options import takes
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.recorders import AMBIENT, CLOSING, Recorder, claim_run, frame_name
 from mitsim.core.runs import Capture, LineTruth, MosaicCapture
@@ -50,6 +51,11 @@ from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner.explain import known_losses
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from mitsim.bench.request import ExposureKeys
 
 _FIREFLIES = 0.72
 """Part of the variance in one of four groups above which single paths dominate: a heavy path gives 0.75, ordinary noise
@@ -75,9 +81,13 @@ _NEGLIGIBLE = 0.1
 class Light(SampledLight):
     """Sampled light of one scene, ready to be exposed; attributes as :class:`mitsim.light.light.SampledLight`."""
 
-    @check_arguments
+    @takes(Request, without="patterns")
     def expose(
-        self, patterns: str = "dots:7", output: Path | str | None = None, job: Job | None = None, **request: Any
+        self,
+        patterns: str = "dots:7",
+        output: Path | str | None = None,
+        job: Job | None = None,
+        **request: Unpack[ExposureKeys],
     ) -> Capture:
         """Expose one noisy frame for each shot of a family in this light.
 
@@ -89,15 +99,13 @@ class Light(SampledLight):
             Folder for the frames; None keeps them in memory.
         job
             Clock, progress and limits.
-        **request
-            ``seed``, ``exposure`` or ``exposure_fraction`` other than those with which the light was traced.
 
         Raises
         ------
         MitsimError
             For patterns that do not fit, an output that cannot be written, or a field that needs other light.
         """
-        return expose(self, patterns, output, job, **request)
+        return expose(self, patterns, output, job, **Request(**request).given)
 
     @check_arguments
     def check_serves(self, patterns: str) -> None:

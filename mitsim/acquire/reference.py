@@ -92,7 +92,7 @@ class Rendered:
         """Draw the mean of the channels with a colour bar on ``ax`` or a new figure, and return the axes."""
         from mitsim.core.images import from_above
 
-        return from_above("report.result_plots", "draw_rendered")(self, ax)
+        return from_above("report.plots", "draw_rendered")(self, ax)
 
     def __repr__(self) -> str:
         rows, columns = self.mean.shape[:2]

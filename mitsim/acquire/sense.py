@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsim.bench.request import Exposure, check_ending, check_f_number, check_image, check_wavelength
+from mitsim.bench.request import Exposure, Irradiance, check_ending, check_image
 from mitsim.core.arrays import FloatArray, Npy
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
@@ -88,7 +88,7 @@ class Sensed:
     @check_arguments
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw the digital numbers with a colour bar on ``ax`` or a new figure, and return the axes."""
-        return from_above("report.result_plots", "draw_sensed")(self, ax)
+        return from_above("report.plots", "draw_sensed")(self, ax)
 
     def __repr__(self) -> str:
         rows, columns = self.digital.shape
@@ -156,7 +156,7 @@ def sense(
         For an image with other than finite numbers >= 0, no light although the exposure depends on it, or a camera
         without quantum efficiency.
     """
-    check_wavelength(wavelength_nm)
+    Irradiance(wavelength=wavelength_nm)
     if sensor.mosaic is not None:
         raise MitsimError(
             f"sensor {sensor.name!r}: has a mosaic {sensor.mosaic} of colour filters, which an image of one channel "
@@ -232,5 +232,5 @@ def irradiance_behind_lens(radiance: FloatArray, f_number: float) -> FloatArray:
     f_number
         N, at least 0.5; ArgumentError otherwise.
     """
-    check_f_number(f_number)
+    Irradiance(f_number=f_number)
     return np.asarray(radiance * (math.pi / (4 * f_number**2)))

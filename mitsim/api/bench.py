@@ -5,6 +5,8 @@ The objects below this floor are data; here they have their verbs, each of which
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,18 +15,20 @@ from typing import TYPE_CHECKING, Any, Literal
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.core.environment import DEFAULT_VARIANT
-from mitsim.core.errors import check_arguments
+from mitsim.core.errors import ArgumentError, check_arguments, is_masked
 from mitsim.core.job import Job
+from mitsim.core.options import takes
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:
-    from typing import Self
+    from typing_extensions import Self, Unpack
 
     from mitsim.acquire.capture import Light
     from mitsim.acquire.choose_colour import Coloured
     from mitsim.acquire.reference import Rendered
+    from mitsim.bench.request import ExposureKeys, RequestKeys, SessionKeys
     from mitsim.core.runs import Capture, MosaicCapture
-    from mitsim.devices.session import BoardShape, SessionRecipe
+    from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
     from mitsim.report.bench_view import BenchView
@@ -43,7 +47,7 @@ def open_bench(
     for_render: bool = False,
     **parameters: object,
 ) -> Bench:
-    """Load a scene with its camera and projector; selects the Mitsuba variant for the process.
+    """Load a scene with its camera and projector, and select the Mitsuba variant of the process.
 
     Parameters
     ----------
@@ -88,16 +92,14 @@ class Bench(Apparatus):
 
     # ---- The plan, and light of the scene ----
 
-    @check_arguments
-    def plan(self, patterns: str = "dots:7", **request: Any) -> Plan:
-        """What will be simulated, why, and what it costs, by a short look at the scene.
+    @takes(Request, without="patterns")
+    def plan(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Plan:
+        """Plan what is simulated, by a short look at the scene, with reasons and cost.
 
         Parameters
         ----------
         patterns
             of a family (:func:`mitsim.devices.patterns.parse_patterns`).
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, such as ``accuracy`` or ``effects``.
 
         Raises
         ------
@@ -106,12 +108,11 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.spectral import plan_request
 
-        return plan_request(self, Request.of(patterns=patterns, **request))
+        return plan_request(self, Request(patterns=patterns, **request))
 
-    @check_arguments
-    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Any) -> Light:
-        """Light of the scene by projector pixel, traced once, from which any family can be exposed. MitsimError as
-        :meth:`plan`.
+    @takes(Request, without="patterns")
+    def light(self, patterns: Plan | str = "dots:7", job: Job | None = None, **request: Unpack[ExposureKeys]) -> Light:
+        """Trace the light of the scene by projector pixel, once, so that any family can be exposed in it.
 
         Parameters
         ----------
@@ -119,8 +120,6 @@ class Bench(Apparatus):
             the family whose frames are to have the accuracy, or a plan of this bench.
         job
             clock, progress and limits.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`.
         """
         from mitsim.acquire.capture import check_plan, request_of, trace_request
         from mitsim.acquire.spectral import SpectralBench, plan_request
@@ -136,16 +135,16 @@ class Bench(Apparatus):
 
     # ---- Captures ----
 
-    @check_arguments
+    @takes(Request)
     def capture(
         self,
         plan: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[RequestKeys],
     ) -> Capture:
-        """One noisy frame for each shot of a pattern family.
+        """Take one noisy frame for each shot of a pattern family.
 
         Parameters
         ----------
@@ -157,9 +156,6 @@ class Bench(Apparatus):
             go on with an interrupted capture of the same request in ``output``, bit-equal to an uninterrupted one.
         job
             clock, progress and limits.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`; of a plan, all but accuracy, seconds and effects, and
-            of patterns and seeds such as light the same pixels together.
 
         Raises
         ------
@@ -177,19 +173,17 @@ class Bench(Apparatus):
 
     # ---- Spectral lines and colour filters ----
 
-    @check_arguments
+    @takes(Request, without="patterns")
     def capture_lines(
         self,
         patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[ExposureKeys],
     ) -> dict[str, Capture]:
-        """Sequential colour: a capture of each spectral line of the projector, by its name, as ``638nm``.
-
-        All lines are traced on the same paths; each capture is what a projector of this line alone would give, and has
-        the accuracy. Needs a spectral variant.
+        """Take a capture for each spectral line of the projector, by the line's name, as ``638nm``. All lines are
+        traced on the same paths. Each capture has the accuracy that is asked for. Needs a spectral variant.
 
         Parameters
         ----------
@@ -199,8 +193,6 @@ class Bench(Apparatus):
             folder that holds a run's folder for each line, and colour.json; None keeps them in memory.
         resume, job
             as for :meth:`capture`.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -215,18 +207,16 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_lines(self, request_of(patterns, request), task, known)
 
-    @check_arguments
-    def choose_colour(self, patterns: str = "dots:7", **request: Any) -> Coloured[Self]:
-        """Mono, bands or lines: the cheapest that is predicted to leave at most half of the accuracy of the colours.
-
-        Looks at the scene in this variant and in the spectral one, and sets that of the bench that it returns.
+    @takes(Request, without="patterns")
+    def choose_colour(self, patterns: str = "dots:7", **request: Unpack[ExposureKeys]) -> Coloured[Self]:
+        """Choose the cheapest of mono, bands and lines that is predicted to leave at most half of the accuracy as error
+        of colours. It looks at the scene in this variant and in the spectral one, and sets the variant of the bench
+        that it returns.
 
         Parameters
         ----------
         patterns
             name of the family.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -235,29 +225,27 @@ class Bench(Apparatus):
         """
         from mitsim.acquire.choose_colour import choose_colour
 
-        return choose_colour(self, Request.of(patterns=patterns, **request))
+        return choose_colour(self, Request(patterns=patterns, **request))
 
     @check_arguments
     def in_variant(self, variant: str) -> Bench:
-        """The same bench loaded anew into a ``variant``, which is set from then on; objects of the variant before must
-        not be used with it. MitsimError as :func:`mitsim.open_bench`."""
+        """Load the bench into a ``variant``, which is then the current one; objects of the earlier variant must not be
+        used with it."""
         return reopen(self, variant)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_lines(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
-        """Sequential colour: the camera's factors at each spectral line of the projector, by its name.
+        """Estimate the camera's factors at each spectral line of the projector, by the line's name.
 
         Parameters
         ----------
-        seed, accuracy, recipe, resume, job
+        resume, job
             as for :meth:`calibrate`.
         output
             folder that holds a calibration's folder for each line, and colour.json; None keeps them in memory.
@@ -271,20 +259,19 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate_lines
 
-        return calibrate_lines(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate_lines(self, SessionRequest(**request), task)
 
-    @check_arguments
+    @takes(Request, without="patterns")
     def capture_mosaic(
         self,
         patterns: Plan | str = "dots:7",
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
-        **request: Any,
+        **request: Unpack[ExposureKeys],
     ) -> MosaicCapture:
-        """All lines of the projector at once, seen by a camera under a mosaic of colour filters: one frame a shot.
-
-        Needs a spectral variant, and a camera whose file has a ``mosaic``.
+        """Take frames of all lines at once by a camera under a mosaic of colour filters: one frame for each shot. Needs
+        a spectral variant, and a camera whose file has a ``mosaic``.
 
         Parameters
         ----------
@@ -294,8 +281,6 @@ class Bench(Apparatus):
             RUN folder, with the lines' truths and colour.json beside; None keeps all in memory.
         resume, job
             as for :meth:`capture`.
-        **request
-            other fields of :class:`mitsim.bench.request.Request`, but for ``seconds``.
 
         Raises
         ------
@@ -310,27 +295,23 @@ class Bench(Apparatus):
         known = None if isinstance(patterns, str) else patterns
         return capture_mosaic(self, request_of(patterns, request), task, known)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_mosaic(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[str, Factors]:
-        """The factors of a camera under a mosaic of colour filters at each spectral line of the projector, by its name.
-
-        One session a line, whose light the filters dim; each pixel's reading is divided by what its filter passes of
-        the line, as the camera's file states it. Factors are those of pixels without filters, one electron a photon.
+        """Estimate the factors of a camera under colour filters at each spectral line of the projector, by the line's
+        name. Each line has a session of its own, by the shipped recipe with four shots of each pattern if none is
+        given. Each pixel's number is divided by the stated transmission of its filter, so that the factors are those of
+        pixels without filters, one electron a photon.
 
         Parameters
         ----------
-        seed, accuracy, output, resume, job
+        output, resume, job
             as for :meth:`calibrate_lines`.
-        recipe
-            how each session is run; None: the shipped one, with four shots of each pattern.
 
         Raises
         ------
@@ -341,30 +322,22 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate_mosaic
 
-        return calibrate_mosaic(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate_mosaic(self, SessionRequest(**request), task)
 
     # ---- Calibration sessions ----
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> Factors:
-        """The camera's two factors, from a rendered Hadamard session on a white board.
+        """Estimate the camera's two factors from a rendered Hadamard session on a white board.
 
         Parameters
         ----------
-        seed
-            root of every random stream.
-        accuracy
-            relative rms error of the expected responses.
-        recipe
-            how the session is run; None: the shipped one.
         output
             CAL folder that is written, with its unfinished parts meanwhile; None keeps the factors in memory.
         resume
@@ -381,62 +354,56 @@ class Bench(Apparatus):
         with task.importing():
             from mitsim.calibrate.calibrate import calibrate
 
-        return calibrate(self, SessionRequest(seed, accuracy, recipe), task)
+        return calibrate(self, SessionRequest(**request), task)
 
-    @check_arguments
+    @takes(SessionRequest)
     def calibrate_depths(
         self,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         output: Path | str | None = None,
         resume: bool = False,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> dict[float, Factors]:
-        """The camera's two factors at each of a recipe's depths, by depth [mm]. MitsimError as :meth:`calibrate`, and
-        for a recipe without depths, or with one at which the mask is.
+        """Estimate the camera's two factors at each of a recipe's depths, by depth [mm].
 
         Parameters
         ----------
-        seed, accuracy, recipe, resume, job
+        resume, job
             as :meth:`calibrate`.
         output
             folder of a CAL folder for each depth, called by its millimetres; None keeps the factors in memory.
         """
         from mitsim.calibrate.calibrate import calibrate_depths
 
-        return calibrate_depths(self, SessionRequest(seed, accuracy, recipe), Task.of(output, resume, job))
+        return calibrate_depths(self, SessionRequest(**request), Task.of(output, resume, job))
 
-    @check_arguments
+    @takes(SessionRequest)
     def write_session(
         self,
         frames: Path | str,
         output: Path | str | None = None,
-        seed: int = 0,
-        accuracy: float = 1e-3,
-        recipe: SessionRecipe | None = None,
         job: Job | None = None,
+        **request: Unpack[SessionKeys],
     ) -> Factors:
-        """What :meth:`calibrate` does; and the session's frames, as a real camera's user has them, in a folder from
-        which :func:`mitsim.calibrate_frames` makes the same factors. MitsimError as :meth:`calibrate`, for a recipe
-        with depths, and a folder that holds something or has no room.
+        """Calibrate as :meth:`calibrate` does, and write the session's frames as a user of a real camera has them, so
+        that :func:`mitsim.calibrate_frames` makes the same factors of them.
 
         Parameters
         ----------
         frames
             new or empty folder.
-        output, seed, accuracy, recipe, job
+        output, job
             as :meth:`calibrate`.
         """
         from mitsim.calibrate.calibrate import write_session
 
-        return write_session(self, frames, SessionRequest(seed, accuracy, recipe), Task.of(output, job=job))
+        return write_session(self, frames, SessionRequest(**request), Task.of(output, job=job))
 
     # ---- The bench to look at, renderings, and the same devices before a board ----
 
     def view(self) -> BenchView:
-        """A drawing of the bench to scale, with its distances and what the camera sees of it, before any light is
-        simulated: it shows itself in a notebook, and is saved to a picture or to a page on which it can be turned."""
+        """Draw the bench to scale, with its distances and what the camera sees, before any light is simulated. The
+        drawing shows itself in a notebook, and is saved as a picture or as a page on which it can be turned."""
         from mitsim.report.bench_view import view
 
         return view(self)
@@ -451,7 +418,7 @@ class Bench(Apparatus):
         effects: Mapping[str, bool] | None = None,
         job: Job | None = None,
     ) -> Rendered:
-        """The expected irradiance under the scene's own light.
+        """Estimate the expected irradiance under the scene's own light.
 
         Parameters
         ----------
@@ -477,7 +444,7 @@ class Bench(Apparatus):
 
     @check_arguments
     def with_board(self, reflectance: float, shape: BoardShape | None = None, depth: float | None = None) -> Self:
-        """The same devices before a diffuse board. MitsimError for a reflectance or a depth that no board has.
+        """Place the devices before a diffuse board.
 
         Parameters
         ----------
@@ -491,3 +458,104 @@ class Bench(Apparatus):
         from mitsim.bench.board import before_board
 
         return before_board(self, reflectance, shape, depth)
+
+
+# ---- A picture or a mesh of the user's -------------------------------------------------------------------------------
+
+_LIT_MM = 120.0
+"""Side of what the projector lights of a sheet 400 mm away, as all flat scenes have it: 128 pixels of 0.9375 mm."""
+
+
+@check_arguments
+def flat_scene(picture: Any, size_mm: float = _LIT_MM, distance_mm: float = 400.0, **options: Any) -> Bench:
+    """Open the scene ``photograph`` with your own picture on its sheet.
+
+    Parameters
+    ----------
+    picture
+        a PNG, TIFF, NPY, OpenEXR or JPEG file, or an array (rows, columns) or (rows, columns, 3). Its numbers are
+        reflectances, 0 to 1, of whole numbers the part of their type's largest; of colours the mean is taken. It is as
+        high to wide as its pixels are; what is left of the sheet is black.
+    size_mm
+        side of the sheet, and longer side of the picture [mm]. At 400 mm the projector lights 120 mm: there an array
+        of 128 x 128 numbers has one for each of its pixels.
+    distance_mm
+        from the camera to the sheet [mm]. The bench stays aligned to 400 mm, and so does its calibration.
+    **options
+        other arguments of :func:`mitsim.open_bench`: ``camera``, ``projector``, ``variant``, parameters of the scene.
+
+    Returns
+    -------
+    the bench; its truth is the picture where the projector lights it.
+
+    Raises
+    ------
+    MitsimError
+        for a picture that cannot be read or whose numbers are no reflectances, and as :func:`mitsim.open_bench`.
+    """
+    path = picture if isinstance(picture, str | Path) else _write_array(picture)
+    return open_bench("photograph", picture=path, sheet_mm=size_mm, sheet_z=distance_mm, **options)
+
+
+@check_arguments
+def shelf_scene(
+    mesh: Path | str, size_mm: float = 60.0, reflectance: float = 0.7, turn_deg: float = 0.0, **options: Any
+) -> Bench:
+    """Open the scene ``shelf`` with your own object.
+
+    Parameters
+    ----------
+    mesh
+        a PLY file of triangles, or an OBJ file; its y axis is up. It is centred, and stands on the shelf.
+    size_mm
+        its longest side [mm].
+    reflectance
+        of its matt surface, on either side, 0 to 1.
+    turn_deg
+        about its upright axis [degrees].
+    **options
+        other arguments of :func:`mitsim.open_bench`.
+
+    Raises
+    ------
+    MitsimError
+        for a mesh that cannot be read, has no faces, or normals that face into it, and as :func:`mitsim.open_bench`.
+    """
+    stated: dict[str, Any] = {"object_mm": size_mm, "object_albedo": reflectance, "object_turn": turn_deg}
+    return open_bench("shelf", object=mesh, **stated, **options)
+
+
+_ALLOWED = "give a file, or an array of real numbers 0 to 1 or of unsigned ones, (rows, columns) or (rows, columns, 3)"
+
+
+def _write_array(picture: object) -> Path:
+    """Write an array to a file that is named by its content, so that another process finds it when it opens the
+    scene."""
+    import numpy as np
+
+    try:
+        values = np.asarray(picture)
+    except ValueError as error:
+        raise ArgumentError("picture", f"{error}; {_ALLOWED}") from None
+    if (
+        is_masked(picture)
+        or values.dtype.kind not in "buf"
+        or values.ndim not in (2, 3)
+        or values.shape[2:] not in ((), (1,), (3,))
+    ):
+        raise ArgumentError(
+            "picture",
+            f"got {'masked ' * is_masked(picture)}numbers of type {values.dtype} and shape {values.shape}; {_ALLOWED}",
+        )
+    most = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
+    values = values.astype(np.float64) / most
+    values = values.mean(axis=2) if values.ndim == 3 else values
+    digest = hashlib.sha256(f"{values.shape}".encode() + values.tobytes()).hexdigest()[:16]
+    folder = Path(tempfile.gettempdir()) / "mitsim-pictures"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{digest}.npy"
+    if not path.is_file():
+        with tempfile.NamedTemporaryFile(dir=folder, suffix=".npy", delete=False) as file:
+            np.save(file, values)
+        Path(file.name).replace(path)  # whole, or not at all
+    return path

@@ -11,11 +11,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mitsim.core.configuration import CAMERA, DEFAULT_CAMERA, PROJECTOR, load_model, locate, read_toml
+from mitsim.core.configuration import (
+    CAMERA,
+    DEFAULT_CAMERA,
+    PROJECTOR,
+    load_model,
+    locate,
+    mistakes,
+    read_toml,
+    refuse_together,
+)
 from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, load_variant
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import plain
-from mitsim.core.mistakes import mistakes, told_together
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import read_name
 from mitsim.scene.outline import Outline, SceneFiles, lit_side
@@ -425,7 +433,7 @@ def _check_camera(path: Path) -> None:
 
         found += mistakes(MaskProfile, mask)
     if found:
-        raise told_together(f"file {path}", found)
+        raise refuse_together(f"file {path}", found)
 
 
 def open_apparatus(

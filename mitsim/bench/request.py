@@ -7,28 +7,30 @@ what a calibration is to find, and :class:`Task` where results go and who watche
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import validate
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
+from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate
+from mitsim.core.environment import DEFAULT_VARIANT, check_variant
+from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.mistakes import refusal
+from mitsim.core.manifests import MOST_SHOTS
+from mitsim.core.options import DEVICES, LIMITS, QUALITY, FilePath, Options, option, shipped_names, validated_by
 from mitsim.core.seeds import check_root
+from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
-from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel
+from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel, load_sensor
+from mitsim.devices.session import SessionRecipe, load_recipe
 
 if TYPE_CHECKING:
     from mitsim.devices.camera import Devices
-    from mitsim.devices.session import SessionRecipe
 
 LOWEST_ACCURACY, HIGHEST_ACCURACY = 1e-6, 0.3
 """Below, single precision in the renderer (6e-8 a connection) and the pilot's samples tell nothing; above, no frame is
@@ -69,7 +71,7 @@ class Task:
 
     @classmethod
     def of(cls, output: Path | str | None = None, resume: bool = False, job: Job | None = None) -> Task:
-        """Of the Python face's arguments.
+        """Return the value that the arguments of a Python function describe.
 
         Parameters
         ----------
@@ -80,28 +82,9 @@ class Task:
 
     @contextmanager
     def importing(self) -> Iterator[None]:
-        """The stage "imports" of the job's clock."""
+        """Count the time of this context as the stage "imports" of the job's clock."""
         with self.job.clock.stage("imports"), pause_collector():
             yield
-
-
-@dataclass(frozen=True)
-class SessionRequest:
-    """Which factors are wanted, and how well.
-
-    Attributes
-    ----------
-    seed
-        root of every random stream.
-    accuracy
-        relative rms error of the expected responses.
-    recipe
-        how the session is run; None: the shipped one.
-    """
-
-    seed: int = 0
-    accuracy: float = 1e-3
-    recipe: SessionRecipe | None = None
 
 
 @dataclass(frozen=True)
@@ -149,18 +132,18 @@ def _check_range(name: str, value: float, least: float, most: float, rule: str) 
 
 
 def check_accuracy(accuracy: float) -> float:
-    """``accuracy``, or ArgumentError when it is outside what the estimator can promise."""
+    """Return the ``accuracy``; ArgumentError if no estimator can promise it."""
     return _check_range("accuracy", accuracy, LOWEST_ACCURACY, HIGHEST_ACCURACY, "a relative error from {}")
 
 
 def check_psnr(psnr: float) -> float:
-    """``psnr`` [dB], or ArgumentError when no image of worth has it."""
+    """Return the ``psnr`` [dB]; ArgumentError if no useful image has it."""
     return _check_range("psnr", psnr, *PSNR_DB, "{} dB")
 
 
 def check_samples(estimator: str, spp: int | None) -> None:
-    """ArgumentError for an ``estimator`` that there is not, or too few or too many samples ``spp`` a pixel of the
-    reference; None: those of the scene."""
+    """Refuse an unknown ``estimator``, and too few or too many samples ``spp`` a pixel of the reference; None stands
+    for those of the scene."""
     if estimator not in ESTIMATORS:
         raise ArgumentError("estimator", f"{estimator!r}: use {' or '.join(ESTIMATORS)}")
     if estimator == REFERENCE and spp is not None and not FEWEST_PASSES <= spp <= MOST_SAMPLES:
@@ -168,124 +151,353 @@ def check_samples(estimator: str, spp: int | None) -> None:
 
 
 def check_untimed(seconds: float | None) -> None:
-    """ArgumentError where a run in colour is to take so many ``seconds``."""
+    """Refuse ``seconds`` for a run in colour."""
     if seconds is not None:
         raise ArgumentError(
             "seconds", f"{seconds:g}: runs in colour are not planned by time; give an accuracy, or leave colour out"
         )
 
 
-def _of_a_family(patterns: str) -> str:
+def _switches(effects: object) -> dict[str, bool]:
+    """Return effects that are switched on or off, by name; MitsimError for anything else."""
+    found = parse_switches(effects) if isinstance(effects, str) else effects
+    if not isinstance(found, Mapping) or not all(isinstance(value, bool) for value in found.values()):
+        raise ArgumentError("effects", f"{short_text(effects)}: give +NAME,-NAME, or True or False by name")
+    return check_switches(dict(found))
+
+
+def family_of(patterns: str) -> str:
+    """Return the ``patterns``, the name of a family; ArgumentError for another name."""
     read_name(patterns)
     return patterns
 
 
-def _some_time(seconds: float) -> float:
-    if not 0 < seconds <= LONGEST_S:
-        raise ArgumentError("seconds", f"{seconds:g}: give a number above 0, at most {LONGEST_S:g}")
-    return seconds
+class Seeded(Options):
+    """The root of all random streams."""
+
+    seed: Annotated[int, validated_by(check_root)] = option(0, "root of every random stream", panel=QUALITY)
 
 
-def _worth_it(fraction: float) -> float:
-    return _check_range("noise_fraction", fraction, _LEAST_NOISE, 1, "a part of the sensor's noise from {}")
+class SeedKeys(TypedDict, total=False):
+    """Keywords of :class:`Seeded`, for type checkers; tests/test_verbs.py compares such classes with their models."""
+
+    seed: int
 
 
-def _some_shots(shots: int) -> int:
-    from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests have no shots
+class SampledKeys(SeedKeys, total=False):
+    """Keywords of :class:`Sampled`."""
 
-    _check_range("ambient_shots", shots, 1, MOST_SHOTS, "{} shots, or none for the patterns' own")
-    return shots
+    accuracy: float
 
 
-class Request(BaseModel):
-    """Which shots of a scene are wanted, and how well."""
+class SessionKeys(SampledKeys, total=False):
+    """Keywords of :class:`SessionRequest`."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+    recipe: SessionRecipe | None
 
-    patterns: Annotated[str, AfterValidator(_of_a_family)] = Field("dots:7", description=pattern_names())
-    accuracy: Annotated[float, AfterValidator(check_accuracy)] = Field(
-        1e-3, description="relative rms error of the expected frames"
+
+class ExposureKeys(SampledKeys, total=False):
+    """Keywords of :class:`Request`, without the patterns."""
+
+    exposure: float | Literal["auto"]
+    exposure_fraction: float
+    seconds: float | None
+    effects: dict[str, bool] | str
+    noise_fraction: float | None
+    ambient_frame: Literal["auto", "yes", "no"]
+    ambient_shots: int | None
+    closing_frame: Literal["first", "uniform"] | None
+
+
+class RequestKeys(ExposureKeys, total=False):
+    """Keywords of :class:`Request`."""
+
+    patterns: str
+
+
+class Family(Options):
+    """Patterns that the projector shows."""
+
+    patterns: Annotated[str, validated_by(family_of)] = option("dots:7", pattern_names(), metavar="PATTERNS")
+
+
+class Accurate(Options):
+    """How well light is known."""
+
+    accuracy: Annotated[float, validated_by(check_accuracy)] = option(
+        1e-3, "relative rms error of the expected frames", panel=QUALITY
     )
-    seconds: Annotated[float, AfterValidator(_some_time)] | None = Field(
-        None, description="take the finest accuracy that a run of so many seconds buys"
-    )
-    seed: Annotated[int, AfterValidator(check_root)] = Field(0, description="root of every random stream")
-    exposure: float | Literal["auto"] = Field("auto", description="seconds a frame, or auto")
-    exposure_fraction: float = Field(0.8, description="brightest pixel, as a part of full well")
-    effects: Annotated[dict[str, bool], AfterValidator(check_switches)] = Field(
-        {}, description="effects switched on or off, whatever they are worth"
-    )
-    noise_fraction: Annotated[float, AfterValidator(_worth_it)] | None = Field(
-        None, description="stop sampling at this part of the sensor's noise"
-    )
-    ambient_frame: Literal["auto", "yes", "no"] = Field("auto", description="whether a frame of ambient light is taken")
-    ambient_shots: Annotated[int, AfterValidator(_some_shots)] | None = Field(
-        None, description="shots of that frame; None: by the patterns"
-    )
-    closing_frame: Literal["first", "uniform"] | None = Field(
-        None, description="frame at the end that checks lamp, camera and scene: the first one again, or a uniform one"
-    )
 
-    def __init__(self, **values: Any) -> None:
-        """Of the fields' ``values``, as they are; MitsimError as :meth:`of`."""
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise refusal(type(self), error, "request") from error
 
-    @classmethod
-    @check_arguments
-    def of(cls, **values: object) -> Request:
-        """The request of these ``values``; effects may be written ``"+ambient,-diffraction"``.
+class Sampled(Seeded, Accurate):
+    """How finely light is sampled."""
 
-        Raises
-        ------
-        MitsimError
-            for a name that is no field, or a value that a field cannot have.
-        """
-        if isinstance(values.get("effects"), str):
-            values["effects"] = parse_switches(str(values["effects"]))
-        return validate(cls, values, "request")
 
-    def with_values(self, **values: object) -> Request:
-        """The same request with other ``values``; MitsimError as :meth:`of`."""
-        return Request.of(**{**self.model_dump(exclude_unset=True), **values})
+class Timed(Seeded):
+    """How long the camera is exposed."""
 
-    @property
-    def deciding(self) -> dict[str, Any]:
-        """What is asked, as the manifest's configuration holds it: an accuracy or seconds."""
-        unused = {"accuracy" if self.seconds is not None else "seconds"}
-        # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
-        return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
+    exposure: float | Literal["auto"] = option("auto", "seconds a frame, or auto", metavar="auto|SECONDS")
+    exposure_fraction: float = option(0.8, "brightest pixel, as a part of full well", metavar="PART")
 
-    @field_validator("ambient_frame", "closing_frame", mode="before")
-    @classmethod
-    def _a_choice(cls, choice: object, info: ValidationInfo) -> object:
-        allowed = {"ambient_frame": ("auto", "yes", "no"), "closing_frame": ("first", "uniform")}
-        *most, last = allowed[str(info.field_name)]
-        if choice not in (*most, last) and not (choice is None and info.field_name == "closing_frame"):
-            raise ArgumentError(str(info.field_name), f"{choice!r}: use {', '.join(most)} or {last}")
-        return choice
-
-    def model_post_init(self, _: object) -> None:
-        """MitsimError for an exposure that no camera has, and for seconds beside what they decide."""
+    def model_post_init(self, context: object) -> None:
+        """Refuse an exposure that no camera has."""
+        super().model_post_init(context)
         self.timing  # noqa: B018 - checks itself
-        if self.seconds is None:
-            return
-        if "accuracy" in self.model_fields_set:
-            raise ArgumentError(
-                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
-            )
-        if self.noise_fraction is not None:
-            raise ArgumentError(
-                "noise_fraction",
-                f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
-            )
+
+    def refuse_idle(self) -> None:
+        """Refuse a part of the full well beside an exposure in seconds."""
+        if self.exposure != "auto":
+            self.refuse(["exposure_fraction"], "on an exposure in seconds")
 
     @property
     def timing(self) -> Exposure:
         """How the exposure time is found."""
         return Exposure(None if self.exposure == "auto" else self.exposure, self.exposure_fraction)
+
+
+class Planned(Sampled, Family):
+    """Which light is simulated, and how finely."""
+
+    seconds: float | None = option(
+        None, "the finest accuracy that a run of so long buys", metavar="S", panel=QUALITY, gt=0, le=LONGEST_S
+    )
+    effects: Annotated[Any, validated_by(_switches)] = option(
+        {}, "override the plan: +NAME,-NAME", metavar="+NAME,-NAME", panel=QUALITY
+    )
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse an accuracy beside the seconds that decide it."""
+        super().model_post_init(context)
+        if self.seconds is not None and "accuracy" in self.model_fields_set:
+            raise ArgumentError(
+                "seconds", f"{self.seconds:g}: the accuracy is what they buy; give seconds or an accuracy, not both"
+            )
+
+
+class Request(Timed, Planned):
+    """Which shots of a scene are wanted, and how well."""
+
+    noise_fraction: float | None = option(
+        None, "stop sampling at this part of the sensor's noise", metavar="PART", panel=QUALITY, ge=_LEAST_NOISE, le=1
+    )
+    ambient_frame: Literal["auto", "yes", "no"] = option(
+        "auto", "take a frame with the projector off and lamps on", metavar="auto|yes|no"
+    )
+    ambient_shots: int | None = option(
+        None, "shots of that frame; by the patterns if not given", metavar="N", ge=1, le=MOST_SHOTS
+    )
+    closing_frame: Literal["first", "uniform"] | None = option(
+        None,
+        "frame at the end that checks lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+    )
+
+    @classmethod
+    def of(cls, **values: Any) -> Request:
+        """Return the request of these ``values``; effects may be written ``"+ambient,-diffraction"``."""
+        return cls(**values)
+
+    def with_values(self, **values: object) -> Request:
+        """Return the request with other ``values`` of some fields."""
+        return Request.of(**{**self.model_dump(exclude_unset=True), **values})
+
+    def refuse_idle(self) -> None:
+        """Refuse options that have no effect beside others that are given."""
+        super().refuse_idle()
+        if self.ambient_frame == "no":
+            self.refuse(["ambient_shots"], "with ambient_frame no")
+
+    @property
+    def deciding(self) -> dict[str, Any]:
+        """The fields that decide frames, as the manifest's configuration holds them, with either an accuracy or
+        seconds."""
+        unused = {"accuracy" if self.seconds is not None else "seconds"}
+        # Without a closing frame the configuration, and so the digest in each frame, is as before there was the choice.
+        return self.model_dump(mode="json", exclude=unused if self.closing_frame else {*unused, "closing_frame"})
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse a second rule that ends sampling beside seconds."""
+        super().model_post_init(context)
+        if self.seconds is not None and self.noise_fraction is not None:
+            raise ArgumentError(
+                "noise_fraction",
+                f"{self.noise_fraction:g}: stops sampling by another rule than seconds; give one of both",
+            )
+
+
+class SessionRequest(Sampled):
+    """Which factors a calibration is to find, and how well."""
+
+    recipe: SessionRecipe | None = option(
+        None, "session recipe, TOML", metavar="FILE.toml", kind=Path, read=load_recipe
+    )
+
+
+# ---- A scene and its devices ----
+
+NO, MOSAIC, AUTO = "no", "mosaic", "auto"
+"""Words of ``colour`` beside ``lines`` and ``bands:K``."""
+
+
+def by_line(colour: str) -> bool:
+    """Return True if a ``colour`` is lines, or bands of them, one after the other."""
+    return colour.partition(":")[0] in (LINES, BANDS)
+
+
+def _parameters(texts: Iterable[str]) -> dict[str, Any]:
+    """Return the scene's parameters that are written NAME=VALUE."""
+    parameters = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise MitsimError(f"-D {text!r}: give NAME=VALUE")
+        if name in ("scene", "for_render", *Opening.model_fields):
+            raise MitsimError(f"-D {text!r}: mitsim itself uses the name {name}; give the scene's <default> another")
+        parameters[name] = value
+    return parameters
+
+
+class OpeningKeys(TypedDict, total=False):
+    """Keywords of :class:`Opening`."""
+
+    variant: str
+    camera: Path | str | None
+    projector: Path | str | None
+    allow_outside_files: bool
+    parameters: Mapping[str, Any]
+
+
+class Variant(Options):
+    """The variant of Mitsuba."""
+
+    variant: Annotated[str, validated_by(check_variant)] = option(
+        DEFAULT_VARIANT,
+        "Mitsuba variant: llvm_ad_mono, llvm_ad_rgb or llvm_ad_spectral; with a GPU, cuda_ for llvm_",
+        metavar="VARIANT",
+        panel=LIMITS,
+    )
+
+
+class LitScene(Variant):
+    """What opens a scene with the projector's light."""
+
+    PANEL = DEVICES
+
+    projector: FilePath | None = option(
+        None, "projector: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, PROJECTOR)
+    )
+    parameters: Mapping[str, Any] = option(
+        {}, "set a <default> of the scene", "-D", metavar="NAME=VALUE", kind=list[str], read=_parameters
+    )
+    allow_outside_files: bool = option(False, "let the scene read files outside its own folder")
+
+
+class Opening(LitScene):
+    """What opens a bench, beside its scene."""
+
+    camera: FilePath | None = option(
+        None, "camera electronics: name or TOML file", metavar="NAME|FILE", complete=partial(shipped_names, CAMERA)
+    )
+
+    def traced_in(self, colour: str) -> str:
+        """Return the variant that light is traced in for a ``colour``: one that knows wavelengths if lines are told
+        apart."""
+        return self.variant if colour in (NO, AUTO) else spectral_of(self.variant)
+
+    def check(
+        self,
+        scene: Path | str,
+        patterns: str | None = None,
+        timing: Exposure | None = None,
+        colour: str = NO,
+        seconds: float | None = None,
+    ) -> None:
+        """Refuse, before the renderer is imported, what the scene and its devices cannot have.
+
+        Parameters
+        ----------
+        scene, patterns
+            Scene of the bench, and a family that its projector is to show; None for no family.
+        timing
+            Exposure; None where nothing is exposed.
+        colour, seconds
+            Which light is told apart, and how long a capture is to take.
+        """
+        from mitsim.bench.apparatus import check_devices, check_scene
+
+        camera, projector = check_devices(self.camera, self.projector)
+        sensor = load_sensor(camera)
+        if colour == MOSAIC and sensor.mosaic is None:
+            raise ArgumentError(
+                "colour",
+                f"mosaic: camera {camera} has no mosaic of colour filters; give one that has, such as imx249_rggb, or "
+                "use colour lines",
+            )
+        if colour not in (NO, MOSAIC) and sensor.mosaic is not None:
+            raise ArgumentError(
+                "colour",
+                f"{colour}: camera {camera} has a mosaic {sensor.mosaic}, whose frames show all lines at once; use "
+                "colour mosaic",
+            )
+        if colour != NO:
+            check_untimed(seconds)
+        if colour == AUTO:
+            check_undecided(self.variant)
+        elif colour != NO:
+            from mitsim.devices.projector import ProjectorModel  # here: it imports numpy
+
+            light = load_model(projector, ProjectorModel)
+            (light.in_bands(bands_of(colour)) if colour.startswith(BANDS) else light).traced_lines  # noqa: B018
+        if timing is not None and colour != MOSAIC:
+            timing.check(sensor, camera)
+        check_scene(scene, self.texts, self.allow_outside_files, [] if patterns is None else [patterns])
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The parameters as a scene spells them."""
+        from mitsim.bench.apparatus import spelling
+
+        return {name: spelling(value) for name, value in self.parameters.items()}
+
+    @property
+    def models(self) -> list[Path]:
+        """Files of the camera and its mask, and of the projector, that are named."""
+        from mitsim.devices.mask_profile import load_mask  # here: it imports numpy
+
+        named = (self.camera, CAMERA), (self.projector, PROJECTOR)
+        files = [locate(each, "calibration", ".toml", field) for each, field in named if each]
+        mask = load_mask(files[0]) if self.camera else None
+        return files if mask is None or mask.file is None else [*files, files[0].parent / mask.file]
+
+
+def _known_colour(colour: str) -> None:
+    """Refuse a word of ``colour`` that is not known."""
+    if colour.startswith(f"{BANDS}:"):
+        bands_of(colour)
+    elif colour not in (NO, LINES, MOSAIC, AUTO):
+        raise ArgumentError("colour", f"{colour!r}: use {NO}, {LINES}, {BANDS}:K, {MOSAIC} or {AUTO}")
+
+
+class Coloured(Options):
+    """Which of the projector's light is told apart."""
+
+    colour: Annotated[str, validated_by(_known_colour)] = option(
+        NO,
+        "lines: sequential colour, each line of the projector in a folder of its own; bands:K: the same of K bands of "
+        "its lines; mosaic: all lines at once, by a camera under colour filters; auto: no, bands or lines, as the "
+        "accuracy needs (not calibrate); no: light that is not told apart",
+        metavar="no|lines|bands:K|mosaic|auto",
+    )
+
+
+class FixedColour(Coloured):
+    """Which of the projector's light is told apart, without a choice."""
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse a colour that a plan would have to choose."""
+        super().model_post_init(context)
+        if self.colour == AUTO:
+            raise ArgumentError("colour", f"{AUTO!r}: use {NO}, {LINES}, {BANDS}:K or {MOSAIC}")
 
 
 # ---- What `mitsim sense` takes ----
@@ -294,37 +506,53 @@ IMAGES, ENDINGS = (".exr", ".npy"), (".png", ".exr", ".npy")
 """Files that an image is read from, and digital numbers are written to."""
 _LARGEST_PNG = 2**16 - 1
 """What 16 bits of grey hold."""
-_WAVELENGTHS_NM = 1.0, 1e6
-"""As a projector's."""
+
+
+class Lit(Options):
+    """Light of one wavelength."""
+
+    wavelength: float = option(550.0, "of the light [nm]", ge=1, le=1e6)
+
+
+class Irradiance(Timed, Lit):
+    """How an image's numbers are light on a sensor, and how the sensor is exposed to it."""
+
+    VERB = "sense"
+
+    exposure: float | Literal["auto"] = option("auto", "seconds, or auto", metavar="auto|SECONDS")
+    f_number: float | None = option(
+        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N", ge=0.5, lt=math.inf
+    )
+    scale: float = option(1.0, "what its numbers are multiplied by", gt=0, lt=math.inf)
+    channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
+
+
+class IrradianceKeys(SeedKeys, total=False):
+    """Keywords of :class:`Irradiance`, without the exposure time."""
+
+    exposure_fraction: float
+    wavelength: float
+    f_number: float | None
+    scale: float
+    channel: str | None
 
 
 def check_image(path: Path) -> None:
-    """MitsimError for a ``path`` that no image is read from."""
+    """Refuse a ``path`` that no image is read from."""
     if path.suffix.lower() not in IMAGES:
         raise MitsimError(f"image {path}: give an OpenEXR (.exr) or NumPy (.npy) file")
     check_plain(path, "image")
 
 
-def check_wavelength(wavelength_nm: float) -> None:
-    """ArgumentError for light of a ``wavelength_nm`` [nm] that there is not."""
-    _check_range("wavelength", wavelength_nm, *_WAVELENGTHS_NM, "{} nm")
-
-
-def check_f_number(f_number: float) -> None:
-    """ArgumentError for an ``f_number`` that no lens has."""
-    if not 0.5 <= f_number < math.inf:
-        raise ArgumentError("f_number", f"{f_number:g}: no lens in air is below 0.5; give its f-number")
-
-
 def check_view(path: Path | str) -> Path:
-    """The ``path`` of a bench's drawing; ArgumentError for one that is neither a picture nor a page."""
+    """Return the ``path`` of a bench's drawing; ArgumentError if it is neither a picture nor a page."""
     if Path(path).suffix.lower() not in VIEWS:
         raise ArgumentError("output", f"{path}: give a name that ends in {' or '.join(VIEWS)}")
     return Path(path)
 
 
 def check_ending(path: Path, sensor: SensorModel) -> None:
-    """MitsimError for a ``path`` that no frame is written to, or whose kind cannot hold a ``sensor``'s numbers."""
+    """Refuse a ``path`` that no frame is written to, or whose kind cannot hold the ``sensor``'s numbers."""
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise MitsimError(f"output {path}: give a name that ends in {', '.join(ENDINGS)}")

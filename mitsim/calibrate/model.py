@@ -88,7 +88,13 @@ def calibrate_model(
         as :meth:`mitsim.api.bench.Bench.calibrate`.
     """
     with nullcontext() if output is None else output_folder(output) as place:
-        factors = _fit_factors(bench, modelling, frames, SessionRequest(seed, modelling.accuracy, recipe), job or Job())
+        factors = _fit_factors(
+            bench,
+            modelling,
+            frames,
+            SessionRequest(seed=seed, accuracy=modelling.accuracy, recipe=recipe),
+            job or Job(),
+        )
         if place is not None:
             factors.write(place)
     return factors

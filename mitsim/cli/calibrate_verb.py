@@ -1,7 +1,6 @@
-"""`mitsim calibrate`: words of a command line in; a session's or a plan's words, or a refusal, out.
+"""`mitsim calibrate`: factors of a simulated session, of real frames, of known pictures, or of a fitted model.
 
-Five ways to factors: a simulated session, the frames of a real one, captures of known pictures, a fitted model, and a
-plan, which makes none.
+`--plan` makes none of these, and plans a session.
 """
 
 from __future__ import annotations
@@ -9,36 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsim.cli.help_page import OUTPUT, WHAT
-from mitsim.cli.options import (
-    MOSAIC,
-    NO,
-    Accuracy,
-    Coloured,
-    Common,
-    LimitedPictured,
-    Resume,
-    Seed,
-    check_work,
-    complete_scene,
-    in_colour,
-    is_given,
-    option,
-    option_name,
-    request_of,
-    verb,
-)
-from mitsim.cli.report_verb import finish_folder
-from mitsim.cli.screen import finish, memory_line, payload_of_lines, total_of_lines
+from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
+from mitsim.cli.commands import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
+from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
 from mitsim.core.errors import MitsimError
+from mitsim.core.options import OUTPUT, WHAT, option
 from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
+from mitsim.verbs import calibrate_in, open_as
 
 if TYPE_CHECKING:
     from mitsim.devices.session import Modelling
@@ -50,9 +32,8 @@ _OF_KNOWN = {"known", "aged", "output", "as_json", "quiet", "verbose", "no_pictu
 """Those that go with --known."""
 
 
-@dataclass(frozen=True)
-class Session:
-    """Frames that factors come from, and where they go."""
+class Calibrating(SessionRequest, FixedColour, Opening, LimitedPictured, Resumed):
+    """What factors are found from, how, and where they go."""
 
     PANEL = WHAT
 
@@ -62,61 +43,37 @@ class Session:
         "-o",
         "--output",
         metavar="CAL",
-        rich_help_panel=OUTPUT,
+        panel=OUTPUT,
     )
     frames: Path | None = option(None, "folder with the frames of a real session, instead of a scene", metavar="DIR")
     known: Path | None = option(None, "list of captures of known pictures, instead of a scene", metavar="LIST.toml")
     aged: Path | None = option(
         None, "calibration that has aged: moved until the frames of --known fit", "--from", metavar="CAL"
     )
-    accuracy: Accuracy = 1e-3
-    seed: Seed = 0
-    recipe: Path | None = option(None, "session recipe, TOML", metavar="FILE.toml")
     write_frames: Path | None = option(
-        None, "folder to write the simulated frames to, for --frames", metavar="DIR", rich_help_panel=OUTPUT
+        None, "folder to write the simulated frames to, for --frames", metavar="DIR", panel=OUTPUT
     )
-    resume: Resume = False
-
-    @property
-    def request(self) -> dict[str, Any]:
-        """Accuracy and seed, checked."""
-        return request_of(accuracy=self.accuracy, seed=self.seed)
-
-
-@dataclass(frozen=True)
-class Planned:
-    """What --plan is asked for."""
-
-    PANEL = WHAT
-
     planning: bool = option(False, "find the light that an image of --psnr needs; calibrates nothing", "--plan")
     psnr: float | None = option(None, "wanted of --plan's image [dB]", metavar="DB")
     patterns: str | None = option(None, "of --plan's capture", show_default="dots:7", metavar="PATTERNS")
-
-    def folder(self, output: Path | None) -> Path:
-        """The ``output`` of a calibration that is no plan; MitsimError without one, or with options of a plan."""
-        for name, value in (("--psnr", self.psnr), ("--patterns", self.patterns)):
-            if value is not None:
-                raise MitsimError(f"{name} {value}: is for --plan; a calibration serves all patterns, so leave it out")
-        if output is None:
-            raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
-        return output
-
-
-@dataclass(frozen=True)
-class Modelled:
-    """What --model is asked for."""
-
-    PANEL = WHAT
-
     model: str | None = option(
         None, "model the factors, its devices fitted to a few frames; of --frames with SCENE", metavar="geometric|wave"
     )
     frames_used: int | None = option(None, "frames that --model is fitted to, at most", show_default="16", metavar="K")
     fit: str | None = option(None, "what --model fits", show_default="mask, magnification, gain", metavar="NAME,...")
 
+    @property
+    def folder(self) -> Path:
+        """Folder of a calibration that is no plan; MitsimError without one, or with options of a plan."""
+        for name, value in (("--psnr", self.psnr), ("--patterns", self.patterns)):
+            if value is not None:
+                raise MitsimError(f"{name} {value}: is for --plan; a calibration serves all patterns, so leave it out")
+        if self.output is None:
+            raise MitsimError("Missing option '-o' / '--output': give the calibration folder to make")
+        return self.output
+
     def modelling(self, accuracy: float) -> Modelling:
-        """The fit, of light of an ``accuracy``; MitsimError for words that it does not know."""
+        """Return the fit of --model, of light of an ``accuracy``; MitsimError for words that it does not have."""
         from mitsim.devices.session import FITTED, Modelling
 
         names = FITTED if self.fit is None else tuple(name.strip() for name in self.fit.split(","))
@@ -124,12 +81,16 @@ class Modelled:
         frames = {} if self.frames_used is None else {"frames": self.frames_used}
         return Modelling(model, **frames, fitted=names, accuracy=accuracy)
 
+    def refuse_others(self, scene: str | None, allowed: set[str], reason: str) -> None:
+        """Refuse, for a ``reason``, a ``scene`` and the first option that is given and not ``allowed``."""
+        given = {*self.given, *(() if scene is None else ("scene",))}
+        if others := sorted(given - allowed):
+            raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
+
 
 @verb
 def calibrate(
-    *,
-    context: typer.Context,
-    session: Session,
+    asked: Calibrating,
     scene: Annotated[
         str | None,
         typer.Argument(
@@ -138,10 +99,6 @@ def calibrate(
             autocompletion=complete_scene,
         ),
     ] = None,
-    planned: Planned,
-    modelled: Modelled,
-    devices: Coloured,
-    limited: LimitedPictured,
 ) -> int:
     """Estimate the camera's two factors, simulated or real.
 
@@ -152,99 +109,79 @@ def calibrate(
     $ mitsim calibrate photograph -o few --model wave
     $ mitsim calibrate --frames session -o cal --camera imx249
     """
-    if session.known is not None:
-        folder = Planned().folder(session.output)
-        _check_alone(context, f"--known {session.known}: runs and their list decide", _OF_KNOWN)
-        return _calibrate_known(session.known, session.aged, folder, limited)
-    if session.aged is not None:
-        raise MitsimError(f"--from {session.aged}: is mended by captures of known pictures; give --known LIST too")
-    if modelled.model is not None and not planned.planning:
-        modelling, folder = modelled.modelling(session.accuracy), planned.folder(session.output)
-        return _fit(context, scene, modelling, folder, session, devices, limited)
+    if asked.known is not None:
+        asked.refuse_others(scene, _OF_KNOWN, f"--known {asked.known}: runs and their list decide")
+        return _calibrate_known(asked.known, asked)
+    if asked.aged is not None:
+        raise MitsimError(f"--from {asked.aged}: is mended by captures of known pictures; give --known LIST too")
+    if asked.model is not None and not asked.planning:
+        return _fit(scene, asked)
     for name in ("frames_used", "fit", "model"):
-        if (value := getattr(modelled, name)) is not None:
+        if (value := getattr(asked, name)) is not None:
             raise MitsimError(f"{option_name(name)} {value}: is for --model without --plan; leave it out")
-    if session.frames is not None:
-        folder = Planned().folder(session.output)
-        _check_alone(context, f"--frames {session.frames}: frames and their list decide", _OF_FRAMES)
-        return _calibrate_frames(session.frames, folder, devices.camera, limited)
+    if asked.frames is not None:
+        asked.refuse_others(scene, _OF_FRAMES, f"--frames {asked.frames}: frames and their list decide")
+        return _calibrate_frames(asked.frames, asked)
     if scene is None:
         raise MitsimError(
             "calibrate: give a scene, --frames DIR with the frames of a real session, or --known LIST of known pictures"
         )
-    if planned.planning:
-        return _plan(scene, session, planned, devices, limited)
-    return _calibrate(scene, session, planned, devices, limited)
-
-
-def _check_alone(context: typer.Context, reason: str, taken: set[str]) -> None:
-    """MitsimError, for a ``reason``, where options are given that are not ``taken``."""
-    if others := sorted({name for name in context.params if is_given(context, name)} - taken):
-        raise MitsimError(f"{reason}; leave out {option_name(others[0])}")
+    if asked.planning:
+        return _plan(scene, asked)
+    return _calibrate(scene, asked)
 
 
 # ---- a simulated session ---------------------------------------------------------------------------------------------
 
 
-def _calibrate(scene: str, session: Session, planned: Planned, devices: Coloured, limited: LimitedPictured) -> int:
-    from mitsim.bench.request import Exposure
+def _calibrate(scene: str, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.session import load_recipe
 
-    request, recipe, colour = session.request, load_recipe(session.recipe), devices.colour
-    if session.write_frames is not None or colour != NO:
+    recipe, folder, colour = asked.recipe or load_recipe(), asked.folder, asked.colour
+    if asked.write_frames is not None or colour != NO:
         recipe.of_one_depth()
-    if session.write_frames is not None:
-        if session.resume:
+    if asked.write_frames is not None:
+        if asked.resume:
             raise MitsimError(
                 "--write-frames: a resumed session shows its finished patterns no more; leave out --resume"
             )
         if colour != NO:
             raise MitsimError(
-                f"--write-frames {session.write_frames}: frames are kept of light that is not told apart; leave one out"
+                f"--write-frames {asked.write_frames}: frames are kept of light that is not told apart; leave one out"
             )
-    folder, variant = planned.folder(session.output), devices.traced_in(limited.variant)
-    check_work(folder, session.resume, "calibration", several=colour != NO or bool(recipe.depths))
-    if session.write_frames is not None:
-        check_output(session.write_frames)
-    devices.check_colour(limited.variant)
-    if colour != MOSAIC:
-        devices.check_exposure(Exposure(None, recipe.exposure_fraction))
+    check_work(folder, asked.resume, "calibration", several=colour != NO or bool(recipe.depths))
+    if asked.write_frames is not None:
+        check_output(asked.write_frames)
+    asked.check(scene, None, Exposure(None, recipe.exposure_fraction), colour)
     advise(RESUME)
-    with limited.job() as job:
-        bench = devices.open(scene, variant, job)
+    session = asked.part(SessionRequest)
+    with asked.job() as job:
+        bench = open_as(scene, asked, job, colour)
         held = memory_from_here()
-        whole: dict[str, Any] = {**request, "output": folder, "job": job}
-        if colour != NO:
-            seen = in_colour(bench, colour)
-            by_line = seen.calibrate_mosaic if colour == MOSAIC else seen.calibrate_lines
-            shown = None if session.recipe is None else recipe
-            payload, lines = _of_lines(by_line(**whole, recipe=shown, resume=session.resume), folder)
-            payload["memory_bytes"] = memory_since(held)
-            return finish_folder(limited, folder, payload, lines, payload["warnings"])
-        if session.write_frames is not None:
-            found = [bench.write_session(session.write_frames, **whole, recipe=recipe)]
-        elif recipe.depths:
-            found = [*bench.calibrate_depths(**whole, recipe=recipe, resume=session.resume).values()]
+        if asked.write_frames is not None:
+            found: Mapping[str, Factors] = {"": bench.write_session(asked.write_frames, folder, job, **session.given)}
         else:
-            found = [bench.calibrate(**whole, recipe=recipe, resume=session.resume)]
+            found = calibrate_in(bench, colour, session, Task(folder, asked.resume, job))
     taken = memory_since(held)
-    places = [str(folder / f"{depth:g}") for depth in recipe.depths] or [str(folder)]
+    if colour != NO:
+        payload, lines = _of_lines(found, folder)
+        payload["memory_bytes"] = taken
+        return finish_folder(asked, folder, payload, lines, payload["warnings"])
     payloads = [
-        {**factors.manifest.result, "memory_bytes": taken, "output": place}
-        for factors, place in zip(found, places, strict=True)
+        {**factors.manifest.result, "memory_bytes": taken, "output": str(folder / name)}
+        for name, factors in found.items()
     ]
-    lines = [line for payload in payloads for line in _session_lines(payload, limited)]
-    warnings = [text for factors in found for text in factors.warnings]
+    lines = [line for payload in payloads for line in _session_lines(payload, asked)]
+    warnings = [text for factors in found.values() for text in factors.warnings]
     if not recipe.depths:
-        return finish_folder(limited, folder, payloads[0], lines, warnings)
+        return finish_folder(asked, folder, payloads[0], lines, warnings)
     whole = {"depths": payloads, "output": str(folder), "warnings": warnings}
-    return finish_folder(limited, folder, whole, lines, warnings)
+    return finish_folder(asked, folder, whole, lines, warnings)
 
 
 def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
-    """What is said of a simulated session, by its ``payload``, as ``common`` options have it."""
     names = "separability_residual", "noise_free_residual", "phi_error", "condition"
     residual, clean, error, condition = _finite(payload, *names)
     shadow = payload["shadow_residual"]
@@ -261,7 +198,7 @@ def _session_lines(payload: dict[str, Any], common: Common) -> list[str]:
 
 
 def _of_lines(factors: Mapping[str, Factors], output: Path) -> tuple[dict[str, Any], list[str]]:
-    """JSON and lines of text of a coloured calibration: its ``factors`` by line, in the folder ``output``."""
+    """Return the JSON and the lines of text of a coloured calibration, by its ``factors``."""
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
         for name, each in factors.items()
@@ -281,54 +218,54 @@ def _percent(part: float | None) -> str:
 
 
 def _finite(payload: Mapping[str, Any], *names: str) -> list[float]:
-    """Numbers of a ``payload``; JSON has none beyond the finite ones."""
+    """Return numbers of a ``payload``, where JSON has null for infinite ones."""
     return [math.inf if payload[name] is None else payload[name] for name in names]
 
 
 # ---- frames of a real session ----------------------------------------------------------------------------------------
 
 
-def _calibrate_frames(folder: Path, output: Path, camera: str | None, limited: LimitedPictured) -> int:
+def _calibrate_frames(folder: Path, asked: Calibrating) -> int:
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.framelist import load_frames
 
-    session = load_frames(folder)  # refused before the estimator is imported
+    session, output = load_frames(folder), asked.folder  # refused before the estimator is imported
     from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
     held = memory_from_here()
-    with limited.job() as job:
+    with asked.job() as job:
         if session.planes != ("",):
-            payload, lines = _of_lines(calibrate_planes(session, output, job, camera), output)
+            payload, lines = _of_lines(calibrate_planes(session, output, job, asked.camera), output)
             payload["memory_bytes"] = memory_since(held)
-            return finish_folder(limited, output, payload, lines, payload["warnings"])
-        factors = calibrate_frames(session, output, job, camera)
+            return finish_folder(asked, output, payload, lines, payload["warnings"])
+        factors = calibrate_frames(session, output, job, asked.camera)
     payload = {**factors.manifest.result, "memory_bytes": memory_since(held), "output": str(output)}
     residual, error, condition = _finite(payload, "separability_residual", "predicted_phi_error", "condition")
     lines = [
         f"{payload['frames']} frames of {payload['n']} stripes in {payload['seconds']['total']:.1f} s: {output}",
         f"Factor error {error:.1e} by its noise, separability residual {residual:.2%}",
-        *limited.details(f"Condition {condition:.2e}", memory_line(payload)),
+        *asked.details(f"Condition {condition:.2e}", memory_line(payload)),
         *([] if payload["divided_by"] == 1 else [f"Numbers are divided by {payload['divided_by']}, which all have"]),
         *(f"Not known: {text}" for text in payload["not_known"]),
     ]
-    return finish_folder(limited, output, payload, lines, factors.warnings)
+    return finish_folder(asked, output, payload, lines, factors.warnings)
 
 
 # ---- captures of known pictures --------------------------------------------------------------------------------------
 
 
-def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: LimitedPictured) -> int:
+def _calibrate_known(listed: Path, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
     from mitsim.devices.knownlist import load_known
 
-    captures = load_known(listed)  # refused before the fit is imported
+    captures, output, aged = load_known(listed), asked.folder, asked.aged  # refused before the fit is imported
     check_output(output)
     from mitsim.reconstruct.aged_calibration import moved_in_words
     from mitsim.reconstruct.known_pictures import calibrate_known
 
     held = memory_from_here()
-    with limited.job() as job:
+    with asked.job() as job:
         found = calibrate_known(captures, output, job, aged)
     results = {
         name: {**each.manifest.result, "warnings": each.warnings, "output": str(output / name)}
@@ -344,7 +281,7 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
     if aged is not None:
         left = f"Left over beyond noise {first['unexplained_residual']:.2%}, before {first['unexplained_before']:.2%}"
         moved = f"Moved: {moved_in_words(first['moved'])}"
-        return finish_folder(limited, output, payload, [said, moved, left], warnings)
+        return finish_folder(asked, output, payload, [said, moved, left], warnings)
     rows, columns = first["scale"]
     planes = dict[str, list[str]]()
     for name, each in results.items():
@@ -360,92 +297,78 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
         "columns of pixels",
         *(f"{', '.join(names)}: {text}" if any(names) else text for text, names in planes.items()),
     ]
-    return finish_folder(limited, output, payload, lines, warnings)
+    return finish_folder(asked, output, payload, lines, warnings)
 
 
 # ---- `mitsim calibrate --plan` ---------------------------------------------------------------------------------------
 
 
-def _plan(scene: str, session: Session, planned: Planned, devices: Coloured, limited: LimitedPictured) -> int:
-    from mitsim.bench.request import Exposure, Request, check_psnr
+def _plan(scene: str, asked: Calibrating) -> int:
+    from mitsim.bench.request import check_psnr
     from mitsim.core.files import output_file, prepare_output, write_text
     from mitsim.devices.session import load_recipe, recipe_text
 
-    request, recipe, output = session.request, load_recipe(session.recipe), session.output
+    recipe, output, colour = asked.recipe or load_recipe(), asked.output, asked.colour
     recipe.of_one_depth()
-    if session.write_frames is not None:
-        raise MitsimError(f"--write-frames {session.write_frames}: --plan takes no frames; leave one of them out")
-    if devices.colour != NO:
-        raise MitsimError(
-            f"--colour {devices.colour}: --plan is for light that is not told apart; leave one of them out"
-        )
-    if planned.psnr is None:
+    for given, reason in (
+        (asked.write_frames is not None, f"--write-frames {asked.write_frames}: --plan takes no frames"),
+        (colour != NO, f"--colour {colour}: --plan is for light that is not told apart"),
+        (asked.no_pictures, "--no-pictures: a plan has none"),
+        (asked.resume, "--resume: a plan writes no parts to go on with"),
+    ):
+        if given:
+            raise MitsimError(f"{reason}; leave it out")
+    if asked.psnr is None:
         raise MitsimError("--plan: give the PSNR that the image is to have, such as --psnr 35")
-    if limited.no_pictures:
-        raise MitsimError("--no-pictures: a plan has none; leave it out")
-    if session.resume:
-        raise MitsimError("--resume: a plan writes no parts to go on with; leave it out")
     if output is not None:
         prepare_output(output, kind="file")
-    patterns = Request.of(patterns=planned.patterns or "dots:7").patterns
-    psnr = check_psnr(planned.psnr)
-    devices.check_exposure(Exposure(None, recipe.exposure_fraction))
-    devices.check(scene, patterns)
-    with limited.job() as job:
-        bench = devices.open(scene, limited.variant, job)
+    patterns, psnr = Request(patterns=asked.patterns or "dots:7").patterns, check_psnr(asked.psnr)
+    asked.check(scene, patterns, Exposure(None, recipe.exposure_fraction))
+    with asked.job() as job:
+        bench = open_as(scene, asked, job)
         from mitsim.calibrate.session_plan import plan_calibration
 
         with nullcontext() if output is None else output_file(output):
-            found = plan_calibration(bench, psnr, patterns, recipe, **request, job=job)
+            found = plan_calibration(bench, psnr, patterns, recipe, seed=asked.seed, accuracy=asked.accuracy, job=job)
             lines = found.lines()
             if output is not None:
                 write_text(output, recipe_text(found.recipe))
                 lines.append(f"Recipe: {output}")
     payload = {**found.payload(), "output": None if output is None else str(output)}
-    return finish(limited.as_json, payload, lines, found.warnings)
+    return finish(asked.as_json, payload, lines, found.warnings)
 
 
 # ---- `mitsim calibrate --model` --------------------------------------------------------------------------------------
 
 
-def _fit(
-    context: typer.Context,
-    scene: str | None,
-    modelling: Modelling,
-    folder: Path,
-    session: Session,
-    devices: Coloured,
-    limited: LimitedPictured,
-) -> int:
-    from mitsim.bench.request import Exposure
+def _fit(scene: str | None, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.devices.framelist import load_frames
     from mitsim.devices.session import load_recipe
 
+    modelling, folder = asked.modelling(asked.accuracy), asked.folder
     if scene is None:
         raise MitsimError("--model: give the scene too, which states the camera and projector as they were to be built")
-    of_frames_alone = ("recipe", "seed", "accuracy") if session.frames else ()
+    of_frames_alone = ("recipe", "seed", "accuracy") if asked.frames else ()
     for name in ("resume", "write_frames", "colour", *of_frames_alone):
-        if is_given(context, name):
+        if name in asked.given:
             other = " of --frames" if name in of_frames_alone else ""
             raise MitsimError(f"{option_name(name)}: is of no use with --model{other}; leave it out")
-    seed = session.request["seed"]
-    recipe, frames = load_recipe(session.recipe), session.frames and load_frames(session.frames)
+    recipe, frames = asked.recipe or load_recipe(), asked.frames and load_frames(asked.frames)
     check_output(folder)
     if frames is None:
-        devices.check_exposure(Exposure(None, recipe.exposure_fraction))
-    with limited.job() as job:
-        bench = devices.open(scene, limited.variant, job)
+        asked.check(scene, None, Exposure(None, recipe.exposure_fraction))
+    with asked.job() as job:
+        bench = open_as(scene, asked, job)
         from mitsim.calibrate.model import calibrate_model
 
-        factors = calibrate_model(bench, modelling, frames, recipe, seed, folder, job)
+        factors = calibrate_model(bench, modelling, frames, recipe, asked.seed, folder, job)
     result = factors.manifest.result
     lines = _model_lines(result, folder)
-    return finish_folder(limited, folder, {**result, "output": str(folder)}, lines, factors.warnings)
+    return finish_folder(asked, folder, {**result, "output": str(folder)}, lines, factors.warnings)
 
 
 def _model_lines(result: Mapping[str, Any], output: Path) -> list[str]:
-    """What people read of a fit's ``result``, in the folder ``output``."""
     numbers = [
         f"{name.replace('_', ' ')} {number['value']:.6g} +-{number['standard_error']:.2g} {number['unit']}"
         for name, number in result["parameters"].items()

@@ -1,115 +1,45 @@
-"""Verbs on frames alone, without a scene: `mitsim reconstruct`, `characterise` and `sense`."""
+"""Verbs on folders and files, without a scene: images, a camera's sensor, reports, exchange and learning."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import mitsim
-from mitsim.cli.help_page import DEVICES, QUALITY, WHAT
-from mitsim.cli.options import (
-    Common,
-    ExposureFraction,
-    Pictured,
-    Seed,
-    complete_camera,
-    completing,
-    given_of,
-    is_given,
-    number_of,
-    option,
-    option_name,
-    refuse_unused,
-    verb,
-)
-from mitsim.cli.report_verb import finish_folder, finish_frame
-from mitsim.cli.screen import finish
-from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.spectral_manifests import (
-    CALIBRATION,
-    JOINT,
-    RUN,
-    check_way,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
-)
-from mitsim.reconstruct.request import MARKOV, METHODS, MODEL, TIKHONOV
+from mitsim.bench.request import Irradiance
+from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, show, verb
+from mitsim.cli.screen import finish, finish_folder, finish_frame, page_line, page_of
+from mitsim.core.configuration import CAMERA
+from mitsim.core.errors import MitsimError
+from mitsim.core.options import DEVICES, WHAT, option, shipped_names
+from mitsim.core.spectral_manifests import JOINT, MOSAIC, RUN, SpectralFolder, check_way, is_coloured, open_lines
+from mitsim.core.worker import RESUME, advise
+from mitsim.devices.patterns import pattern_names
+from mitsim.exchange.capture_list import FrameFacts
+from mitsim.exchange.formats import Exported, Pictures
+from mitsim.learn.training_request import METHODS, Schedule, Training
+from mitsim.reconstruct.request import MODEL, ImageRequest
+from mitsim.studies.emva_options import Procedure
 
 if TYPE_CHECKING:
-    from mitsim.report.colour_image import JudgedColours
-    from mitsim.report.quality import Judged
+    from mitsim.report.colour_image import ColourImage
+    from mitsim.report.reconstruct_run import Judged
 
 # ---- images of frames ------------------------------------------------------------------------------------------------
 
 
-def method_names() -> str:
-    """Methods of solving, as the help lists them."""
-    notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
-    return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a file of mitsim train"])
-
-
-@dataclass(frozen=True)
-class Solving:
-    """How an image is solved for."""
-
-    PANEL = QUALITY
-
-    lam: str = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
-    method: str = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", autocompletion=completing(lambda: METHODS))
-    focus: str | None = option(
-        None,
-        "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
-        metavar="auto|MM|map",
-    )
-    depth_range: str | None = option(
-        None,
-        "nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's "
-        "if not given",
-        metavar="A:B",
-    )
-    bounds: str | None = option(
-        None,
-        "least and largest number of the image, by nonnegative and tv; either may be left out; if not given, 0: of "
-        "nonnegative and with --psf",
-        metavar="LOW:HIGH",
-    )
-    iterations: int | None = option(
-        None, "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given", min=1, metavar="N"
-    )
-    margin: int = option(
-        0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
-    )
-
-    def read(self) -> dict[str, Any]:
-        """The options as the solver takes them, with numbers for words; MitsimError for words that are none."""
-        method: Any = self.method
-        if self.method.endswith(MODEL):
-            from mitsim.learn.verbs import load_network
-
-            method = load_network(self.method)
-        return {
-            "lam": number_of("lam", self.lam),
-            "method": method,
-            "focus": None if self.focus is None else number_of("focus", self.focus, ("auto", "map")),
-            "depth_range": None if self.depth_range is None else _two_depths(self.depth_range),
-            "margin": self.margin,
-            "bounds": None if self.bounds is None else _two_bounds(self.bounds),
-            "iterations": self.iterations,
-        }
-
-
-@dataclass(frozen=True)
-class ColouredImage:
-    """How an image in colour is made."""
+class ImageInputs(Overwritten):
+    """What an image is made of."""
 
     PANEL = WHAT
 
+    calibration: Path | None = option(None, "folder of `mitsim calibrate`; needed without --psf", metavar="CAL")
+    psf: Path | None = option(
+        None, "in place of a calibration: picture of the light of a scene point, of the frames' pixels", metavar="FILE"
+    )
+    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
     chart: str | None = option(
         None,
         "of a coloured run: the chart in the image that colours are fitted on, a scene's name or a file",
@@ -123,36 +53,25 @@ class ColouredImage:
     )
 
 
-@dataclass(frozen=True)
-class OfPointSpread(ColouredImage):
-    """Cameras that are known by a point spread function, and those in colour."""
+def _method(name: str) -> Any:
+    """Return a method's name, or the network in a file."""
+    if not name.endswith(MODEL):
+        return name
+    from mitsim.learn.verbs import load_network
 
-    PANEL = WHAT
-
-    psf: Path | None = option(
-        None,
-        "in place of a calibration: picture of the light of a scene point, of the frames' pixels",
-        "--psf",
-        metavar="FILE",
-    )
-    reduce: int = option(1, "with --psf: pixels a side, of frames and picture, that become one", min=1, metavar="K")
+    return load_network(name)
 
 
 @verb
 def reconstruct(
-    *,
     run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="folder of `mitsim calibrate`; needed without --psf", metavar="CAL", rich_help_panel=WHAT),
-    ] = None,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="folder for the image; RUN/reconstruction if not given", metavar="DIR"),
     ] = None,
-    solving: Solving,
-    camera: OfPointSpread,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an earlier image in the folder")] = False,
+    *,
+    asked: Annotated[ImageRequest, show(method={"read": _method})],
+    inputs: Annotated[ImageInputs, show(overwrite={"help": "replace an earlier image in the folder", "panel": ""})],
     common: Pictured,
 ) -> int:
     """Recover the image from frames and a calibration alone.
@@ -164,57 +83,85 @@ def reconstruct(
     $ mitsim reconstruct run --calibration cal --focus auto -o sharp
     """
     from mitsim.core.files import check_output
-    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.reconstruct.request import ImageRequest, check_parallax, holds_image
-
-    options = solving.read()
-    output = output or run / "reconstruction"
-    colours = {"chart": camera.chart, "mosaic": camera.mosaic}
-    if camera.psf is not None:
-        for name, value in {"calibration": calibration, **colours}.items():
-            if value is not None:
-                raise MitsimError(f"--{name} {value}: has no effect with --psf; leave it out")
-        return _reconstruct_psf(run, camera, output, {**options, "overwrite": overwrite}, common)
-    if camera.reduce != 1:
-        raise MitsimError(f"--reduce {camera.reduce}: has no effect without --psf; leave it out")
-    if calibration is None:
-        raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
-    if not is_mosaic(run):
-        ImageRequest(**options)
-    if is_coloured(run):
-        options["overwrite"] = overwrite
-        if is_mosaic(run):
-            options = _mosaic_options(options, camera.mosaic or JOINT)
-        elif camera.mosaic is not None:
-            raise MitsimError(f"--mosaic {camera.mosaic}: {run} has a run for each line; leave out --mosaic")
-        return _reconstruct_colours(run, calibration, output, camera.chart, options, common)
-    for name, value in colours.items():
-        if value is not None:
-            raise MitsimError(f"--{name} {value}: {run} is not coloured; leave out --{name}")
-    # Refused before the solver is imported, which takes half a second.
-    read_manifest(run, RunManifest)
-    manifest = read_manifest(calibration, CalibrationManifest)
-    if solving.focus is not None or solving.margin:
-        check_parallax(manifest.parallax, str(calibration))
-    check_output(output, overwrite=holds_image(output))
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct as reconstruct_folder
+    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+    from mitsim.reconstruct.request import check_parallax, holds_image
+
+    # All of it is refused before the solver is imported, which takes half a second.
+    output, lines, chart = output or run / "reconstruction", open_lines(run, RUN, MOSAIC), None
+    _check_inputs(lines, asked, inputs)
+    for part in lines.parts.values():
+        read_manifest(part, RunManifest)
+    if inputs.calibration is not None:
+        for name, part in lines.check_calibration(inputs.calibration).parts.items():
+            manifest = read_manifest(part, CalibrationManifest)
+            if asked.focus is not None or asked.margin:
+                check_parallax(manifest.parallax, str(inputs.calibration / name))
+    if inputs.chart is not None:
+        from mitsim.devices.chart import load_chart
+
+        chart = load_chart(inputs.chart)
+    # An image of the same inputs may be replaced, and which inputs a folder has is looked into later.
+    check_output(output, overwrite=is_coloured(output) if lines.colours else holds_image(output))
+    from mitsim.report import reconstruct_run
 
     held = memory_from_here()
     with common.job() as job:
-        result = reconstruct_folder(run, calibration, output, **options, overwrite=overwrite, job=job)
-    payload = {**result.summary(), "memory_bytes": memory_since(held)}
-    return _finish_image(result, payload, common)
+        options = {"lam": asked.lam, "way": inputs.mosaic or JOINT} if lines.filters else asked.given
+        where: Any = {"output": output, "overwrite": inputs.overwrite, "job": job, **options}
+        found: Any
+        calibration: Any = inputs.calibration
+        if inputs.psf is not None:
+            found = reconstruct_run.reconstruct_psf(run, inputs.psf, reduce=inputs.reduce, **where)
+        elif lines.colours:
+            found = reconstruct_run.reconstruct_colours(run, calibration, chart=chart, page=False, **where)
+        else:
+            found = reconstruct_run.reconstruct(run, calibration, **where)
+    payload = {**found.summary(), "memory_bytes": memory_since(held)}
+    shown = _colours_lines(found, common) if lines.colours else _image_lines(found, payload, common)
+    return finish_folder(common, output, payload, shown, payload["warnings"])
 
 
-def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> int:
-    """Print a ``result``, whose JSON is the ``payload``; the exit status."""
+def _check_inputs(lines: SpectralFolder, asked: ImageRequest, inputs: ImageInputs) -> None:
+    """Refuse options that have no effect on a run of these ``lines``, and inputs that are missing."""
+    run = lines.folder
+    if inputs.psf is not None:
+        inputs.refuse(["calibration", "chart", "mosaic"], "with --psf")
+        if lines.colours:
+            raise MitsimError(f"--psf {inputs.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
+        asked.check_point_spread(inputs.reduce)
+        if not inputs.psf.is_file():
+            raise MitsimError(f"--psf {inputs.psf}: is no file; give a picture of the light of a scene point")
+        return
+    if inputs.reduce != 1:
+        inputs.refuse(["reduce"], "without --psf")
+    if inputs.calibration is None:
+        raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
+    if not lines.colours:
+        inputs.refuse(["chart", "mosaic"], f"on {run}, which is not coloured")
+    elif not lines.filters:
+        inputs.refuse(["mosaic"], f"on {run}, which has a run for each line")
+    else:
+        from mitsim.reconstruct.request import check_joint
+
+        check_way(inputs.mosaic or JOINT)
+        check_joint(asked.lam)
+        for name, value in asked.without("lam").items():
+            if value != ImageRequest.model_fields[name].default:
+                raise MitsimError(
+                    f"{option_name(name)} {value}: runs behind colour filters are solved by tikhonov at the calibrated "
+                    "depth; leave it out"
+                )
+
+
+def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
+    """Return what the terminal shows of an image, by its ``payload``."""
     image, rank = result.reconstruction, payload["rank"]
     inherits = image.status.verdict.good and not image.ok
     verdict = "Flagged" if inherits else image.status.verdict.value.capitalize()
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
     trust = "; ".join(known.gist for known in (image.uncertainties, image.misfit, image.fit) if known)
-    lines = [
+    return [
         f"{f'Flagged: {image.status.flags[0]}' if inherits else f'{image.status.sentence}.'}"
         if result.quality is None
         else f"{verdict}: {result.quality}",
@@ -229,165 +176,65 @@ def _finish_image(result: Judged, payload: dict[str, Any], common: Pictured) -> 
             *image.trust,
         ),
     ]
-    return finish_folder(common, Path(result.output), payload, lines, payload["warnings"])
 
 
-def _reconstruct_psf(run: Path, point: OfPointSpread, output: Path, options: dict[str, Any], common: Pictured) -> int:
-    """The image of a ``run`` by a point spread function, solved with ``options``."""
-    from mitsim.core.files import check_output
-    from mitsim.core.manifests import RunManifest, read_manifest
-    from mitsim.reconstruct.request import ImageRequest, holds_image
-
-    # Refused before the solver is imported.
-    if is_coloured(run):
-        raise MitsimError(f"--psf {point.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
-    ImageRequest(**{name: value for name, value in options.items() if name != "overwrite"}).check_point_spread(
-        point.reduce
-    )
-    if point.psf is None or not point.psf.is_file():
-        raise MitsimError(f"--psf {point.psf}: is no file; give a picture of the light of a scene point")
-    read_manifest(run, RunManifest)
-    check_output(output, overwrite=holds_image(output))
-    from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct_psf
-
-    held = memory_from_here()
-    with common.job() as job:
-        result = reconstruct_psf(run, point.psf, output, point.reduce, job=job, **options)
-    return _finish_image(result, {**result.summary(), "memory_bytes": memory_since(held)}, common)
-
-
-def _mosaic_options(options: dict[str, Any], way: str) -> dict[str, Any]:
-    """Those ``options`` of `mitsim reconstruct` that images behind colour filters have, and their ``way``.
-
-    MitsimError for a way that there is not, and for options that these images have not.
-    """
-    from mitsim.reconstruct.request import check_joint
-
-    check_way(way)
-    check_joint(options["lam"])
-    for name, neutral in (
-        ("focus", None),
-        ("method", "tikhonov"),
-        ("margin", 0),
-        ("depth_range", None),
-        ("bounds", None),
-        ("iterations", None),
-    ):
-        if options[name] != neutral:
-            raise MitsimError(
-                f"{option_name(name)} {options[name]}: runs behind colour filters are solved by tikhonov at the "
-                "calibrated depth; leave it out"
-            )
-    return {"lam": options["lam"], "overwrite": options["overwrite"], "way": way}
-
-
-def _reconstruct_colours(
-    run: Path, calibration: Path, output: Path, chart: str | None, options: dict[str, Any], common: Pictured
-) -> int:
-    """The image of every line of a coloured run, each solved with ``options``, and one in colour."""
-    from mitsim.core.files import check_output
-    from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-    from mitsim.devices.chart import load_chart
-
-    # Refused before the solver and colour-science are imported.
-    if is_mosaic(run):
-        read_mosaic(run)
-        read_manifest(run, RunManifest)
-    else:
-        for name in read_colours(run, RUN).names:
-            read_manifest(run / name, RunManifest)
-    for name in read_colours(calibration, CALIBRATION).names:
-        read_manifest(calibration / name, CalibrationManifest)
-    place = None if chart is None else load_chart(chart)
-    # What it holds is looked into later: an image of the same inputs may be replaced.
-    check_output(output, overwrite=is_coloured(output))
-    from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.report.quality import reconstruct_colours
-
-    held = memory_from_here()
-    with common.job() as job:
-        found = reconstruct_colours(run, calibration, output, place, job=job, page=False, **options)
-    payload = {**found.summary(), "memory_bytes": memory_since(held)}
-    return finish_folder(common, output, payload, _colours_lines(found, common), found.warnings)
-
-
-# ---- what is said of images, and words of options --------------------------------------------------------------------
-
-
-def _colours_lines(found: JudgedColours, common: Common) -> list[str]:
-    """What is said of an image in colour, as ``common`` options have it."""
+def _colours_lines(found: ColourImage, common: Common) -> list[str]:
+    """Return what the terminal shows of an image in colour."""
     verdict = "Solved" if found.ok else "Flagged"
     quality = f"PSNR {found.psnr_db:.2f} dB over all lines" if found.psnr_db is not None else "an image of every line"
     return [
         f"{verdict}: {quality}",
         f"Image: {found.output}",
         *(f"{name}: {row}" for name, row in found.table.items()),
-        *(f"{text[0].upper()}{text[1:]}" for text in found.colours.sentences),
+        *(f"{text[0].upper()}{text[1:]}" for text in found.sentences),
         *common.details(*found.described),
     ]
 
 
-def _two_bounds(text: str) -> tuple[float, float]:
-    """The two numbers of LOW:HIGH; -inf and inf for ends that are left out."""
-    low, colon, high = text.partition(":")
-    try:
-        if colon:
-            return float(low or -math.inf), float(high or math.inf)
-    except ValueError:
-        pass
-    raise ArgumentError("bounds", f"{text!r}: give the least and the largest number, such as 0:1 or 0:")
+@verb
+def report(
+    folder: Annotated[Path, typer.Argument(help="of capture, calibrate, reconstruct or import", metavar="FOLDER")],
+    common: Common,
+) -> int:
+    """Make the pictures and the page of a folder again.
 
+    From its files alone: a run, a calibration or an image.
 
-def _two_depths(text: str) -> tuple[float, float]:
-    """The two numbers of A:B."""
-    near, colon, far = text.partition(":")
-    try:
-        if colon:
-            return float(near), float(far)
-    except ValueError:
-        pass
-    raise ArgumentError("depth_range", f"{text!r}: give the nearest and the farthest depth [mm], such as 350:450")
+    $ mitsim report run
+    $ mitsim report cal
+    """
+    made = page_of(folder)
+    return finish(common.as_json, {**made, "output": str(folder)}, [page_line(made)], ())
 
 
 # ---- a camera's sensor alone -----------------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True)
-class Procedure:
-    """How a camera is characterised."""
-
-    PANEL = WHAT
-
-    pixels: int = option(256, "rows and columns of the frames")
-    steps: int = option(50, "steps of light, from dark to beyond saturation")
-    frames: str = option(
-        "100",
-        "frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the dark",
-        metavar="N|DIR",
-    )
-    wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]")
-    seed: Seed = 0
+_CAMERA_HELP = "camera electronics: name or TOML file"
+_complete_camera = completing(lambda: shipped_names(CAMERA))
 
 
 @verb
 def characterise(
-    *,
-    context: typer.Context,
     camera: Annotated[
         str | None,
-        typer.Argument(
-            help="camera electronics: name or TOML file",
-            metavar="[CAMERA]",
-            show_default=False,
-            autocompletion=complete_camera,
-        ),
+        typer.Argument(help=_CAMERA_HELP, metavar="[CAMERA]", show_default=False, autocompletion=_complete_camera),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="folder of page, plots, JSON and camera.toml", metavar="DIR")
     ] = Path("characterise-output"),
+    frames: Annotated[
+        str,
+        typer.Option(
+            help="frames of each stack; without CAMERA: folder of a real camera's frames under even light and in the "
+            "dark",
+            metavar="N|DIR",
+            rich_help_panel=WHAT,
+        ),
+    ] = "100",
+    *,
     asked: Procedure,
     common: Common,
+    given: set[str],
 ) -> int:
     """Measure a camera after EMVA 1288, simulated or real.
 
@@ -396,54 +243,23 @@ def characterise(
     $ mitsim characterise imx249 -o figures
     $ mitsim characterise --frames flats -o mine
     """
-    if camera is None and not is_given(context, "frames"):
+    if camera is None and "frames" not in given:
         raise MitsimError("characterise: got no CAMERA; give one to simulate, or --frames DIR of a real one")
-    frames = int(asked.frames) if asked.frames.isdecimal() and camera is not None else Path(asked.frames)
-    procedure = {name: value for name, value in given_of(context, vars(asked)).items() if name != "frames"}
+    stacks = int(frames) if frames.isdecimal() and camera is not None else Path(frames)
     with common.job() as job:
-        done = mitsim.characterise(camera, output, frames, job, **procedure)
+        done = mitsim.characterise(camera, output, stacks, job, **asked.given)
     return finish(common.as_json, done.payload(), done.lines(), done.warnings)
-
-
-@dataclass(frozen=True)
-class Exposed:
-    """A camera and how long it is exposed."""
-
-    PANEL = WHAT
-
-    camera: str = option(
-        ...,
-        "camera electronics: name or TOML file",
-        metavar="NAME|FILE",
-        rich_help_panel=DEVICES,
-        autocompletion=complete_camera,
-    )
-    exposure: str = option("auto", "seconds, or auto", metavar="auto|SECONDS")
-    exposure_fraction: ExposureFraction = 0.8
-    seed: Seed = 0
-
-
-@dataclass(frozen=True)
-class Irradiance:
-    """How an image's numbers are light on the sensor."""
-
-    PANEL = WHAT
-
-    f_number: float | None = option(
-        None, "the image is radiance [W/m^2/sr] before a lens of this f-number", metavar="N"
-    )
-    scale: float = option(1.0, "what its numbers are multiplied by")
-    channel: str | None = option(None, "of several channels, the one to take", metavar="NAME")
-    wavelength: float = option(550.0, "of the light [nm]")
 
 
 @verb
 def sense(
-    context: typer.Context,
     image: Annotated[Path, typer.Argument(help="irradiance [W/m^2], OpenEXR or NPY", metavar="IMAGE.exr")],
     output: Annotated[Path, typer.Option("-o", "--output", help="frame to write", metavar="FRAME.png|exr|npy")],
-    exposed: Exposed,
-    irradiance: Irradiance,
+    camera: Annotated[
+        str,
+        typer.Option(help=_CAMERA_HELP, metavar="NAME|FILE", rich_help_panel=DEVICES, autocompletion=_complete_camera),
+    ],
+    asked: Irradiance,
     common: Pictured,
 ) -> int:
     """Put an image of any renderer behind a camera's sensor.
@@ -454,19 +270,17 @@ def sense(
     $ mitsim sense photo.exr --camera imx249 --f-number 2.8 -o photo.png
     """
     from mitsim.bench.request import check_ending, check_image
-    from mitsim.core.configuration import CAMERA, locate
+    from mitsim.core.configuration import locate
     from mitsim.core.files import check_apart, output_file
     from mitsim.devices.sensor import load_sensor
 
-    words = {**vars(exposed), "exposure": number_of("exposure", exposed.exposure)}
-    if words["exposure"] != "auto":
-        refuse_unused(context, ["exposure_fraction"], "on an --exposure in seconds")
-    sensor = load_sensor(locate(exposed.camera, "calibration", ".toml", CAMERA))
+    asked.refuse_idle()
+    sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     check_ending(output, sensor)
     check_image(image)
     check_apart(output, [image])
     with output_file(output, overwrite=True) as place:
-        frame = mitsim.sense(image, **words, **vars(irradiance))
+        frame = mitsim.sense(image, camera, **asked.given)
         payload = {**frame.summary(), "output": str(frame.save(place))}
     lines = [
         f"{sensor.name}: {payload['shape'][0]}x{payload['shape'][1]} pixels, exposure {frame.exposure_s:.3g} s, "
@@ -474,3 +288,160 @@ def sense(
         *frame.notes,
     ]
     return finish_frame(common, (output, frame.digital, "DN"), payload, lines, frame.warnings)
+
+
+# ---- exchange --------------------------------------------------------------------------------------------------------
+
+
+@verb
+def export(
+    run: Annotated[Path, typer.Argument(help="folder of `mitsim capture`", metavar="RUN")],
+    exported: Exported,
+    common: Common,
+) -> int:
+    """Write a run in a format that other programs read.
+
+    $ mitsim export run --format hdf5 -o run.h5
+    $ mitsim export run --format mat -o run.mat --calibration cal
+    """
+    if exported.format == "png":
+        exported.refuse(["overwrite"], "on a folder of pictures, which takes the place of none")
+    payload = mitsim.export(run, **exported.given)
+    with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
+    lines = [f"{payload['frames']} frames{with_it} as {exported.format}: {payload['output']}", *payload["notes"]]
+    return finish(common.as_json, payload, lines, ())
+
+
+@verb
+def import_(
+    source: Annotated[
+        Path, typer.Argument(help="file of `mitsim export`, or frames: a folder of them, or one file", metavar="SOURCE")
+    ],
+    facts: Annotated[FrameFacts, show(seed={"default": 0}, byte_order={"default": "little"})],
+    pictured: Pictured,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="run folder to make", metavar="RUN")] = None,
+    calibration_output: Annotated[
+        Path | None, typer.Option(help="folder to make of the file's calibration", metavar="CAL")
+    ] = None,
+) -> int:
+    """Make a run of a real camera's frames, or of an exported file.
+
+    $ mitsim import frames -o run --list mine.toml --calibration cal
+    $ mitsim import hand.png -o hand --list diffusercam
+    $ mitsim import run.h5 -o copy
+    """
+    from mitsim.exchange.formats import READERS
+
+    if output is None and calibration_output is None:
+        raise MitsimError("import: nothing to make; give -o RUN, --calibration-output CAL, or both")
+    if source.suffix.lower() in READERS:
+        facts.refuse(facts.without("channel"), f"on {source}, which says itself what its frames are")
+        payload = mitsim.import_file(source, output, calibration_output, facts.channel)
+    elif output is None or calibration_output is not None:
+        raise MitsimError(f"{source}: frames hold no calibration; give -o RUN, and no --calibration-output")
+    else:
+        with pictured.job() as job:
+            payload = mitsim.import_frames(source, output, job, **facts.given)
+    lines = []
+    if payload["output"]:
+        lines.append(f"{payload['frames']} frame{'s' if payload['frames'] != 1 else ''}: {payload['output']}")
+    if payload["calibration_output"]:
+        lines.append(f"calibration: {payload['calibration_output']}")
+    elif "calibration" in payload["holds"]:
+        lines.append("The file holds a calibration too; give --calibration-output to have it")
+    lines += payload.get("notes", ())
+    if payload["left_out"]:
+        lines.append(f"Not known, and left out: {', '.join(payload['left_out'])}")
+    if payload["output"]:
+        return finish_folder(pictured, Path(payload["output"]), payload, lines, payload["warnings"])
+    return finish(pictured.as_json, {**payload, "report": None}, lines, payload["warnings"])
+
+
+@verb
+def patterns(
+    family: Annotated[
+        str, typer.Argument(help=f"{pattern_names()}; or stripes, those of a calibration", metavar="PATTERNS|stripes")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="folder to make", metavar="DIR")],
+    asked: Annotated[Pictures, show(seed={"default": 0}, signed_capture={"default": "pair"})],
+    common: Common,
+) -> int:
+    """Draw patterns as pictures for a real projector.
+
+    Or a calibration's stripes, with the list that its frames need.
+
+    $ mitsim patterns dots:7 -o pictures
+    $ mitsim patterns stripes -o stripes --camera imx249 --exposure 0.02
+    """
+    payload, last = mitsim.pattern_pictures(family, output, **asked.given), asked.closing_frame
+    if payload["session"]:
+        after = (
+            f"Copy {payload['session']} into the folder of their frames; then: mitsim calibrate --frames FRAMES -o CAL"
+        )
+    else:
+        after = (
+            f"Their frames are read by: mitsim import FRAMES --patterns {output / 'patterns.json'} --camera NAME "
+            f"--exposure SECONDS --calibration CAL -o RUN{f' --closing-frame {last}' if last else ''}"
+        )
+    from mitsim.exchange.png_files import describe_cells
+
+    where = payload["projector"]
+    lines = [
+        f"{payload['pictures']} pictures of {where['rows']}x{where['columns']}, {payload['n']}x{payload['n']} cells of "
+        f"{describe_cells(where)}: {output}",
+        after,
+    ]
+    return finish(common.as_json, payload, lines, ())
+
+
+# ---- learning --------------------------------------------------------------------------------------------------------
+
+
+@verb
+def train(
+    method: Annotated[
+        str,
+        typer.Argument(
+            help=f"{', '.join(METHODS[:-1])} or {METHODS[-1]}",
+            metavar="METHOD",
+            autocompletion=completing(lambda: METHODS),
+        ),
+    ],
+    pairs: Annotated[Path, typer.Argument(help="folder of `mitsim pairs`", metavar="PAIRS")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to make", metavar="MODEL.pt")],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder of `mitsim calibrate`",
+            metavar="CAL",
+            show_default="PAIRS/calibration",
+            rich_help_panel=WHAT,
+        ),
+    ] = None,
+    *,
+    schedule: Schedule,
+    resumed: Resumed,
+    limited: Limited,
+) -> int:
+    """Train a network that makes images of frames.
+
+    For reconstruct --method MODEL.pt. Needs torch: mitsim[learn].
+
+    $ mitsim train unrolled pairs -o model.pt
+    $ mitsim reconstruct run --calibration cal --method model.pt
+    """
+    from mitsim.learn.verbs import train as train_model
+
+    if output.suffix != MODEL:
+        raise MitsimError(f"--output {output}: a trained network is a file that ends in {MODEL}; give such a name")
+    Training(method=method, **schedule.given)  # refused before anything is imported for it
+    advise(RESUME)
+    with limited.job() as job:
+        made = train_model(method, pairs, output, calibration, resumed.resume, job, **schedule.given)
+        payload = {**made.summary(), "seconds": job.clock.seconds()}
+    lines = [
+        f"{payload['model']}: {payload['weights']} weights, {made.curve[-1][0]} of {schedule.steps} steps in "
+        f"{payload['seconds']['total']:.0f} s (predicted {made.predicted_seconds:.0f}): {output}",
+        f"PSNR of photographs held out: {made.psnr_before_db:.2f} dB before, {made.psnr_db:.2f} dB after",
+    ]
+    return finish(limited.as_json, payload, lines, ())

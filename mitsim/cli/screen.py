@@ -1,35 +1,190 @@
-"""What the terminal shows: results and warnings in; text, JSON and an exit status out."""
+"""What the terminal shows: pages of help; results, warnings and the pages of their folders, as text or JSON.
+
+Help is plain text, on a terminal or not. Typer's panels of rich take half as long again to show, leave a sentence 22 of
+80 characters, and take `mitsim[learn]` for markup.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from mitsim.cli.commands import Pictured, message_of
 from mitsim.core.errors import MitsimError, printable
+from mitsim.core.files import PICTURES
+from mitsim.core.options import OUTPUT, PANELS
 from mitsim.core.spectral_manifests import RUN, read_colours
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from mitsim.light.plan import Plan, PlanRow
+
+# ---- pages of help ---------------------------------------------------------------------------------------------------
+
+_NARROWEST = 30
+"""Columns that a page has at least: an option and a word beside it."""
+_FIRST_COLUMN = 3 / 8
+"""Part of the width that names of options have at most, so that what is said of them has twelve words of 80 columns and
+five of 40; chosen."""
+
+
+def parts_of(text: str | None) -> tuple[str, str, tuple[str, ...]]:
+    """Split the ``text`` of a docstring into its first line, its other prose, and its commands, the lines after a $."""
+    prose, *examples = re.split(r"\n\s*\$ ", (text or "").rstrip())
+    summary, _, more = prose.partition("\n")
+    return summary, more.strip(), tuple(examples)
+
+
+class _Page:
+    """What the pages of verbs and of the program share."""
+
+    help: str | None
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the page.
+
+        Parameters
+        ----------
+        ctx, formatter
+            of the command line, and what takes the text; click makes it no narrower than 50 columns.
+        """
+        formatter.width = min(formatter.width, max(shutil.get_terminal_size().columns - 2, _NARROWEST))
+        self.format_usage(ctx, formatter)  # type: ignore[attr-defined]
+        summary, more, examples = parts_of(self.help)
+        for text in filter(None, (summary, more)):
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write_text(text)
+        self.format_options(ctx, formatter)  # type: ignore[attr-defined]
+        if examples:
+            with formatter.section(_heading("Examples")):
+                for line in examples:
+                    formatter.write(f"  {line}\n")
+
+
+class Verb(_Page, TyperCommand):
+    """A verb, whose page has a heading for each panel of its options, and examples in the end."""
+
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        """Write the line of what must be given.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        words = [f"{each.opts[0]} {each.metavar}" if _is_option(each) else _name(each) for each in self.params
+                 if each.required or not _is_option(each)]  # fmt: skip
+        formatter.write_usage(ctx.command_path, " ".join([*words, "[OPTIONS]"]))
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write all that may be given, by panels.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        shown = self.get_params(ctx)
+        panels = {"Arguments": [each for each in shown if not _is_option(each)]}
+        for name in PANELS:
+            panels[name] = [each for each in shown if _is_option(each) and (_panel(each) or OUTPUT) == name]
+        _write_panels({name: [(_name(each), _meaning(each)) for each in panel] for name, panel in panels.items()},
+                      formatter)  # fmt: skip
+
+
+class Program(_Page, TyperGroup):
+    """The program, whose page has its verbs by panels, a whole line for each."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write verbs and options.
+
+        Parameters
+        ----------
+        ctx, formatter
+            as :meth:`format_help` takes them.
+        """
+        panels = {
+            str(panel): [(str(verb.name), parts_of(verb.help)[0]) for verb in verbs]
+            for panel, verbs in groupby(self.commands.values(), _panel)
+        }
+        _write_panels(panels, formatter)
+        _write_panels({"Options": [(_name(each), _meaning(each)) for each in self.get_params(ctx)]}, formatter)
+
+
+def _write_panels(panels: Mapping[str, Sequence[tuple[str, str]]], formatter: Any) -> None:
+    """Write rows of names and meanings under their headings, with the same columns for all headings."""
+    most = int(_FIRST_COLUMN * formatter.width)
+    width = max((len(name) for rows in panels.values() for name, _ in rows if len(name) <= most), default=0)
+    for heading, rows in panels.items():
+        if rows:
+            with formatter.section(_heading(heading)):
+                formatter.write_dl([(name.ljust(width), meaning) for name, meaning in rows], col_max=width)
+
+
+def _heading(text: str) -> str:
+    return typer.style(text, bold=True)  # left out where nobody would see it
+
+
+def _is_option(parameter: Any) -> bool:
+    return bool(parameter.param_type_name == "option")
+
+
+def _panel(holder: Any) -> Any:
+    return holder.rich_help_panel if hasattr(holder, "rich_help_panel") else None
+
+
+def _name(parameter: Any) -> str:
+    """Return what a user types for a parameter: its names, the shortest first, and the word for its value."""
+    if not _is_option(parameter):
+        return str(parameter.metavar)
+    names = ", ".join(sorted(parameter.opts, key=len))
+    return names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
+
+
+def _meaning(parameter: Any) -> str:
+    least, most = (getattr(parameter, end, None) for end in ("min", "max"))
+    allowed = f"{least} to {most}" if most is not None else f"at least {least}" if least is not None else ""
+    needed = "required" if parameter.required and _is_option(parameter) else ""
+    return "; ".join(filter(None, [parameter.help, allowed, _default(parameter), needed]))
+
+
+def _default(parameter: Any) -> str:
+    shown = parameter.show_default
+    if isinstance(shown, str):
+        return f"default {shown}"
+    value = parameter.default
+    if not shown or value in (None, "", ()) or isinstance(value, bool):
+        return ""
+    return f"default {value:g}" if isinstance(value, float) else f"default {value}"
+
+
+# ---- results ---------------------------------------------------------------------------------------------------------
 
 _COLUMNS = 80
 """Of the usual terminal, and of what is no terminal."""
 
 
 def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
-    """What people read of a ``plan``: first what it comes to, then what it is made of.
-
-    What is left out is named where its error is within two decades of the accuracy, or not known; ``everything`` tells
-    all rows and their whole reasons. Rows that a screen has no room for are named at its end.
-    """
+    """Return the lines that the terminal shows of a ``plan``: its result, then its effects. An effect that is left out
+    is shown if its error is unknown or within two decades of the accuracy; ``everything`` shows all effects with their
+    whole reasons. Effects without room on the screen are named at its end."""
     most = math.hypot(plan.systematic_bound, plan.sampling_target)
     gist = f"Plan at accuracy {plan.accuracy:g}: {plan.predicted_seconds:.3g} s, error up to {most:.1e}"
     stages = ", ".join(f"{name} {seconds:.3g}" for name, seconds in plan.predicted.items())
@@ -71,7 +226,7 @@ def _row_text(row: PlanRow, words: str) -> str:
 
 
 def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tuple[list[str], list[PlanRow]]:
-    """Lines of the ``rows`` that have ``room`` under a ``heading`` and that of their ``words``, and the other rows."""
+    """Return the lines of the ``rows`` for which there is ``room`` under two headings, and the other rows."""
     indent, lines = " " * len(_HEAD.format("", "", "", "")), [_HEAD.format(heading, "error if off", "seconds", words)]
     for number, row in enumerate(rows):
         text = wrap_text(_row_text(row, row.gist), indent)
@@ -82,8 +237,7 @@ def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tupl
 
 
 def wrap_text(text: str, indent: str = "") -> list[str]:
-    """A ``text`` in lines as wide as the terminal, or of 80 characters, after the first behind an ``indent``; names and
-    paths stay whole."""
+    """Wrap a ``text`` to the width of the terminal. Further lines follow an ``indent``; names and paths stay whole."""
     width = shutil.get_terminal_size((_COLUMNS, _SCREEN_LINES)).columns
     indent = indent or text[: len(text) - len(text.lstrip())] or "  "
     lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
@@ -91,7 +245,7 @@ def wrap_text(text: str, indent: str = "") -> list[str]:
 
 
 def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence[str]) -> int:
-    """Print the result; exit status 1 when there are warnings.
+    """Print a result; return exit status 1 if there are warnings.
 
     Parameters
     ----------
@@ -118,7 +272,7 @@ def finish(as_json: bool, payload: Any, lines: Sequence[str], warnings: Sequence
 
 
 def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
-    """JSON of a coloured run or calibration.
+    """Return the JSON of a coloured run or calibration.
 
     Parameters
     ----------
@@ -141,28 +295,27 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
 
 
 def kernel_lines(kernels: Mapping[str, float]) -> list[str]:
-    """The line that is said of compiled ``kernels``: their number and seconds; none where there are none."""
+    """Return the line on compiled ``kernels``, if there are any."""
     if not kernels["number"]:
         return []
     return [f"{kernels['number']} kernels compiled in {kernels['seconds']:.1f} s of these; Dr.Jit's cache keeps them"]
 
 
 def memory_line(payload: Mapping[str, Any]) -> str:
-    """The line that is said of the memory that a capture or calibration took, by its ``payload``."""
+    """Return the line on the memory that a capture or calibration used."""
     taken = f"Memory {payload['memory_bytes'] / 2**30:.2g} GiB"
     most = payload.get("predicted_memory_bytes")  # of real frames nothing is predicted
     return taken if most is None else f"{taken} of at most {most / 2**30:.2g} predicted"
 
 
 def total_of_lines(payload: Mapping[str, Any]) -> str:
-    """The first line of text of a ``payload`` as of :func:`payload_of_lines`."""
     return f"{len(payload['channels'])} lines in {payload['seconds']['total']:.1f} s: {payload['output']}"
 
 
 @contextmanager
 def write_at_end() -> Iterator[None]:
-    """What is printed in this context is written when it ends. Where nobody reads any more, the program ends as by
-    SIGPIPE, quietly; MitsimError where standard output takes no more for another reason, such as a full disk."""
+    """Write what is printed in this context at its end. If nobody reads standard output any more, end the program
+    quietly as SIGPIPE does; raise MitsimError if it cannot be written for another reason, such as a full disk."""
     try:
         yield
         sys.stdout.flush()
@@ -171,3 +324,86 @@ def write_at_end() -> Iterator[None]:
         if isinstance(error, BrokenPipeError):
             sys.exit(128 + signal.SIGPIPE)
         raise MitsimError(f"standard output: cannot be written ({error.strerror}); give it another place") from None
+
+
+# ---- pages and pictures of results -----------------------------------------------------------------------------------
+
+
+def finish_folder(
+    options: Pictured, folder: Path, payload: dict[str, Any], lines: Sequence[str], warnings: Sequence[str]
+) -> int:
+    """Make the pictures and the page of a finished folder, and print the result; return the exit status.
+
+    Parameters
+    ----------
+    options
+        of the verb.
+    folder
+        of the work, which is not lost where they cannot be made: a warning says so.
+    payload, lines, warnings
+        as for :func:`mitsim.cli.screen.finish`; JSON gains ``report``, null without a page.
+    """
+    again = f"`mitsim report {folder}` makes them later"
+    made, failed = _attempt(options, lambda: page_of(folder), again)
+    said = [] if made is None else [page_line(made)]
+    return finish(options.as_json, {**payload, "report": made}, [*lines, *said], [*warnings, *failed])
+
+
+def finish_frame(
+    options: Pictured,
+    frame: tuple[Path, npt.NDArray[Any], str],
+    payload: dict[str, Any],
+    lines: Sequence[str],
+    warnings: Sequence[str],
+) -> int:
+    """Make a picture next to a file of one frame, and print the result; return the exit status.
+
+    Parameters
+    ----------
+    options
+        of the verb.
+    frame
+        its file, its numbers (rows, columns), or (rows, columns, 3) in colour, and their unit.
+    payload, lines, warnings
+        as for :func:`mitsim.cli.screen.finish`; JSON gains ``picture``, null without one.
+    """
+
+    def make() -> dict[str, Any]:
+        from mitsim.report.pages import write_beside
+
+        started = time.perf_counter()
+        file, words = write_beside(*frame)
+        return {"file": str(file), "shows": words, "seconds": time.perf_counter() - started}
+
+    made, failed = _attempt(options, make, "the frame is kept")
+    said = [] if made is None else [f"picture {made['file']}: {made['shows']}"]
+    return finish(options.as_json, {**payload, "picture": made}, [*lines, *said], [*warnings, *failed])
+
+
+def page_of(folder: Path) -> dict[str, Any]:
+    """Make the page and the pictures of a ``folder``, and return their JSON."""
+    started = time.perf_counter()
+    from mitsim.report.folder_page import report_folder
+
+    page = report_folder(folder)
+    pictures = sorted(map(str, (folder / PICTURES).glob("*.png")))
+    return {"page": str(page), "pictures": pictures, "seconds": time.perf_counter() - started}
+
+
+def page_line(made: dict[str, Any]) -> str:
+    return f"Page: {made['page']} (pictures in {made['seconds']:.1f} s)"
+
+
+def _attempt(
+    options: Pictured, make: Callable[[], dict[str, Any]], kept: str
+) -> tuple[dict[str, Any] | None, tuple[str, ...]]:
+    """Return what ``make`` makes, unless pictures are not wanted. If it fails, return nothing and a warning that states
+    what is ``kept``."""
+    if options.no_pictures:
+        return None, ()
+    try:
+        return make(), ()
+    except MitsimError as error:
+        return None, (f"pictures: {message_of(error)}; {kept}",)
+    except (OSError, MemoryError) as error:
+        return None, (f"pictures: {getattr(error, 'strerror', None) or 'out of memory'}; {kept}",)

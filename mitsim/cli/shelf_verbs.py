@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import inspect
+import itertools
 import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
 
-from mitsim.cli.help_page import WHAT
-from mitsim.cli.options import Common, completing, refuse_unused, verb
+from mitsim.cli.commands import Common, completing, verb
 from mitsim.cli.screen import finish
 from mitsim.core.configuration import (
     CAMERA,
@@ -26,13 +29,12 @@ from mitsim.core.configuration import (
     opening_words,
     read_toml,
     shipped_files,
+    toml_value,
 )
 from mitsim.core.errors import MitsimError, near_name
+from mitsim.core.options import WHAT, refuse_unused
 
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-
-# ---- `mitsim list` ---------------------------------------------------------------------------------------------------
+# ---- What is shipped -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def _masks() -> Iterator[Entry]:
 
 
 def _studies() -> Iterator[Entry]:
-    """Read from the source, for to import all studies takes three seconds."""
+    """Read the studies from their source, because importing all of them takes three seconds."""
     from mitsim.studies import EXPERIMENTS, SHARED, STUDIES
 
     for name in EXPERIMENTS:
@@ -103,7 +105,7 @@ def _effects() -> Iterator[Entry]:
 
 
 def _methods() -> Iterator[Entry]:
-    """Those of the solver, and those that are learned, read from the source, for torch may be missing."""
+    """Iterate over the solver's methods and the learned ones, read from the source because torch may be missing."""
     from mitsim.learn.training_request import METHODS
     from mitsim.reconstruct.solvers import SOLVERS
 
@@ -136,7 +138,6 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
 
 
 def _source(module: str) -> ast.Module:
-    """The text of a ``module``, which is not run."""
     found = importlib.util.find_spec(module)
     assert found is not None and found.origin is not None, module
     return ast.parse(Path(found.origin).read_text(encoding="utf-8"))
@@ -147,7 +148,7 @@ def _first_line(node: ast.Module | ast.ClassDef) -> str:
 
 
 def _clause(text: str) -> str:
-    """What a docstring says before its first colon or full stop, as a part of a sentence."""
+    """Return the start of a docstring, up to its first colon or full stop, as a part of a sentence."""
     first = " ".join(text.split("\n\n")[0].split()).split(": ")[0].split(". ")[0].removesuffix(".")
     return first[0].lower() + first[1:] if first[1:2].islower() or first[1:2] == " " else first
 
@@ -181,7 +182,7 @@ def list_(
 
 
 def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
-    """Names, and what each is and serves for beside them, as wide as the terminal."""
+    """Iterate over the lines of ``entries``: names, and what each is for, wrapped to the terminal."""
     first = max(len(each.name) for each in entries) + indent + 2
     width = max(shutil.get_terminal_size().columns, first + 20)
     for each in entries:
@@ -190,7 +191,7 @@ def _rows(entries: list[Entry], indent: int) -> Iterator[str]:
         yield from textwrap.wrap(name + text, width, subsequent_indent=" " * first, break_on_hyphens=False)
 
 
-# ---- `mitsim new` ----------------------------------------------------------------------------------------------------
+# ---- Files to begin with ---------------------------------------------------------------------------------------------
 
 _NAME = re.compile(r"[A-Za-z][\w-]*")
 _MASKS: dict[str, dict[str, Any]] = {
@@ -240,14 +241,12 @@ class _Starter:
 
 
 def _camera(name: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.sensor import SensorModel, load_sensor
 
     return starter(SensorModel, _begun_as(like, load_sensor(like), name=name))
 
 
 def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.mask_profile import MaskProfile
 
     yield from _camera(name, like)
@@ -256,26 +255,22 @@ def _mask(name: str, like: Path, kind: str = "separable") -> Iterator[str]:
 
 
 def _projector(name: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.projector import ProjectorModel
 
     return starter(ProjectorModel, _begun_as(like, load_model(like, ProjectorModel), name=name))
 
 
 def _session(_: str, like: Path) -> Iterator[str]:
-    """Below the line that says what the shipped one is."""
     yield from like.read_text(encoding="utf-8").splitlines()[1:]
 
 
 def _recipe(_: str, like: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.devices.session import SessionRecipe, load_recipe
 
     return starter(SessionRecipe, _begun_as(like, load_recipe(like)))
 
 
 def _list(_: str, __: Path) -> Iterator[str]:
-    from mitsim.core.field_docs import starter
     from mitsim.exchange.capture_list import CaptureList
 
     return starter(CaptureList, _LIST)
@@ -288,12 +283,12 @@ def _study(name: str, _: Path) -> Iterator[str]:
 
 
 def _begun_as(like: Path, model: BaseModel, **more: str) -> dict[str, Any]:
-    """Fields of a file: those that the file ``like`` sets, of the ``model`` in it, and ``more``."""
+    """Return the fields that the file ``like`` of a ``model`` sets, and ``more``."""
     return {**model.model_dump(exclude_unset=True), **more, "source": f"as the shipped {like.stem}, to be replaced"}
 
 
 def _captures(like: Path) -> bool:
-    """Whether the camera of the file ``like`` says what light makes of electrons."""
+    """Return True if the camera of the file ``like`` states its quantum efficiency."""
     from mitsim.devices.sensor import load_sensor
 
     return load_sensor(like).states_efficiency
@@ -315,7 +310,6 @@ _STARTERS = {
 @verb
 def new(
     *,
-    context: typer.Context,
     kind: Annotated[
         str,
         typer.Argument(help=", ".join(_STARTERS), metavar="KIND", autocompletion=completing(lambda: _STARTERS)),
@@ -340,6 +334,7 @@ def new(
         ),
     ] = None,
     common: Common,
+    given: set[str],
 ) -> int:
     """A file to begin with: commented, whole, valid as it is.
 
@@ -359,7 +354,7 @@ def new(
         raise MitsimError(f"new {kind} {name!r}: give a name of letters, digits, - and _ that begins with a letter")
     begin = _STARTERS[kind]
     if not begin.like:
-        refuse_unused(context, ["like"], f"on a {kind}, of which there is one to begin with")
+        refuse_unused(given, ["like"], f"on a {kind}, of which there is one to begin with")
     ending = ".py" if kind == "study" else "" if begin.lines is None else ".toml"
     output = output or Path(f"{name}{ending}")
     if output.suffix != ending and ending:
@@ -388,3 +383,111 @@ def new(
             write_text(place, text)
     payload = {"kind": kind, "name": name, "output": str(output), "use": use}
     return finish(common.as_json, payload, [f"{kind.capitalize()} {name}: {output}", f"Try: {use}"], ())
+
+
+# ---- what fields of a file are ---------------------------------------------------------------------------------------
+
+_PLAIN = {"string": "text", "boolean": "true or false", "integer": "whole number", "number": "number"}
+_WIDTH = 100
+"""Columns of a comment: chosen, so that a file fits beside its neighbour on a screen."""
+
+
+def meanings(model: type[BaseModel]) -> dict[str, str]:
+    """Return the meaning of each field of a ``model``: the first paragraph of the docstring below the field. Without
+    the source it is empty."""
+    found: dict[str, str] = {}
+    for base in reversed([one for one in model.__mro__ if issubclass(one, BaseModel) and one.model_fields]):
+        try:
+            (written,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        body = getattr(written, "body", [])
+        for field, below in itertools.pairwise(body):
+            text = getattr(getattr(below, "value", None), "value", None)
+            if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(text, str):
+                text = " ".join(text.split("\n\n")[0].split()).removesuffix(".")
+                plain = len(text) > 1 and (text[1].islower() or text[1] == " ")
+                found[ast.unparse(field.target)] = text[0].lower() + text[1:] if plain else text
+    return found
+
+
+def default_text(value: object) -> str:
+    """Return a field's default ``value`` in words."""
+    if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def allowed_text(rules: Mapping[str, Any]) -> str:
+    """Return the values that a field may have, from the ``rules`` of its JSON schema."""
+    if "anyOf" in rules:
+        choices = rules["anyOf"]
+        return ", ".join("null" if choice.get("type") == "null" else allowed_text(choice) for choice in choices)
+    if "const" in rules or "enum" in rules:
+        return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
+    if "$ref" in rules or rules.get("type") == "object":
+        return "object"
+    if "prefixItems" in rules:
+        return f"list of {len(rules['prefixItems'])}: {allowed_text(rules['prefixItems'][0])}"
+    if rules.get("type") == "array":
+        length = f", at most {rules['maxItems']}" if "maxItems" in rules else ""
+        return f"list: {allowed_text(rules['items'])}{length}"
+    if "pattern" in rules:
+        words = re.fullmatch(r"\^\(([\w|]+)\)\$", rules["pattern"])
+        return ", ".join(f"`{word}`" for word in words[1].split("|")) if words else "text without / and \\"
+    least, above = rules.get("minimum"), rules.get("exclusiveMinimum")
+    most, below = rules.get("maximum"), rules.get("exclusiveMaximum")
+    start = f"{least:g}" if least is not None else f"above {above:g}" if above is not None else ""
+    end = f"{most:g}" if most is not None else f"below {below:g}" if below is not None else ""
+    if start and end:
+        return start if start == end else f"{start} to {end}"
+    kind = _PLAIN.get(rules.get("type", ""), "anything")
+    return f"{kind}, at least {start}" if least is not None else f"{kind}, {start}" if start else kind
+
+
+def starter(model: type[BaseModel], values: Mapping[str, Any], table: str = "") -> Iterator[str]:
+    """Iterate over the lines of a file of a ``model``, which explain every field; fields without a value follow a #.
+
+    Parameters
+    ----------
+    model
+        of the file.
+    values
+        fields that are set; they make the file whole.
+    table
+        name of the table that the fields are in; empty: of none.
+    """
+    parts = {name: _model_of(field.annotation) for name, field in model.model_fields.items()}
+    schema, known = model.model_json_schema()["properties"], meanings(model)
+    if table:
+        yield f"{'' if values else '#'}[{table}]"
+    plain = [name for name, part in parts.items() if part is None]
+    given = [name for name in plain if name in values]
+    for name in (*given, *(name for name in plain if name not in values)):
+        if given and name not in values:
+            yield from ("", *_comment("Further fields."))
+            given = []
+        allowed = allowed_text(schema[name]).replace("`", "").removesuffix(", null")
+        default = model.model_fields[name].default
+        lacks = default is PydanticUndefined or default_text(default) in ("none", "infinite")
+        yield from _comment(f"{known[name]}. Allowed: {allowed}.")
+        shown = "..." if lacks else toml_value(default)
+        yield f"{name} = {toml_value(values[name])}" if name in values else f"#{name} = {shown}"
+    for name, part in parts.items():
+        if part is not None:
+            yield from ("", *_comment(f"{known[name]}."))
+            yield from starter(part, values.get(name) or {}, f"{table}.{name}".removeprefix("."))
+
+
+def _comment(text: str) -> list[str]:
+    text = text[0].upper() + text[1:] if text[1].islower() or text[1] == " " else text
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False)
+
+
+def _model_of(kind: Any) -> type[BaseModel] | None:
+    """Return the model of a table, if a field of a ``kind`` is one; None for other fields and for lists of tables."""
+    kinds = [kind, *get_args(kind)]
+    found = (each for each in kinds if isinstance(each, type) and issubclass(each, BaseModel))
+    return next(found, None)

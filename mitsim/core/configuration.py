@@ -1,16 +1,19 @@
 """Configuration files: a TOML path in, a checked pydantic model out; where the shipped ones lie."""
 
+from __future__ import annotations
+
+import math
 import os
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 
-from mitsim.core.errors import MitsimError, near_name
+from mitsim.core.errors import MitsimError, cut, near_name, short_text
 from mitsim.core.files import BYTE_ORDER_MARK, read_json, read_text
-from mitsim.core.mistakes import Table, refusal
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -35,14 +38,182 @@ NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=Fa
 class Configuration(pydantic.BaseModel):
     """A frozen model of finite numbers, of the very types that it states, without further fields."""
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+
+# ---- Mistakes in files -----------------------------------------------------------------------------------------------
+
+_MOST_MISTAKES = 20
+"""Mistakes that are listed: a screen of them."""
+Place = tuple[str | int, ...]
+"""Names, and numbers of list items, that lead to a part of nested data."""
+Mistake = tuple[int, str]
+"""Line of a mistake, 0 if it is not known, and its message."""
+
+
+class Table(dict[str, Any]):
+    """Names and values that a person wrote into a file, all of whose mistakes are reported together.
+
+    Parameters
+    ----------
+    values
+        Names and values.
+    text
+        Text of the TOML file; empty where lines are not known.
+    place
+        Names of the tables that this one is in.
+    """
+
+    def __init__(self, values: Mapping[str, Any], text: str = "", place: Place = ()) -> None:
+        super().__init__(values)
+        self.text, self.place = text, place
+
+    def part(self, name: str) -> Table:
+        """Return the table ``name`` in this one."""
+        return Table(self[name], self.text, (*self.place, name))
+
+    def line(self, place: Place) -> int:
+        """Return the line on which the name or table at a ``place`` begins, or that which holds it; 0 if none does.
+
+        Lines are read one by one, so that a name inside a text of several lines counts.
+        """
+        wanted, table, counts, best = (*self.place, *place), Place(), dict[Place, int](), (0, 0)
+        for number, line in enumerate(self.text.split("\n"), 1):
+            if not (found := _NAMED.match(line)):
+                continue
+            parts = [part.strip(" \"'") for part in (found[2] or found[3]).split(".")]
+            here: Place = () if found[1] else table
+            for part in parts:
+                here = (*here, part)
+                if found[1] == "[[" and part is parts[-1]:
+                    counts[here] = counts.get(here, -1) + 1
+                if found[1] and here in counts:
+                    here = (*here, counts[here])
+            table = here if found[1] else table
+            if here == wanted[: len(here)] and len(here) > best[0]:
+                best = len(here), number
+        return best[1]
+
+
+_NAMED = re.compile(r"\s*(?:(\[\[?)([^\]]+)\]|([\w\"' .-]+?)\s*=)")
+"""Line that begins a table, or sets a name."""
+
+
+def mistakes(model: type[pydantic.BaseModel], data: Table) -> list[Mistake]:
+    """Return what is wrong with ``data`` that is to be a ``model``; an empty list if nothing is."""
+    try:
+        model.model_validate(data)
+    except pydantic.ValidationError as error:
+        return _mistakes_in(model, error, data)
+    return []
+
+
+def refusal(
+    model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str, data: object = None
+) -> MitsimError:
+    """Return pydantic's ``error`` on the ``data`` of a ``model`` as a message that begins with ``where``.
+
+    Of a :class:`Table` it lists all mistakes; of other data, which programs write, the first.
+    """
+    found = _mistakes_in(model, error, data)
+    if isinstance(data, Table):
+        return refuse_together(where, found)
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return MitsimError(f"{where}: {found[0][1]}{more}")
+
+
+def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
+    """Return a refusal, which begins with ``where``, for all mistakes that were ``found``."""
+    if len(found) == 1:
+        ((line, text),) = found
+        return MitsimError(f"{where}:{line}: {text}" if line else f"{where}: {text}")
+    ordered = sorted(found, key=lambda one: one[0] or math.inf)
+    listed = [f"line {line}: {text}" if line else text for line, text in ordered]
+    more = [f"and {len(listed) - _MOST_MISTAKES} more"] if len(listed) > _MOST_MISTAKES else []
+    return MitsimError(f"{where}: has {len(found)} mistakes:", *listed[:_MOST_MISTAKES], *more)
+
+
+def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationError, data: object) -> list[Mistake]:
+    """Return pydantic's errors as mistakes, misspelt names first and one for each place."""
+    above = data.place if isinstance(data, Table) else ()
+    found, meant = dict[Place, Mistake](), set[Place]()
+    errors = error.errors(include_url=False)
+    for one in sorted(errors, key=lambda one: one["type"] != "extra_forbidden"):
+        place, kind = one["loc"], one["type"]
+        if kind == "too_short" and any(
+            len(each["loc"]) > len(place) and each["loc"][: len(place)] == place for each in errors
+        ):  # wrong items are missing from a list's length
+            continue
+        holder: Any = data
+        for end, part in enumerate(place if kind not in ("missing", "extra_forbidden") else ()):
+            try:
+                holder = holder[part]
+            except (KeyError, IndexError, TypeError):  # the name of a union's alternative
+                place = place[:end] or place
+                break
+        field = ".".join(cut(str(part)) for part in (*above, *place))
+        line = data.line(place) if isinstance(data, Table) else 0
+        text = _complaint(model, one, field)
+        if kind == "extra_forbidden" and "did you mean " in text:
+            meant.add((*place[:-1], text.rpartition("did you mean ")[2].removesuffix("?")))
+        elif place in meant:  # a misspelt name is both unknown and missing
+            continue
+        found.setdefault(place, (line, text))
+    return [*found.values()]
+
+
+def _complaint(model: type[pydantic.BaseModel], one: Any, field: str) -> str:
+    """Return what is wrong with a ``field``: its value and the rule of pydantic."""
+    value = short_text(one["input"], 100)
+    if one["type"] == "value_error":  # a validator of ours, whose message has the value
+        return f"{field}: {one['ctx']['error']}" if field else str(one["ctx"]["error"])
+    if one["type"] == "missing":
+        return f"{field}: is missing"
+    if one["type"] == "extra_forbidden":
+        known = [*getattr(_model_at(model, one["loc"][:-1]), "model_fields", ())]
+        near = near_name(str(one["loc"][-1]), known)
+        hint = near.strip() or (f"known fields: {', '.join(known)}" if known else "remove it")
+        return f"{field}: got {value}, no such field; {hint}"
+    return f"{field or 'contents'}: got {value}; {rule_of(one['msg'])}"
+
+
+_PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
+"""Kinds of values as pydantic calls them, and in plain words."""
+
+
+def rule_of(message: str) -> str:
+    """Return a rule of pydantic as a request."""
+    rule = message.removeprefix("Value error, ")
+    if "pattern '^[^/" in rule:
+        return "give a name without folders"
+    if not rule.startswith("Input should be "):
+        return rule[0].lower() + rule[1:]
+    rule = re.split(", (?:got|unable)", rule.removeprefix("Input should be "))[0]
+    if rule.startswith(("greater", "less")):
+        return f"give a number {rule}"
+    return f"give {_PLAINER.get(rule, rule.replace(' valid ', ' '))}"
+
+
+def _model_at(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.BaseModel] | None:
+    """Return the model of the part at a ``place`` in a ``model``; None for another kind of part."""
+    for name in place:
+        if isinstance(name, str) and name in model.model_fields:
+            kinds = [model.model_fields[name].annotation]
+            for kind in kinds:  # grows, because a part may be in a tuple, or optional
+                kinds += get_args(kind)
+            models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)]
+            if not models:
+                return None
+            model = models[0]
+    return model
+
+
+# ---- Reading files ---------------------------------------------------------------------------------------------------
 
 
 def shipped_path(*parts: str) -> Path:
-    """A file or folder that comes with mitsim, for example ``shipped_path("calibration", "imx249.toml")`` of ``parts``.
-
-    A wheel carries them inside the package, a source tree beside it. MitsimError when it is in neither.
-    """
+    """Return the path of a file or folder that comes with mitsim, for example ``shipped_path("calibration",
+    "imx249.toml")``. A wheel carries them inside the package, a source tree beside it."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "_shipped"
     path = (inside if inside.is_dir() else package.parent).joinpath(*parts)
@@ -52,7 +223,7 @@ def shipped_path(*parts: str) -> Path:
 
 
 def read_toml(path: Path | str) -> Table:
-    """The table in the TOML file ``path`` of at most 64 KiB. MitsimError when it cannot be read or is not TOML."""
+    """Return the table in the TOML file ``path`` of at most 64 KiB."""
     try:
         text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
         # The parser's time grows with the square of the parts of a dotted name.
@@ -66,8 +237,7 @@ def read_toml(path: Path | str) -> Table:
 
 
 def read_table(path: Path, what: str) -> Table:
-    """The table in the TOML or JSON file ``path`` of a person's; MitsimError, which calls it ``what``, for a file that
-    cannot be read or holds something else."""
+    """Return the table in a person's TOML or JSON file ``path``, which messages call ``what``."""
     if path.suffix.lower() != ".json":
         return read_toml(path)
     data = read_json(path)
@@ -77,12 +247,12 @@ def read_table(path: Path, what: str) -> Table:
 
 
 def load_model(path: Path | str, model: type[Model]) -> Model:
-    """The TOML file ``path`` as a ``model``. MitsimError naming field, value and rule when it breaks one."""
+    """Return the TOML file ``path`` as a ``model``; MitsimError if it breaks a rule."""
     return validate(model, read_toml(path), f"file {path}")
 
 
 def validate(model: type[Model], data: dict[str, Any], where: str, context: object = None) -> Model:
-    """A dictionary as a checked model.
+    """Return a dictionary as a checked model.
 
     Parameters
     ----------
@@ -113,7 +283,7 @@ known of frames."""
 
 
 def locate(name: Path | str, shelf: Literal["scenes", "calibration", "sessions"], ending: str, field: str = "") -> Path:
-    """The path of a file: that of a shipped one by its bare name, else ``name`` itself.
+    """Return the path of a file: of a shipped one by its bare name, else ``name`` itself.
 
     Parameters
     ----------
@@ -169,8 +339,8 @@ _OPENING = re.compile(r"\s*(?:<\?xml[^>]*\?>)?\s*(?:<scene[^>]*>)?\s*<!--(.*?)--
 
 
 def opening_words(path: Path) -> tuple[str, str]:
-    """What the comment that opens the scene or TOML file ``path`` says: its first sentence, and what follows "Serves:"
-    in it; empty where it does not."""
+    """Return the first sentence of the comment that opens the scene or TOML file ``path``, and what follows "Serves:"
+    in that comment."""
     opening = _OPENING.match(path.read_text(encoding="utf-8"))
     if opening is None:
         return "", ""
@@ -179,3 +349,12 @@ def opening_words(path: Path) -> tuple[str, str]:
     sentences = re.split(r"(?<=\.) (?=[A-Z])", text)
     serves = next((each for each in sentences if each.startswith(_SERVES)), "")
     return sentences[0], serves.removeprefix(_SERVES).removesuffix(".")
+
+
+def toml_value(value: object) -> str:
+    """Return text, a number, a truth, a list or a table as a TOML file has the ``value``, on one line."""
+    import tomli_w
+
+    # In a list with a number a table is inline. Line ends are those of lists, because texts have theirs escaped.
+    text = tomli_w.dumps({"": [value, 0]}).partition("\n")[2].rpartition(",\n    0,")[0].strip()
+    return re.sub(r",\n\s*", ", ", re.sub(r"(?<=\[)\n\s*|,\n\s*(?=\])", "", text))

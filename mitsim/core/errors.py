@@ -8,10 +8,10 @@ import difflib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import fields
+import reprlib
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 _LONGEST = 1500
 """Characters of a message: a screen of 80 x 20."""
@@ -32,12 +32,14 @@ class MitsimError(Exception):
 class ArgumentError(MitsimError):
     """A value that one argument cannot have; ``argument`` names it.
 
-    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option.
+    The ``message`` begins with the argument, as Python spells it; the command line writes it as its option. Where
+    several arguments of a call are wrong, ``others`` has the refusals of the further ones.
     """
 
     def __init__(self, argument: str, message: str) -> None:
         super().__init__(f"{argument} {message}")
         self.argument, self._message = argument, message
+        self.others: tuple[ArgumentError, ...] = ()
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, str]]:
         """As a process that works for a study hands it back."""
@@ -67,28 +69,6 @@ def near_name(text: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
-def options_of(made: type, values: Mapping[str, Any], function: str) -> Mapping[str, Any]:
-    """The ``values``, which are fields of a dataclass.
-
-    Parameters
-    ----------
-    made, values
-        the dataclass, and what it is to be made of.
-    function
-        that takes them, for the message.
-
-    Raises
-    ------
-    ArgumentError
-        for a name that is none of them, with those that are.
-    """
-    known = [each.name for each in fields(made)]
-    for name in values:
-        if name not in known:
-            raise ArgumentError(name, f"is no option of {function}; {near_name(name, known)}use {', '.join(known)}")
-    return values
-
-
 # -------- Arguments of public functions
 # Annotations are read as they are written, so that no type of another room is imported for it: a class is known by its
 # name. What a value may be within its kind, such as a range, each function checks itself.
@@ -97,8 +77,11 @@ P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
 _ANY = "object", "Any"
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 100
 _LONGEST_PATH, _LONGEST_NAME = 4095, 255
 """Bytes of a path, and of a name in it, that Linux takes."""
+_SEVERAL = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 Kind = tuple[str, Callable[[object], bool]]
 """What an annotation allows, in words and as a test."""
 _KINDS: dict[str, Kind] = {
@@ -118,45 +101,39 @@ _KINDS: dict[str, Kind] = {
 
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """A public ``function`` that refuses arguments of another kind than it is annotated with: ArgumentError, a line
-    with the argument, the value and what is allowed. Numbers of NumPy come to it as Python's."""
-    signature = inspect.signature(function)
-    annotated = {name: each.annotation for name, each in signature.parameters.items()}
-    kinds = {name: _kinds(text, function) if isinstance(text, str) else [] for name, text in annotated.items()}
+    """Make a public ``function`` refuse arguments of another kind than it is annotated with, by ArgumentError.
 
-    rest = next((kinds[name] for name, each in signature.parameters.items() if each.kind == each.VAR_KEYWORD), [])
+    Numbers of NumPy are passed on as Python's. Further keywords are checked by what the function makes of them.
+    """
+    signature = inspect.signature(function)
+    several = {name for name, each in signature.parameters.items() if each.kind in _SEVERAL}
+    kinds = {
+        name: _kinds(each.annotation, function)
+        if isinstance(each.annotation, str) and each.kind != inspect.Parameter.VAR_KEYWORD
+        else []
+        for name, each in signature.parameters.items()
+    }
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
-        for name, value in _each(signature, signature.bind(*arguments, **named).arguments):
-            allowed = kinds.get(name, rest)
-            if allowed and not any(allows(value) for _, allows in allowed):
-                words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                raise ArgumentError(name, f"{short_text(value)}: give {words}")
-        plain = {name: _plain(value) for name, value in named.items()}
-        return function(*map(_plain, arguments), **plain)  # type: ignore[arg-type]
+        for name, bound in signature.bind(*arguments, **named).arguments.items():
+            allowed = kinds[name]
+            for value in bound if name in several else (bound,):
+                if allowed and not any(allows(value) for _, allows in allowed):
+                    words = " or ".join(dict.fromkeys(words for words, _ in allowed))
+                    raise ArgumentError(name, f"{short_text(value)}: give {words}")
+        plain = {name: plain_number(value) for name, value in named.items()}
+        return function(*map(plain_number, arguments), **plain)  # type: ignore[arg-type]
 
     return call
 
 
-def _plain(value: object) -> object:
-    """A number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
+def plain_number(value: object) -> object:
+    """Return a number of NumPy, which is not imported, as Python's; else the ``value`` itself."""
     if type(value).__module__ != "numpy" or getattr(value, "shape", None) != ():
         return value
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     return value.item() if kind in tuple("biuf") else value  # type: ignore[attr-defined]
-
-
-def _each(signature: inspect.Signature, bound: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    """Name and value of every argument that is ``bound`` to a ``signature``, further ones one by one."""
-    for name, value in bound.items():
-        kind = signature.parameters[name].kind
-        if kind == inspect.Parameter.VAR_KEYWORD:
-            yield from value.items()
-        elif kind == inspect.Parameter.VAR_POSITIONAL:
-            yield from ((name, each) for each in value)
-        else:
-            yield name, value
 
 
 def checked_fields(made: C) -> C:
@@ -219,11 +196,11 @@ def is_masked(value: object) -> bool:
     return "MaskedArray" in (each.__name__ for each in type(value).__mro__)
 
 
-def short_text(value: object) -> str:
-    """Return a refused ``value`` on a short line; of a number of thousands of digits its kind."""
+def short_text(value: object, length: int = 60) -> str:
+    """Return a refused ``value`` on a short line; only its kind if it cannot be written."""
     try:
-        return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else repr(value))
-    except (TypeError, ValueError):
+        return cut(str(os.fspath(value)) if isinstance(value, os.PathLike) else _SHORT.repr(value), length)
+    except (TypeError, ValueError, RecursionError):
         return f"a {type(value).__name__}"
 
 

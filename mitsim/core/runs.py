@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from mitsim.core.files import output_folder
 from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import MANIFEST, ClosingKind, Digital, RunManifest, read_manifest
 from mitsim.core.recorders import TRUTH, Recorder, claim_run, frame_name
-from mitsim.core.spectral_manifests import MosaicManifest, read_mosaic, write_colours
+from mitsim.core.spectral_manifests import MOSAIC, MosaicManifest, read_colours, write_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -311,7 +311,7 @@ class Capture:
         MitsimError
             for a shot that there is not, and a quantity that is not known of a real camera.
         """
-        return from_above("report.result_plots", "draw_shot")(self, shot, quantity, ax)
+        return from_above("report.plots", "draw_shot")(self, shot, quantity, ax)
 
     def to_xarray(self) -> Dataset:
         """Frames, and where known expected electrons and truth, as an ``xarray.Dataset`` with units and coordinates;
@@ -606,7 +606,7 @@ class MosaicCapture:
 def load_mosaic(folder: Path | str) -> MosaicCapture:
     """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)
-    manifest = read_mosaic(folder)
+    manifest = cast("MosaicManifest", read_colours(folder, MOSAIC))
     files = {name: folder / name / TRUTH for name in manifest.names}
     truths = {name: _truth(path) for name, path in files.items() if path.is_file()}
     return MosaicCapture(load_run(folder), manifest, truths if len(truths) == len(files) else {})

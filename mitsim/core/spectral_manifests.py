@@ -1,15 +1,16 @@
-"""Coloured folders: which spectral lines a run, calibration or image has; each line lies in a folder of its own.
+"""Coloured folders: runs, calibrations and images that separate the spectral lines of a projector's light.
 
-`colour.json` names the lines; `FOLDER/638nm/` is an ordinary RUN, CAL or image folder of that line alone. Of a camera
-under a mosaic of colour filters, whose frames show all lines at once, a run is one RUN folder for all, and the lines'
-folders hold what a perfect image of each would show.
+`colour.json` names the lines, and `FOLDER/638nm/` is an ordinary RUN, CAL or image folder of that line. Behind a mosaic
+of colour filters every frame shows all lines, so that a run is one RUN folder, and the lines' folders hold what a
+perfect image of each line would show.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -26,19 +27,18 @@ _COMMANDS = {
     IMAGE: "reconstruct",
     MOSAIC: "capture --colour mosaic",
 }
-"""What makes a folder of each kind."""
+"""Commands that make a folder of each kind."""
 MONO, LINES, BANDS = "mono", "lines", "bands"
-"""Ways to simulate a projector's light: not told apart by wavelength, each line, or ``bands:K`` of lines."""
+"""Ways to simulate a projector's light: wavelengths not separated, each line, or ``bands:K`` of lines."""
 MOST_LINES = 4
-"""Lines that light is traced at together: wavelengths that a path carries in Mitsuba's spectral variants."""
+"""Lines at which light is traced together: wavelengths that a path carries in Mitsuba's spectral variants."""
 JOINT, HALF, DEMOSAIC = WAYS = ("joint", "half", "demosaic")
-"""Ways to images of lines from frames behind colour filters, that of most PSNR first
-(:mod:`mitsim.report.mosaic_images`)."""
+"""Ways from frames behind colour filters to images of lines (:mod:`mitsim.report.reconstruct_run`), the best first."""
 Weight = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 def bands_of(name: str) -> int:
-    """K of ``bands:K``, 1 to :data:`MOST_LINES`; ArgumentError for another ``name``."""
+    """Return K of ``bands:K``, 1 to :data:`MOST_LINES`; ArgumentError for another ``name``."""
     word, _, count = name.partition(":")
     if word != BANDS or count not in map(str, range(1, MOST_LINES + 1)):
         raise ArgumentError("colour", f"{name!r}: give {BANDS}:1 to {BANDS}:{MOST_LINES}")
@@ -46,12 +46,12 @@ def bands_of(name: str) -> int:
 
 
 def spectral_of(variant: str) -> str:
-    """The variant that knows wavelengths, of the same backend as ``variant``."""
+    """Return the spectral variant of the same backend as ``variant``."""
     return f"{variant.rpartition('_')[0]}_spectral"
 
 
 def check_undecided(variant: str) -> None:
-    """ArgumentError for a ``variant`` that colours cannot be weighed from."""
+    """Raise ArgumentError for a spectral ``variant``, with which colours cannot be compared with mono light."""
     if variant.endswith("_spectral"):
         raise ArgumentError("variant", f"{variant}: open the bench with a mono variant; colours are looked at too")
 
@@ -62,9 +62,9 @@ class Line(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
     name: Annotated[str, Field(pattern=r"^[\w.+-]+$", max_length=255)]
-    """Of the line, and of its folder."""
+    """Name of the line and of its folder."""
     wavelength_nm: float = Field(ge=1, le=1e6, allow_inf_nan=False)
-    """Of the line's light [nm]."""
+    """Wavelength of the line."""
     radiant_share: float | None = Field(default=None, ge=0, le=1, allow_inf_nan=False)
     """Part of the projector's power; none: not known."""
 
@@ -77,7 +77,7 @@ class Line(BaseModel):
 
 
 class ColourManifest(BaseModel):
-    """What colour.json says: the kind of folder, and its lines."""
+    """Content of colour.json: the kind of folder, and its lines."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
@@ -97,17 +97,17 @@ class ColourManifest(BaseModel):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the lines."""
+        """Names of the lines."""
         return tuple(line.name for line in self.channels)
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
-        """Of the lines [nm]."""
+        """Wavelengths of the lines."""
         return tuple(line.wavelength_nm for line in self.channels)
 
 
 class MosaicManifest(ColourManifest):
-    """What colour.json says of a run behind colour filters, beside its lines."""
+    """Content of the colour.json of a run behind colour filters."""
 
     mosaic: Literal["RGGB", "BGGR", "GRBG", "GBRG"]
     """Filters of 2 x 2 pixels, row by row from the frame's first pixel."""
@@ -127,60 +127,82 @@ class MosaicManifest(ColourManifest):
 
 
 def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...]) -> ColourManifest:
-    """All planes of a mosaic as lines of a coloured folder.
-
-    Parameters
-    ----------
-    kind
-        of the folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
-    wavelengths_nm
-        of red, green and blue [nm].
-    """
+    """Return the planes of a mosaic as lines of a folder of a ``kind``, with wavelengths of red, green and blue."""
     lengths = dict(zip("rgb", wavelengths_nm, strict=True))
     lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
     return validate(ColourManifest, {"kind": kind, "channels": lines}, "planes")
 
 
 def is_coloured(folder: Path | str) -> bool:
-    """Whether ``folder`` has a colour.json."""
+    """Return True if ``folder`` has a colour.json."""
     return (Path(folder) / COLOUR).is_file()
 
 
-def is_mosaic(folder: Path | str) -> bool:
-    """Whether ``folder`` has the colour.json of a run behind colour filters. MitsimError when it is no JSON."""
-    return is_coloured(folder) and _kind(read_json(Path(folder) / COLOUR)) == MOSAIC
+@dataclass(frozen=True)
+class SpectralFolder:
+    """A run, calibration or image, and its spectral lines.
+
+    Attributes
+    ----------
+    folder
+        The folder.
+    colours
+        Content of its colour.json; None where the folder does not separate wavelengths.
+    """
+
+    folder: Path
+    colours: ColourManifest | None
+
+    @property
+    def filters(self) -> MosaicManifest | None:
+        """The colour filters that the frames were seen through."""
+        return self.colours if isinstance(self.colours, MosaicManifest) else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the lines; one empty name where wavelengths are not separated."""
+        return self.colours.names if self.colours else ("",)
+
+    @property
+    def parts(self) -> dict[str, Path]:
+        """Folders of frames or factors by line; behind filters, and without lines, the folder itself by ""."""
+        return {"": self.folder} if self.filters else {name: self.folder / name for name in self.names}
+
+    def check_calibration(self, calibration: Path) -> SpectralFolder:
+        """Return the ``calibration`` of this run; MitsimError where it has other lines than the run."""
+        if self.colours is not None:
+            check_lines(self.colours, str(self.folder), calibration)
+        elif is_coloured(calibration):
+            raise ArgumentError(
+                "calibration", f"{calibration}: is coloured, but {self.folder} is not; give a line's folder"
+            )
+        return open_lines(calibration, CALIBRATION)
+
+
+def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
+    """Return a folder of one of the ``kinds`` (:data:`KINDS`) with its spectral lines, if it separates wavelengths.
+
+    MitsimError for a colour.json of another kind, or one that breaks a rule.
+    """
+    if not is_coloured(folder):
+        return SpectralFolder(Path(folder), None)
+    data = read_json(Path(folder) / COLOUR)
+    kind = _kind(data)
+    return SpectralFolder(Path(folder), checked_colours(data, kind if kind in kinds else kinds[0], Path(folder)))
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:
-    """The lines of a coloured ``folder`` of a ``kind``, one of :data:`KINDS`.
+    """Return the lines of a coloured ``folder`` of a ``kind``, one of :data:`KINDS`.
 
-    MitsimError when it has no colour.json, or one of another kind or that breaks a rule.
+    MitsimError for a folder without colour.json, of another kind, or whose colour.json breaks a rule.
     """
     if not is_coloured(folder):
         raise MitsimError(f"{folder}: holds no {COLOUR}; give a coloured folder, of `mitsim {_COMMANDS[kind]}`")
     return checked_colours(read_json(Path(folder) / COLOUR), kind, Path(folder))
 
 
-def read_mosaic(folder: Path | str) -> MosaicManifest:
-    """What colour.json says of a run behind colour filters in ``folder``. MitsimError as :func:`read_colours`."""
-    return cast("MosaicManifest", read_colours(folder, MOSAIC))
-
-
 def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
-    """Whether a calibration is of a run's lines.
-
-    Parameters
-    ----------
-    lines, run
-        of the run, and what messages call it.
-    calibration
-        coloured folder.
-
-    Raises
-    ------
-    MitsimError
-        where its lines are others, or it is not coloured.
-    """
+    """Raise MitsimError where a ``calibration`` folder does not have the ``lines`` of a ``run``."""
     calibrated = read_colours(calibration, CALIBRATION)
     ours, theirs = (dict(zip(each.names, each.wavelengths_nm, strict=True)) for each in (lines, calibrated))
     if ours != theirs:
@@ -191,46 +213,24 @@ def check_lines(lines: ColourManifest, run: str, calibration: Path) -> None:
 
 
 def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
-    """The lines of a coloured folder, and filters where it is behind some.
-
-    Parameters
-    ----------
-    data
-        as its colour.json holds it.
-    kind
-        of folder that it is to be, one of :data:`KINDS`.
-    place
-        where it was found, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when it is of another kind or breaks a rule.
-    """
+    """Validate the ``data`` of a colour.json, found at a ``place``, which has to be of a ``kind`` of :data:`KINDS`."""
     if _kind(data) != kind:
         raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
     return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
 
 
-def same_lines(run: Path, calibration: Path) -> ColourManifest:
-    """The lines of a coloured ``run``; MitsimError where its ``calibration`` has others, or either is not coloured."""
-    lines = read_colours(run, RUN)
-    check_lines(lines, str(run), calibration)
-    return lines
-
-
 def _kind(data: Any) -> str:
-    """What a colour.json of this ``data`` says that the folder is."""
+    """Return the kind of folder that the ``data`` of a colour.json states."""
     return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
 
 
 def installed_ways() -> tuple[str, ...]:
-    """Those of :data:`WAYS` that are installed: demosaicing is an extra."""
+    """Return the :data:`WAYS` that are installed, because demosaicing is an extra."""
     return WAYS if find_spec("colour_demosaicing") else WAYS[:-1]
 
 
 def check_way(way: str) -> str:
-    """The ``way``, one of :data:`WAYS`; ArgumentError for another, and one that is not installed."""
+    """Return the ``way``, one of :data:`WAYS`; ArgumentError for another, and for one that is not installed."""
     if way not in WAYS:
         raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
     if way not in installed_ways():
@@ -243,15 +243,5 @@ def check_way(way: str) -> str:
 
 
 def write_colours(folder: Path, colours: ColourManifest, **more: Any) -> None:
-    """Write colour.json, all or nothing. MitsimError when it cannot be written.
-
-    Parameters
-    ----------
-    folder
-        that it is of.
-    colours
-        the folder's kind and lines.
-    **more
-        entries beside these.
-    """
+    """Write colour.json, all or nothing, with the folder's kind and lines and ``more`` entries."""
     write_json(folder / COLOUR, {**colours.model_dump(), **more})

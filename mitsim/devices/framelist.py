@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, read_table, validate
+from mitsim.core.configuration import Configuration, Positive, Table, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
 from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
-from mitsim.core.mistakes import Table
 from mitsim.devices.patterns import stripe_count
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
 

@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import Preparation
 from mitsim.core.manifests import RunManifest, read_manifest
-from mitsim.core.spectral_manifests import RUN, ColourManifest, is_coloured, is_mosaic, read_colours
+from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, open_lines
 
 MOST_CAPTURES = 4096
 """Of a list: more than a day of taking them."""
@@ -135,14 +135,12 @@ _PLACING = "mosaic", "orientation", "turn_deg", "turn_about", "crop"
 
 
 def _run_of(folder: Path) -> tuple[ColourManifest | None, dict[str, RunManifest]]:
-    if not is_coloured(folder):
-        return None, {"": read_manifest(folder, RunManifest)}
-    if is_mosaic(folder):
+    lines = open_lines(folder, RUN, MOSAIC)
+    if lines.filters:
         raise MitsimError(
             f"{folder}: is behind colour filters, all in one frame; import its planes, or calibrate --colour mosaic"
         )
-    lines = read_colours(folder, RUN)
-    return lines, {name: read_manifest(folder / name, RunManifest) for name in lines.names}
+    return lines.colours, {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
 
 
 def _check_alike(found: KnownCaptures, capture: KnownCapture, manifests: dict[str, RunManifest]) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Literal
 
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.seeds import stream
 
 if TYPE_CHECKING:
@@ -399,7 +399,7 @@ def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
     family = FAMILIES.get(name)
     form = f"{name}:K" if colon else name
     if family is None or form not in family.forms or bool(colon) != bool(size):
-        raise MitsimError(f"patterns {text!r}: use {pattern_names()}")
+        raise ArgumentError("patterns", f"{text!r}: use {pattern_names()}")
     rows, _, columns = size.partition("x")
     both = [rows, columns] if f"{name}:RxC" in family.forms and rows and columns else [size or "1"]
     periods = [_period(text, period, n) for period in both]

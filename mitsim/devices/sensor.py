@@ -11,10 +11,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mitsim.core.configuration import CAMERA, Configuration, locate, read_toml, shipped_files, validate
+from mitsim.core.configuration import CAMERA, Configuration, Table, locate, read_toml, shipped_files, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.manifests import Digital
-from mitsim.core.mistakes import Table
 
 EXPOSURE_S = 1e-12, 1e6
 """Shortest and longest exposure [s]: gated avalanche diodes open for 1e-10 s; cooled CCDs collect for some 1e4 s."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 from pydantic import Field, model_validator
 
 from mitsim.core.configuration import CAMERA, LIST, Configuration, Positive, locate, read_table, validate
-from mitsim.core.errors import ArgumentError, MitsimError, checked_fields
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
+from mitsim.core.options import QUALITY, FilePath, Options, option, shipped_names
 from mitsim.core.seeds import check_root
 from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
@@ -270,74 +272,64 @@ _OF_BARE = ("shape", "bits", "byte_order")
 """Of files without a header alone."""
 
 
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class FrameFacts:
-    """What is said of a real camera's frames, in the place of what a list says; None: not said.
+class FrameFacts(Options):
+    """What is known of a real camera's frames, in the place of what a list states; None if not known."""
 
-    Attributes
-    ----------
-    list
-        name or file of a list.
-    patterns
-        of the family, or patterns.json of `mitsim export --format png`.
-    camera
-        electronics, name or TOML file.
-    exposure
-        of each frame [s].
-    calibration
-        CAL folder of the same camera.
-    projector_pixels
-        a side, without a calibration.
-    black_level
-        digital number of a pixel without charge.
-    ambient_frame, ambient_shots
-        frame, or folder of frames, with the projector off; shots that a single one is the mean of.
-    closing_frame, closing_exposure
-        ``first`` or ``uniform``: the last frame checks lamp, camera and scene, and shows the first shot again or all
-        pixels lit; its exposure [s], where that differs from the others'.
-    order
-        in which the shots were taken, one of :func:`mitsim.devices.patterns.shot_orders`.
-    shape, bits, byte_order
-        of files without a header: rows and columns, or "ROWSxCOLUMNS"; bits of a number; little or big.
-    channel, mosaic
-        plane of a colour sensor, or all; filters of the first 2 x 2 pixels.
-    divide
-        factor that all numbers have.
-    dark_frame, flat_frame, flat_dark_frame
-        frames, or folders of them, without light; of even light without a mask; and without light of its exposure.
-    orientation, turn, crop
-        Exif's number or "file"; degrees counter-clockwise after that; row, column, rows and columns in the end, or
-        "ROW,COLUMN[,ROWS,COLUMNS]".
-    seed
-        of patterns that are drawn at random.
-    """
+    VERB = "import_frames"
 
-    list: Path | str | None = None
-    patterns: str | None = None
-    camera: Path | str | None = None
-    exposure: float | None = None
-    calibration: Path | str | None = None
-    projector_pixels: int | None = None
-    black_level: float | None = None
-    ambient_frame: Path | str | None = None
-    ambient_shots: int | None = None
-    closing_frame: Literal["first", "uniform"] | None = None
-    closing_exposure: float | None = None
-    order: str | None = None
-    shape: str | tuple[int, int] | None = None
-    bits: int | None = None
-    byte_order: str | None = None
-    channel: str | None = None
-    mosaic: str | None = None
-    divide: int | None = None
-    dark_frame: Path | str | None = None
-    flat_frame: Path | str | None = None
-    flat_dark_frame: Path | str | None = None
-    orientation: int | str | None = None
-    turn: float | None = None
-    crop: str | tuple[int, ...] | None = None
-    seed: int | None = None
+    list: FilePath | None = option(
+        None,
+        "of frames: list of what is known of them; options take its place",
+        metavar="NAME|FILE",
+        complete=partial(shipped_names, LIST),
+    )
+    patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
+    camera: FilePath | None = option(
+        None,
+        "of frames: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        complete=partial(shipped_names, CAMERA),
+    )
+    exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
+    calibration: FilePath | None = option(
+        None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
+    )
+    projector_pixels: int | None = option(
+        None, "of frames: projector pixels a side, without a calibration", metavar="N"
+    )
+    black_level: float | None = option(None, "of frames: number of a pixel without charge; the camera's if not given")
+    ambient_frame: FilePath | None = option(None, "frame, or folder of frames, with the projector off", metavar="PATH")
+    ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
+    closing_frame: Literal["first", "uniform"] | None = option(
+        None,
+        "the last frame checks lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+    )
+    closing_exposure: float | None = option(None, "seconds of that frame; those of all if not given", metavar="SECONDS")
+    order: str | None = option(
+        None, "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
+    )
+    shape: str | tuple[int, int] | None = option(
+        None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS"
+    )
+    bits: int | None = option(None, "of a number in such a file", metavar="N")
+    byte_order: str | None = option(None, "of such a file: little or big", metavar="ORDER")
+    channel: str | None = option(
+        None, "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
+    )
+    mosaic: str | None = option(
+        None, "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
+    )
+    divide: int | None = option(None, "of frames: factor that all numbers have; found if not given", metavar="N")
+    dark_frame: FilePath | None = option(None, "frame, or folder of frames, without any light", metavar="PATH")
+    flat_frame: FilePath | None = option(None, "the same of even light without a mask", metavar="PATH")
+    flat_dark_frame: FilePath | None = option(None, "the same without light, of the flat's exposure", metavar="PATH")
+    orientation: int | str | None = option(None, "of frames: Exif's, or as the file says", metavar="1..8|file")
+    turn: float | None = option(None, "of frames: turned counter-clockwise after that", metavar="DEGREES")
+    crop: str | tuple[int, ...] | None = option(
+        None, "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
+    )
+    seed: int | None = option(None, "root of every random stream", panel=QUALITY)
 
     def of(self, source: Path) -> RealCapture:
         """What is known of the frames at ``source``, checked before any is opened; MitsimError as
@@ -345,7 +337,7 @@ class FrameFacts:
         listed = CaptureList() if self.list is None else load_capture_list(self.list)
         bare = any(path.suffix.lower() in BARE for path in (source, *(source.iterdir() if source.is_dir() else ())))
         if self.shape is None or not bare:
-            self._refuse(_OF_BARE, "on files that have a header, or without a shape")
+            self.refuse(_OF_BARE, "on files that have a header, or without a shape")
         said: dict[str, Any] = {"prepare": self._preparation(listed.prepare)}
         if self.patterns is not None:
             said["patterns"] = self.patterns
@@ -369,15 +361,9 @@ class FrameFacts:
             black_level_dn=self.black_level,
         )
         if not takes_seed(known.patterns):
-            self._refuse(("seed",), "on patterns that are not drawn at random")
+            self.refuse(("seed",), "on patterns that are not drawn at random")
         known.check(source)
         return known
-
-    def _refuse(self, names: tuple[str, ...], where: str) -> None:
-        """ArgumentError for those ``names`` that are said, and have no effect ``where``."""
-        for name in names:
-            if getattr(self, name) is not None:
-                raise ArgumentError(name, f"has no effect {where}; leave it out")
 
     def _preparation(self, listed: Preparation) -> Preparation:
         """What is done to numbers by a list's ``listed``, and what is said here in the place of it."""
@@ -396,6 +382,36 @@ class FrameFacts:
             given["turn_about"] = "centre"
         known = {name: value for name, value in listed if name in listed.model_fields_set}
         return validate(type(listed), {**known, **given}, "import")
+
+
+class FrameKeys(TypedDict, total=False):
+    """Keywords of :class:`FrameFacts`."""
+
+    list: Path | str | None
+    patterns: str | None
+    camera: Path | str | None
+    exposure: float | None
+    calibration: Path | str | None
+    projector_pixels: int | None
+    black_level: float | None
+    ambient_frame: Path | str | None
+    ambient_shots: int | None
+    closing_frame: Literal["first", "uniform"] | None
+    closing_exposure: float | None
+    order: str | None
+    shape: str | tuple[int, int] | None
+    bits: int | None
+    byte_order: str | None
+    channel: str | None
+    mosaic: str | None
+    divide: int | None
+    dark_frame: Path | str | None
+    flat_frame: Path | str | None
+    flat_dark_frame: Path | str | None
+    orientation: int | str | None
+    turn: float | None
+    crop: str | tuple[int, ...] | None
+    seed: int | None
 
 
 def _text_of(parts: str | tuple[int, ...], sign: str) -> str:

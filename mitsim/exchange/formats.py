@@ -8,30 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
+from mitsim.core.configuration import CAMERA, PROJECTOR
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.imagelist import check_channel
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
+from mitsim.core.options import DEVICES, OUTPUT, QUALITY, WHAT, FilePath, Options, option, shipped_names, takes
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import (
-    RUN,
-    check_lines,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
-    same_lines,
-)
+from mitsim.core.spectral_manifests import MOSAIC, RUN, open_lines
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from mitsim.core.job import Job
+    from mitsim.exchange.capture_list import FrameKeys
     from mitsim.exchange.packed import Run
 
 
@@ -59,14 +56,41 @@ def _function(name: str) -> Callable[..., Any]:
     return found
 
 
-@check_arguments
+class Exported(Options):
+    """How a run is written."""
+
+    PANEL = OUTPUT
+    VERB = "export"
+
+    format: str = option(..., "hdf5, mat, torch or png", metavar="FORMAT")
+    output: FilePath = option(..., "file to make; of png, a folder", "-o", "--output", metavar="FILE", kind=Path)
+    calibration: FilePath | None = option(
+        None, "folder of `mitsim calibrate` that goes with it", metavar="CAL", panel=WHAT, kind=Path
+    )
+    overwrite: bool = option(False, "replace the file")
+    projector: str | None = option(
+        None,
+        "projector: name or TOML file",
+        metavar="NAME|FILE",
+        panel=DEVICES,
+        complete=partial(shipped_names, PROJECTOR),
+    )
+
+
+class ExportKeys(TypedDict, total=False):
+    """Keywords of :class:`Exported`, beside the place and the calibration."""
+
+    overwrite: bool
+    projector: str | None
+
+
+@takes(Exported)
 def export(
     run: Path | str,
     format: str,
     output: Path | str,
     calibration: Path | str | None = None,
-    overwrite: bool = False,
-    projector: str | None = None,
+    **options: Unpack[ExportKeys],
 ) -> dict[str, Any]:
     """Write a run in a format that other programs read.
 
@@ -80,10 +104,6 @@ def export(
         file or folder to make.
     calibration
         CAL folder that goes with it.
-    overwrite
-        whether a file may be replaced.
-    projector
-        name or TOML file whose raster pictures are drawn for, of `png` alone; None: the run's own.
 
     Returns
     -------
@@ -97,14 +117,15 @@ def export(
         called as one of another format, a folder that is none, or a calibration of other lines; and for a run that the
         format cannot hold.
     """
-    check_export(run, format, output, calibration, projector)
+    asked = Exported(format=format, output=output, calibration=calibration, **options)
+    check_export(run, format, output, calibration, projector := asked.projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    with nullcontext() if format == PNG else output_file(place, overwrite):
+    with nullcontext() if format == PNG else output_file(place, asked.overwrite):
         from mitsim.exchange.packed import calibration_content, run_content
 
         shots, calibrated = run_content(folder), None if factors is None else calibration_content(factors)
-        options = {"projector": projector} if format == PNG else {"calibration": calibrated}
-        notes = _function(FORMATS[format])(place, shots, **options)
+        more = {"projector": projector} if format == PNG else {"calibration": calibrated}
+        notes = _function(FORMATS[format])(place, shots, **more)
     return {
         "format": format,
         "frames": _frames_of(shots),
@@ -130,17 +151,17 @@ def check_export(
     """
     check_format(format, output, calibration, projector)
     folder, factors, place = Path(run), None if calibration is None else Path(calibration), Path(output)
-    lines = _lines(folder, factors)
-    if is_mosaic(folder) and format == PNG:
+    lines = open_lines(folder, RUN, MOSAIC)
+    calibrated = None if factors is None else lines.check_calibration(factors)
+    if lines.filters and format == PNG:
         able = ", ".join(name for name in FORMATS if name != PNG)
         raise MitsimError(f"{folder}: is behind colour filters, of which {format} knows nothing; use {able}")
-    for line in lines or ("",):  # refused before numpy is imported
-        part = folder if is_mosaic(folder) else folder / line
+    for part in lines.parts.values():  # refused before numpy is imported
         manifest = read_manifest(part, RunManifest)
-        if factors is not None:
-            read_manifest(factors / line, CalibrationManifest)
         if format == PNG:
             _function("png_files.check_pictures")(manifest, projector, str(part))
+    for part in calibrated.parts.values() if calibrated else ():
+        read_manifest(part, CalibrationManifest)
     check_apart(place, [folder, *([factors] if factors else [])])
 
 
@@ -164,20 +185,6 @@ def check_format(
     if ending in READERS and FORMATS[format].partition(".")[0] != (reader := READERS[ending].partition(".")[0]):
         right = next(name for name, writer in FORMATS.items() if writer.startswith(reader))
         raise MitsimError(f"output {output}: {ending} is of {right}, not of {format}; rename it")
-
-
-def _lines(run: Path, calibration: Path | None) -> tuple[str, ...]:
-    """Names of a run's lines, which are its calibration's too; none of a run that tells none apart."""
-    if is_mosaic(run):
-        colours = read_mosaic(run)
-        if calibration is not None:
-            check_lines(colours, str(run), calibration)
-        return colours.names
-    if not is_coloured(run):
-        if calibration is not None and is_coloured(calibration):
-            raise ArgumentError("calibration", f"{calibration}: is coloured, but {run} is not; give a line's folder")
-        return ()
-    return (read_colours(run, RUN) if calibration is None else same_lines(run, calibration)).names
 
 
 @check_arguments
@@ -253,8 +260,10 @@ def _frames_of(run: Run) -> int:
     return sum(len(part.manifest.patterns.captures) for part in run.parts.values())
 
 
-@check_arguments
-def import_frames(source: Path | str, output: Path | str, job: Job | None = None, **known: Any) -> dict[str, Any]:
+@takes(FrameFacts)
+def import_frames(
+    source: Path | str, output: Path | str, job: Job | None = None, **known: Unpack[FrameKeys]
+) -> dict[str, Any]:
     """Make a RUN folder of a real camera's frames, whole or not at all.
 
     Parameters
@@ -265,9 +274,6 @@ def import_frames(source: Path | str, output: Path | str, job: Job | None = None
         RUN folder to make.
     job
         whose command line the manifest keeps; None: Python asks.
-    **known
-        what is known of them: ``list``, a list's name or file, or in its place ``patterns``, ``camera``, ``exposure``,
-        ``calibration`` and others of :class:`mitsim.exchange.capture_list.FrameFacts`.
 
     Returns
     -------
@@ -281,7 +287,7 @@ def import_frames(source: Path | str, output: Path | str, job: Job | None = None
         for values that cannot be or have no effect, frames that are missing, too many, unlike each other or beyond the
         camera's range, or a place that holds something.
     """
-    facts = FrameFacts(**options_of(FrameFacts, known, "import_frames")).of(Path(source))
+    facts = FrameFacts(**known).of(Path(source))
     from mitsim.exchange.real import import_capture
 
     return import_capture(Path(source), Path(output), facts, None if job is None else job.command)
@@ -291,16 +297,52 @@ STRIPES = "stripes"
 """Pictures of a calibration session, in the place of a family of patterns."""
 
 
-@check_arguments
-def pattern_pictures(
-    patterns: str,
-    output: Path | str,
-    projector: Path | str = "mp_cl1",
-    projector_pixels: int = 128,
-    seed: int | None = None,
-    closing_frame: Literal["first", "uniform"] | None = None,
-    **session: Any,
-) -> dict[str, Any]:
+class Pictures(Options):
+    """A projector that patterns are drawn for, its last picture, and what stripes need beside them."""
+
+    PANEL = DEVICES
+    VERB = "pattern_pictures"
+
+    projector: FilePath = option(
+        "mp_cl1",
+        "projector of known rows and columns: name or TOML file",
+        metavar="NAME|FILE",
+        complete=partial(shipped_names, PROJECTOR),
+    )
+    projector_pixels: int = option(128, "projector pixels a side of the patterns", min=1, max=MOST_PIXELS, metavar="N")
+    seed: int | None = option(None, "root of every random stream", panel=QUALITY)
+    closing_frame: Literal["first", "uniform"] | None = option(
+        None,
+        "last picture, to check lamp, camera and scene: the first one again, or a uniform one",
+        metavar="first|uniform",
+        panel=WHAT,
+    )
+    camera: FilePath | None = option(
+        None,
+        "of stripes: camera electronics, name or TOML file",
+        metavar="NAME|FILE",
+        complete=partial(shipped_names, CAMERA),
+    )
+    exposure: float | None = option(None, "of stripes: seconds of each frame", metavar="SECONDS")
+    signed_capture: Literal["pair", "uniform"] | None = option(
+        None, "of stripes: both halves of each, or one and a uniform frame", metavar="pair|uniform"
+    )
+
+
+class PictureKeys(TypedDict, total=False):
+    """Keywords of :class:`Pictures`."""
+
+    projector: Path | str
+    projector_pixels: int
+    seed: int | None
+    closing_frame: Literal["first", "uniform"] | None
+    camera: Path | str | None
+    exposure: float | None
+    signed_capture: Literal["pair", "uniform"] | None
+
+
+@takes(Pictures)
+def pattern_pictures(patterns: str, output: Path | str, **options: Unpack[PictureKeys]) -> dict[str, Any]:
     """Draw patterns, or a calibration's stripes, as pictures to show on a real projector.
 
     Parameters
@@ -309,18 +351,6 @@ def pattern_pictures(
         name of a family, or ``stripes``: those of a calibration.
     output
         folder to make.
-    projector
-        name or TOML file, of known rows and columns.
-    projector_pixels
-        of the patterns, a side.
-    seed
-        of patterns that are drawn at random; None: 0.
-    closing_frame
-        light of a last picture, for a frame that checks lamp, camera and scene: ``first`` shows the first one again,
-        ``uniform`` all pixels lit; None: there is none.
-    **session
-        of stripes: ``camera``, name or TOML file of its electronics; ``exposure`` of each frame [s];
-        ``signed_capture``, ``pair`` or ``uniform``: both halves of each, or one and a uniform frame.
 
     Returns
     -------
@@ -334,43 +364,27 @@ def pattern_pictures(
         for patterns that there are not or that do not fit the projector, values that cannot be or have no effect, and
         a place that holds something.
     """
-    facts, folder = SessionFacts(**options_of(SessionFacts, session, "pattern_pictures")), Path(output)
-    if not 1 <= projector_pixels <= MOST_PIXELS:
-        raise ArgumentError("projector_pixels", f"{projector_pixels}: give 1 to {MOST_PIXELS}, those a side")
-    check_root(seed or 0)
+    asked, folder = Pictures(**options), Path(output)
+    seed, last, pixels = asked.seed or 0, asked.closing_frame, asked.projector_pixels
+    check_root(seed)
     drawn_at_random = patterns != STRIPES and takes_seed(patterns)
-    if seed is not None and not drawn_at_random:
-        raise ArgumentError("seed", "has no effect on patterns that are not drawn at random; leave it out")
+    if not drawn_at_random:
+        asked.refuse(["seed"], "on patterns that are not drawn at random")
     if patterns == STRIPES:
-        if closing_frame is not None:
-            raise ArgumentError("closing_frame", "has no effect on stripes, whose pairs check the lamp; leave it out")
-        if facts.camera is None or facts.exposure is None:
-            missing = "camera" if facts.camera is None else "exposure"
+        asked.refuse(["closing_frame"], "on stripes, whose pairs check the lamp")
+        if asked.camera is None or asked.exposure is None:
+            missing = "camera" if asked.camera is None else "exposure"
             raise ArgumentError(missing, "is not given, and the list of a calibration's frames needs it; give it")
         from mitsim.exchange.png_files import SESSION, draw_stripes, session_of
 
-        capture = facts.signed_capture or "pair"
-        listed = session_of(str(facts.camera), facts.exposure, projector_pixels, capture)
-        return {**draw_stripes(folder, str(projector), listed), "session": str(folder / SESSION)}
-    read_name(patterns, projector_pixels)  # refused before numpy is imported
-    if facts.signed_capture is not None:
-        raise ArgumentError(
-            "signed_capture", "has no effect on patterns, whose signed ones are pairs; it is for stripes; leave it out"
-        )
+        listed = session_of(str(asked.camera), asked.exposure, pixels, asked.signed_capture or "pair")
+        return {**draw_stripes(folder, str(asked.projector), listed), "session": str(folder / SESSION)}
+    read_name(patterns, pixels)  # refused before numpy is imported
+    asked.refuse(["signed_capture"], "on patterns, whose signed ones are pairs; it is for stripes")
     for name in ("camera", "exposure"):
-        if (value := getattr(facts, name)) is not None:
+        if (value := getattr(asked, name)) is not None:
             raise ArgumentError(name, f"{value}: goes with stripes; give it to `mitsim import`")
     from mitsim.exchange.png_files import draw_family
 
-    drawn = draw_family(folder, patterns, projector_pixels, str(projector), seed or 0, closing_frame)
+    drawn = draw_family(folder, patterns, pixels, str(asked.projector), seed, last)
     return {**drawn, "session": None}
-
-
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class SessionFacts:
-    """What the list of a calibration's frames says, as :func:`pattern_pictures` takes it; None: not said."""
-
-    camera: Path | str | None = None
-    exposure: float | None = None
-    signed_capture: Literal["pair", "uniform"] | None = None

@@ -8,7 +8,7 @@ perfect image would show.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -36,11 +36,9 @@ from mitsim.core.spectral_manifests import (
     RUN,
     ColourManifest,
     MosaicManifest,
+    SpectralFolder,
     checked_colours,
-    is_coloured,
-    is_mosaic,
-    read_colours,
-    read_mosaic,
+    open_lines,
 )
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
@@ -285,24 +283,20 @@ class Loaded:
 def run_content(folder: Path) -> Run:
     """The RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a line's folder, is not
     a complete one."""
-    if not is_mosaic(folder):
-        return _content(folder, RUN, pack_run)
-    filters = read_mosaic(folder)
-    files = {name: folder / name / TRUTH for name in filters.names}
+    lines = open_lines(folder, RUN, MOSAIC)
+    files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    return Content({"": pack_run(folder)}, filters, _text_of(folder, COLOUR), truths)
+    return replace(_content(lines, pack_run), truths=truths)
 
 
 def calibration_content(folder: Path) -> Calibration:
     """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
-    return _content(folder, CALIBRATION, pack_calibration)
+    return _content(open_lines(folder, CALIBRATION), pack_calibration)
 
 
-def _content(folder: Path, kind: str, pack: Callable[[Path], Packed[Manifest]]) -> Content[Manifest]:
-    if not is_coloured(folder):
-        return Content({"": pack(folder)})
-    colours = read_colours(folder, kind)
-    return Content({name: pack(folder / name) for name in colours.names}, colours, _text_of(folder, COLOUR))
+def _content(lines: SpectralFolder, pack: Callable[[Path], Packed[Manifest]]) -> Content[Manifest]:
+    text = _text_of(lines.folder, COLOUR) if lines.colours else ""
+    return Content({name: pack(part) for name, part in lines.parts.items()}, lines.colours, text)
 
 
 def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ()) -> ColourManifest:

@@ -5,16 +5,16 @@ Nothing here imports numpy before work begins.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from mitsim.bench.request import Exposure, Request
-from mitsim.core.configuration import Configuration, validate
+from mitsim.bench.request import Exposure, ExposureKeys, Request
+from mitsim.core.configuration import Configuration, load_model, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.imagelist import PRINTS
+from mitsim.core.options import FilePath, Options, option
 from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 
@@ -65,41 +65,40 @@ class Variation(Configuration):
         return {name: float(rng.uniform(*limits)) for name, limits in sorted(ranges.items())}
 
 
-@dataclass(frozen=True)
-class PairsRequest:
-    """Which pairs are wanted.
+class PairOptions(Options):
+    """Which pairs are made, beside the request of their frames."""
 
-    Attributes
-    ----------
-    capture
-        patterns, accuracy, exposure and all else that a capture is asked for; its seed is the root of all streams.
-    count
-        of pairs.
-    idealised
-        whether frames are of the separable model.
-    folder
-        of pictures; None: they are drawn.
-    variation
-        of the bench; None: one bench.
-    """
+    VERB = "make_pairs"
+
+    count: int = option(..., "pairs to make", metavar="N", ge=1, le=MOST_PAIRS)
+    idealised: bool = option(False, "frames of the paper's separable model, not rendered")
+    pictures: FilePath | None = option(
+        None, "folder of pictures; drawn by code if not given", metavar="FOLDER", kind=Path
+    )
+    vary: Variation | None = option(
+        None,
+        "how benches vary from one group of pairs to the next",
+        metavar="FILE.toml",
+        kind=Path,
+        read=lambda path: load_model(path, Variation),
+    )
+
+
+class PairsRequest(PairOptions):
+    """Which pairs are wanted."""
 
     capture: Request
-    count: int
-    idealised: bool = False
-    folder: Path | None = None
-    variation: Variation | None = None
+    """Request of each pair's frames; its seed is the root of all streams."""
 
     def check(self) -> None:
         """MitsimError for a request that cannot be served, before any work."""
-        if not 1 <= self.count <= MOST_PAIRS:
-            raise ArgumentError("count", f"{self.count}: give 1 to {MOST_PAIRS} pairs")
         if self.capture.seconds is not None or self.capture.noise_fraction is not None:
             raise ArgumentError("seconds", "pairs share their light; give an accuracy")
         if self.capture.closing_frame is not None:
             raise ArgumentError("closing_frame", "pairs have none; leave it out")
-        if self.folder is not None:
-            picture_files(self.folder)
-        vary = self.variation
+        if self.pictures is not None:
+            picture_files(Path(self.pictures))
+        vary = self.vary
         for limit in (vary and vary.exposure_fraction) or ():
             Exposure(None, limit)
         for name, limits in vary.mask.items() if vary else ():
@@ -114,9 +113,16 @@ class PairsRequest:
 
     def groups(self) -> list[dict[str, float]]:
         """What is drawn for each bench."""
-        if self.variation is None:
+        if self.vary is None:
             return [{}]
-        return [self.variation.draw(self.capture.seed, group) for group in range(self.variation.groups)]
+        return [self.vary.draw(self.capture.seed, group) for group in range(self.vary.groups)]
+
+
+class PairKeys(ExposureKeys, total=False):
+    """Keywords of :func:`mitsim.make_pairs`, beside the number of pairs."""
+
+    idealised: bool
+    pictures: Path | str | None
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:

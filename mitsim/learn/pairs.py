@@ -180,7 +180,7 @@ class _Maker:
     def _white_of(self, group: int) -> WhitePrints:
         bench, plan = self._bench_of(group)
         if self._white is None or self._white[0] is not bench:
-            own = group if self._asked.variation and self._asked.variation.scene else 0
+            own = group if self._asked.vary and self._asked.vary.scene else 0
             light = trace_request(bench, plan, self._job, integer(self._asked.capture.seed, "white prints", own))
             self._white = bench, WhitePrints.of(light)
         return self._white[1]
@@ -240,7 +240,7 @@ class _Maker:
         """What the shards that are ``left`` take, with the first plan, which is made."""
         pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)
         of_benches = {tuple(sorted(self._groups[shard.group].items())) for shard in left}
-        varied = self._asked.variation is not None and bool(self._asked.variation.scene)
+        varied = self._asked.vary is not None and bool(self._asked.vary.scene)
         taken = self._plan.predicted
         tracing = taken["transport"] + taken["truth"]
         each = _FORMED * taken["optics"] + _PICTURE_S * pixels
@@ -281,7 +281,7 @@ class _Maker:
             pictures=self._pictures.source,
             photographs=self._pictures.photographs,
             ambient_shots=(capture.ambient_shots or ambient_shots(self._family)) if taken else 0,
-            groups=tuple(self._groups) if asked.variation else (),
+            groups=tuple(self._groups) if asked.vary else (),
             shards=shards,
             versions=versions(),
         )
@@ -325,12 +325,12 @@ class _Maker:
 def _pictures(asked: PairsRequest) -> Pictures:
     """Where pictures of pairs that are ``asked`` for come from."""
     seed = asked.capture.seed
-    return DrawnPictures(seed) if asked.folder is None else FolderPictures(asked.folder, seed)
+    return DrawnPictures(seed) if asked.pictures is None else FolderPictures(Path(asked.pictures), seed)
 
 
 def _shards(asked: PairsRequest) -> tuple[Shard, ...]:
     """Files of the pairs that are ``asked`` for; benches get equal parts of these."""
-    found, groups = list[Shard](), 1 if asked.variation is None else asked.variation.groups
+    found, groups = list[Shard](), 1 if asked.vary is None else asked.vary.groups
     ends = [asked.count * (group + 1) // groups for group in range(groups)]
     for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
         for first in range(start, end, SHARD):

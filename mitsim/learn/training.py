@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -433,7 +433,7 @@ def train_network(
     trainer, first = Trainer(request, prepared, sums, network), _copy(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     half = has_half(trainer.model.sigma.device)
-    digest = _digest(asdict(request), factors.fingerprint, about, half)
+    digest = _digest(request.model_dump(), factors.fingerprint, about, half)
     unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), digest)
     state = unfinished.read() if resume and unfinished.path.is_file() else State.first(trainer)
     state.restore(trainer)
@@ -448,7 +448,7 @@ def train_network(
     before = trainer.judge(trainer.judging)
     network.load_state_dict(state.best)
     after = trainer.judge(trainer.judging)
-    how = {**asdict(request), "half_precision": half, "curve": state.curve, "psnr_db": after}
+    how = {**request.model_dump(), "half_precision": half, "curve": state.curve, "psnr_db": after}
     manifest = ModelManifest(
         method=request.method, camera=factors.manifest.camera, factors=factors.fingerprint,
         patterns=store.manifest.patterns, exposure_s=store.manifest.exposure_s, noise=sums.noise, pairs=about,

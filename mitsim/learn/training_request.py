@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from mitsim.core.errors import ArgumentError, MitsimError, checked_fields, near_name
-from mitsim.core.seeds import check_root
+from mitsim.bench.request import Seeded, SeedKeys
+from mitsim.core.errors import ArgumentError, MitsimError, near_name
+from mitsim.core.options import LIMITS, QUALITY, option
 
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
     "unrolled",
@@ -27,50 +26,45 @@ FEWEST_PHOTOGRAPHS = 3
 """One that teaches, one that chooses the best step, and one that judges."""
 
 
-@checked_fields
-@dataclass(frozen=True)
-class Training:
-    """How a network is trained. MitsimError for what none is trained by.
+class Schedule(Seeded):
+    """How a network is trained."""
 
-    Attributes
-    ----------
-    method
-        one of :data:`METHODS`.
-    steps, batch
-        of the optimiser, and pairs of each of them.
-    rate
-        largest learning rate of the one cycle that the steps go through.
-    seed
-        root of first weights, order of the pairs and their noise.
-    device
-        of torch, such as ``cpu`` or ``cuda``.
-    feature_weight, adversary_weight
-        of the losses of :class:`mitsim.learn.critic.Critic`, beside the logarithm of the squared error.
-    """
+    PANEL = QUALITY
+
+    steps: int = option(4000, "of the optimiser", ge=1, le=_LONGEST)
+    batch: int = option(4, "pairs a step", ge=1, le=_LARGEST_BATCH)
+    rate: float = option(2e-3, "largest learning rate of the cycle", gt=0, le=1)
+    device: str = option("cpu", "that torch works on", metavar="NAME", panel=LIMITS)
+    feature_weight: float = option(
+        0.0, "of differences of features, beside the squared error", ge=0, le=_LARGEST_WEIGHT
+    )
+    adversary_weight: float = option(0.0, "of what an adversary tells from truths, beside it", ge=0, le=_LARGEST_WEIGHT)
+
+
+class Training(Schedule):
+    """Which network is trained, and how."""
+
+    VERB = "train"
 
     method: str
-    steps: int = 4000
-    batch: int = 4
-    rate: float = 2e-3
-    seed: int = 0
-    device: str = "cpu"
-    feature_weight: float = 0.0
-    adversary_weight: float = 0.0
+    """One of :data:`METHODS`."""
 
-    def __post_init__(self) -> None:
+    def model_post_init(self, _: object) -> None:
+        """Refuse what no network is trained by."""
         if self.method not in METHODS:
             near = near_name(str(self.method), METHODS)
             raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
-        for name, most in (("steps", _LONGEST), ("batch", _LARGEST_BATCH)):
-            value = getattr(self, name)
-            if not 1 <= value <= most:
-                raise ArgumentError(name, f"{value}: give a whole number, 1 to {most}")
-        check_root(self.seed)
-        if not 0 < self.rate <= 1:
-            raise ArgumentError("rate", f"{self.rate}: give a number above 0, at most 1")
         for name in ("feature_weight", "adversary_weight"):
-            value = getattr(self, name)
-            if not 0 <= value <= _LARGEST_WEIGHT:
-                raise ArgumentError(name, f"{value}: give a number, 0 to {_LARGEST_WEIGHT}")
-            if value and self.method == PLUG_AND_PLAY:
+            if (value := getattr(self, name)) and self.method == PLUG_AND_PLAY:
                 raise ArgumentError(name, f"{value}: {PLUG_AND_PLAY} learns from noise alone; leave it out")
+
+
+class TrainingKeys(SeedKeys, total=False):
+    """Keywords of :class:`Schedule`."""
+
+    steps: int
+    batch: int
+    rate: float
+    device: str
+    feature_weight: float
+    adversary_weight: float

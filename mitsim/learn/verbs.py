@@ -9,17 +9,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request, Task
-from mitsim.core.errors import MitsimError, check_arguments, options_of
+from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
-from mitsim.learn.pair_request import CALIBRATION, PairsRequest
-from mitsim.learn.training_request import Training
+from mitsim.core.options import takes
+from mitsim.learn.pair_request import CALIBRATION, PairOptions, PairsRequest
+from mitsim.learn.training_request import Schedule, Training
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from mitsim.api.bench import Bench
     from mitsim.learn.learned_solver import LearnedSolver
+    from mitsim.learn.pair_request import PairKeys
     from mitsim.learn.pair_store import PairStore
     from mitsim.learn.training import Trained
+    from mitsim.learn.training_request import TrainingKeys
 
 
 def check_torch() -> None:
@@ -28,7 +33,7 @@ def check_torch() -> None:
         raise MitsimError("torch is not installed, which networks need; type: pip install 'mitsim[learn]'")
 
 
-@check_arguments
+@takes(PairOptions, Request, without="vary")
 def make_pairs(
     bench: Bench,
     output: Path | str,
@@ -36,7 +41,7 @@ def make_pairs(
     patterns: str = "dots:7",
     resume: bool = False,
     job: Job | None = None,
-    **options: Any,
+    **options: Unpack[PairKeys],
 ) -> PairStore:
     """Pairs to learn from: pictures on a scene's print, and the frames that the camera takes of them.
 
@@ -54,10 +59,6 @@ def make_pairs(
         whether to go on where interrupted work of the same request stopped.
     job
         its limits, and who is told how far it is.
-    **options
-        ``idealised``: whether frames are of the paper's separable model, whose exact factors are then beside them;
-        ``pictures``: a folder of them, drawn by code where none is given; and other fields of
-        :class:`mitsim.bench.request.Request`, but for ``seconds`` and ``noise_fraction``.
 
     Raises
     ------
@@ -65,9 +66,10 @@ def make_pairs(
         for a request that cannot be served, a scene without a print, pictures that cannot be read, an output that
         cannot be written or holds something else, and more memory, disk or time than is allowed.
     """
-    output, folder = Path(output), options.pop("pictures", None)
-    idealised, request = bool(options.pop("idealised", False)), Request.of(patterns=patterns, **options)
-    asked = PairsRequest(request, count, idealised, None if folder is None else Path(folder))
+    output = Path(output)
+    own: dict[str, Any] = {name: value for name, value in options.items() if name in PairOptions.model_fields}
+    frames: dict[str, Any] = {name: value for name, value in options.items() if name not in own}
+    asked = PairsRequest(capture=Request(patterns=patterns, **frames), count=count, **own)
     asked.check()
     check_output(output, overwrite=resume and (output / PAIRS).is_file())
     task = Task.of(output, resume, job)
@@ -101,7 +103,7 @@ def load_network(path: Path | str, device: str = "cpu") -> LearnedSolver:
     return read_network(path, device)
 
 
-@check_arguments
+@takes(Schedule)
 def train(
     method: str,
     pairs: Path | str,
@@ -109,7 +111,7 @@ def train(
     calibration: Path | str | None = None,
     resume: bool = False,
     job: Job | None = None,
-    **options: Any,
+    **options: Unpack[TrainingKeys],
 ) -> Trained:
     """Train a network on pairs, and write its file.
 
@@ -125,9 +127,6 @@ def train(
         whether to go on where an interrupted training of the same options stopped.
     job
         its limits, and who is told how far it is.
-    **options
-        ``steps``, ``batch``, ``rate``, ``seed``, ``device``, ``feature_weight`` and ``adversary_weight`` of
-        :class:`mitsim.learn.training_request.Training`.
 
     Raises
     ------
@@ -135,7 +134,7 @@ def train(
         where torch is not installed, for options that no network is trained by, folders that cannot be read or do not
         fit each other, a file that is there, and more time or memory than is allowed.
     """
-    request = Training(method, **options_of(Training, options, "train"))
+    request = Training(method=method, **options)
     place = Path(pairs) / CALIBRATION if calibration is None else Path(calibration)
     if calibration is None and not place.is_dir():
         raise MitsimError(f"calibration: {pairs} holds none; give the folder of `mitsim calibrate`")

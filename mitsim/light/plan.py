@@ -15,12 +15,11 @@ import pydantic
 
 from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import Request
-from mitsim.core.configuration import Configuration
+from mitsim.core.configuration import Configuration, refusal
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import from_above, table
 from mitsim.core.job import Cost
-from mitsim.core.mistakes import refusal
 from mitsim.core.spectral_manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 from mitsim.version import __version__
@@ -237,7 +236,9 @@ class Plan:
 
     def as_text(self) -> str:
         """The plan as its file has it; ArgumentError for one that was decided without a request."""
-        asked = self.known_request.model_dump(mode="json", exclude_unset=True)
+        known = self.known_request
+        asked = {name: getattr(known, name) for name in ("patterns", "seconds", "seed", "effects")}
+        asked |= known.model_dump(mode="json", exclude_unset=True)
         settings = {**asdict(self.settings), "effects": sorted(self.settings.effects)}
         own = plain({**asdict(replace(self, request=None)), "settings": settings, "request": asked})
         return json_text({"kind": "plan", "format": FORMAT, "sha256": _digest(own), "plan": own})
@@ -371,7 +372,7 @@ class Plan:
         ax
             matplotlib's axes to draw on; None: those of a new figure.
         """
-        return from_above("report.result_plots", "draw_plan")(self, quantity, ax)
+        return from_above("report.plots", "draw_plan")(self, quantity, ax)
 
     def __repr__(self) -> str:
         states = ", ".join(f"{row.name} {row.state}" for row in self.effects if row.state != "off")

@@ -24,7 +24,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.spectral_manifests import is_coloured, same_lines
+from mitsim.core.spectral_manifests import RUN, open_lines
 from mitsim.devices.knownlist import KnownCaptures
 from mitsim.reconstruct.estimate_factors import (
     SEPARABLE_RESIDUAL,
@@ -114,15 +114,8 @@ def mend_factors(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, F
 
 
 def _load_aged(captures: KnownCaptures, folder: Path) -> dict[str, Factors]:
-    if captures.lines is not None:
-        lines = same_lines(captures.run(captures.listed.known[0]), folder).names
-        return {name: load_calibration(folder / name) for name in lines}
-    if is_coloured(folder):
-        raise MitsimError(
-            f"calibration {folder}: has lines of its own, but the runs of list {captures.path} have none; give one of "
-            "its folders"
-        )
-    return {"": load_calibration(folder)}
+    run = open_lines(captures.run(captures.listed.known[0]), RUN)
+    return {name: load_calibration(part) for name, part in run.check_calibration(folder).parts.items()}
 
 
 @dataclass(frozen=True, eq=False)

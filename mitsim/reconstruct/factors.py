@@ -241,7 +241,7 @@ class Factors:
         ax
             matplotlib's axes to draw on; None: those of a new figure.
         """
-        return from_above("report.result_plots", "draw_factor")(self, side, ax)
+        return from_above("report.plots", "draw_factor")(self, side, ax)
 
     def to_xarray(self) -> Dataset:
         """Both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm; MitsimError

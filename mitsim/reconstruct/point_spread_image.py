@@ -141,7 +141,9 @@ def reconstruct_psf(
         for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
         than is free, and another lambda, method or bounds.
     """
-    return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds, iterations=iterations))
+    return reconstruct_psf_request(
+        shots, psf, reduce, ImageRequest(lam=lam, method=method, bounds=bounds, iterations=iterations)
+    )
 
 
 @single_threaded_blas()

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
+from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
+from mitsim.core.options import takes
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
@@ -45,9 +46,11 @@ from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertai
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from typing_extensions import Unpack
     from xarray import Dataset
 
     from mitsim.reconstruct.point_spread_fit import PointSpreadFit
+    from mitsim.reconstruct.request import ImageKeys
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -224,7 +227,7 @@ class Reconstruction(Solution):
         MitsimError
             for an uncertainty or depths that are not known.
         """
-        return from_above("report.result_plots", "draw_image")(self, quantity, ax)
+        return from_above("report.plots", "draw_image")(self, quantity, ax)
 
     @check_arguments
     def to_xarray(self, factors: Factors | None = None) -> Dataset:
@@ -329,15 +332,13 @@ _BETTER = 0.5
 not fit either."""
 
 
-@check_arguments
+@takes(ImageRequest)
 def reconstruct(
     shots: Capture,
     factors: Factors,
     lam: float | Literal["auto"] = "auto",
     method: str | Solver = TIKHONOV,
-    focus: float | Literal["auto", "map"] | None = None,
-    margin: int = 0,
-    **options: Any,
+    **options: Unpack[ImageKeys],
 ) -> Reconstruction:
     """Recover the image from a capture and a calibration alone.
 
@@ -354,17 +355,6 @@ def reconstruct(
         ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
         :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0), ``tv`` (least total variation),
         or a solver of one's own, such as a trained network (:func:`mitsim.load_network`).
-    focus
-        depth of the scene [mm], whose factors are taken instead of the calibrated depth's; ``auto``: that which leaves
-        least of the measurements unexplained; ``map``: one for each projector pixel, from shifting dots, by
-        ``tikhonov``.
-    margin
-        cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
-        they take up light from outside the window (:mod:`mitsim.reconstruct.background`). By ``tikhonov``, no focus.
-    **options
-        ``depth_range``: nearest and farthest depth [mm] that ``auto`` and ``map`` look for, a quarter of 1/z either way
-        of the calibrated depth unless given; ``bounds``, least and largest number of the image, and ``iterations``, at
-        most, of ``nonnegative`` and ``tv``.
 
     Raises
     ------
@@ -372,8 +362,7 @@ def reconstruct(
         for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
         another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
     """
-    known = options_of(ImageRequest, options, "reconstruct")
-    return reconstruct_request(shots, factors, ImageRequest(lam, method, focus, margin, **known))
+    return reconstruct_request(shots, factors, ImageRequest(lam=lam, method=method, **options))
 
 
 @single_threaded_blas()

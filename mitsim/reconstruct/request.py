@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
+from mitsim.core.options import QUALITY, Options, option, validated_by
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax
@@ -33,44 +35,85 @@ def holds_image(folder: Path) -> bool:
     return (folder / IMAGE_FILE).is_file() or (folder / RESULT_FILE).is_file()
 
 
-@dataclass(frozen=True)
-class ImageRequest:
-    """How an image is asked for. ArgumentError for what no image is made by.
+def method_names() -> str:
+    """Return the methods of solving, as the help lists them."""
+    notes = {MARKOV: f"{MARKOV} (neighbouring pixels alike: for noisy frames)"}
+    return ", ".join([*(notes.get(name, name) for name in METHODS), f"or MODEL{MODEL}, a file of mitsim train"])
 
-    Attributes
-    ----------
-    lam
-        lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
-        from the data.
-    method
-        one of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network, which has no
-        lambda.
-    focus
-        depth of the scene [mm]; ``auto``: that which leaves least of the measurements unexplained; ``map``: one for
-        each projector pixel; None: the calibrated one.
-    margin
-        cells round the projector's window that are solved for too, and left out of the image.
-    depth_range
-        nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
-        calibrated one.
-    bounds
-        least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
-        ``tv``, by a point spread function 0 and inf of both.
-    iterations
-        most steps, by ``nonnegative`` and ``tv``; None: the method's own.
-    """
 
-    lam: float | Literal["auto"] = "auto"
-    method: Any = TIKHONOV
-    focus: float | Literal["auto", "map"] | None = None
-    margin: int = 0
-    depth_range: tuple[float, float] | None = None
-    bounds: Bounds | None = None
-    iterations: int | None = None
+def _two(name: str, rule: str, low: float | None = None, high: float | None = None) -> Callable[[str], Any]:
+    """Return a function that reads the two numbers of LOW:HIGH; ends may be left out where they have a default."""
 
-    def __post_init__(self) -> None:
-        lam: float | str = self.lam
-        focus: float | str | None = self.focus
+    def read(text: str) -> tuple[float, float]:
+        first, colon, last = text.partition(":")
+        try:
+            if colon:
+                return float(first or low), float(last or high)  # type: ignore[arg-type]
+        except (ValueError, TypeError):
+            pass
+        raise ArgumentError(name, f"{text!r}: {rule}")
+
+    return read
+
+
+def _two_numbers(ends: Any) -> tuple[float, float] | None:
+    """Return two ``ends`` as a pair; MitsimError for anything but two numbers."""
+    if ends is None:
+        return None
+    real = isinstance(ends, (tuple, list)) and [type(end) in (int, float) for end in ends] == [True, True]
+    if not real:
+        raise MitsimError(f"{short_text(ends)}: give two numbers, the smaller one first")
+    return float(ends[0]), float(ends[1])
+
+
+Two = Annotated[Any, validated_by(_two_numbers)]
+
+
+class ImageRequest(Options):
+    """How an image is solved for."""
+
+    PANEL = QUALITY
+    VERB = "reconstruct"
+
+    lam: float | Literal["auto"] = option("auto", "regularisation, or auto", "--lambda", metavar="auto|VALUE")
+    """lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation."""
+    method: Any = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", kind=str, complete=lambda: METHODS)
+    """One of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network."""
+    focus: float | Literal["auto", "map"] | None = option(
+        None,
+        "depth of the scene; auto: found; map: one for each pixel, by dots; the calibrated one if not given",
+        metavar="auto|MM|map",
+    )
+    depth_range: Two = option(
+        None,
+        "nearest and farthest depth that auto and map look for; 1/z within a quarter of the calibrated one's if not "
+        "given",
+        metavar="A:B",
+        read=_two("depth_range", "give the nearest and the farthest depth [mm], such as 350:450"),
+    )
+    bounds: Two = option(
+        None,
+        "least and largest number of the image, by nonnegative and tv; either may be left out; if not given, 0: of "
+        "nonnegative and with --psf",
+        metavar="LOW:HIGH",
+        read=_two("bounds", "give the least and the largest number, such as 0:1 or 0:", -math.inf, math.inf),
+    )
+    iterations: int | None = option(
+        None,
+        "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given",
+        min=1,
+        metavar="N",
+    )
+    margin: int = option(
+        0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"
+    )
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse what no image is made by."""
+        lam: Any = self.lam
+        focus: Any = self.focus
+        if not isinstance(self.method, str) and not hasattr(self.method, "name"):
+            raise ArgumentError("method", f"{short_text(self.method)}: give a method's name or a solver")
         method, margin = self.name, self.margin
         if isinstance(self.method, str) and method not in METHODS:
             raise ArgumentError(
@@ -79,70 +122,55 @@ class ImageRequest:
             )
         if lam != "auto" and not isinstance(self.method, str):
             raise ArgumentError("lam", f"{lam}: {method} has none; leave it out")
-        if lam != "auto" and (isinstance(lam, str) or not 0 <= lam <= _MOST):
+        if lam != "auto" and not 0 <= lam <= _MOST:
             raise ArgumentError(
                 "lam", f"{short_text(lam)}: give a finite number of at least 0, or auto; at most {_MOST:g}"
             )
-        if not (focus is None or self.looks_for_depth) and (isinstance(focus, str) or not 0 < focus <= _MOST):
+        if not (focus is None or self.looks_for_depth or 0 < focus <= _MOST):
             raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto or map")
-        if self.depth_range is not None:
-            self._check_range(self.depth_range)
-        if self.bounds is not None:
-            self._check_bounds(self.bounds)
-        steps: Any = self.iterations
-        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
-            raise ArgumentError("iterations", f"{short_text(steps)}: give a whole number, at least 1")
+        if ends := self.depth_range:
+            if not 0 < ends[0] < ends[1] <= _MOST:
+                raise ArgumentError("depth_range", f"{ends}: give two depths above 0 mm, the smaller one first")
+            if not self.looks_for_depth:
+                raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
+        if ends := self.bounds:
+            within = all(abs(end) <= _MOST or abs(end) == math.inf for end in ends)
+            if not (within and ends[0] < ends[1] and ends[0] <= _MOST and ends[1] >= -_MOST):
+                raise ArgumentError("bounds", f"{ends}: give two numbers, the smaller one first")
         for name, value in self.iterative.items():
             if method not in (NONNEGATIVE, TV):
                 raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
-        if isinstance(margin, bool) or not isinstance(margin, int) or margin < 0:
-            raise ArgumentError("margin", f"{short_text(margin)}: give a whole number of cells, at least 0")
         if margin and (focus is not None or method != TIKHONOV):
             raise ArgumentError(
                 "margin", f"{margin}: comes with tikhonov at the calibrated depth alone; leave out focus"
             )
 
-    def _check_range(self, ends: Any) -> None:
-        two = isinstance(ends, (tuple, list)) and len(ends) == 2
-        real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        if not (real and 0 < ends[0] < ends[1] <= _MOST):
-            raise ArgumentError("depth_range", f"{short_text(ends)}: give two depths above 0 mm, the nearer one first")
-        if not self.looks_for_depth:
-            raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
-
-    def _check_bounds(self, ends: Any) -> None:
-        two = isinstance(ends, (tuple, list)) and len(ends) == 2
-        real = two and all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        within = real and all(abs(end) <= _MOST or abs(end) == math.inf for end in ends)
-        if not (real and ends[0] < ends[1] and ends[0] <= _MOST and ends[1] >= -_MOST and within):
-            raise ArgumentError("bounds", f"{short_text(ends)}: give two numbers, the smaller one first")
-
     @property
     def iterative(self) -> dict[str, Any]:
-        """Those of ``bounds`` and ``iterations`` that are given, as methods by iterations take them."""
+        """Those of ``bounds`` and ``iterations`` that are given."""
         given = {"bounds": self.bounds, "iterations": self.iterations}
         return {name: value for name, value in given.items() if value is not None}
 
     @property
     def plain(self) -> dict[str, Any]:
-        """What of an image's inputs JSON holds for these."""
+        """The iterative options as JSON holds them."""
         return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
     def name(self) -> str:
-        """The method's."""
+        """Name of the method."""
         return str(self.method if isinstance(self.method, str) else self.method.name)
 
     @property
     def looks_for_depth(self) -> bool:
-        """Whether depths are found from the frames."""
+        """True if depths are found from the frames."""
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
-        """ArgumentError for what no image by a point spread function is made by, or where not ``reduce`` x ``reduce``
-        pixels, a whole number of them, can become one."""
+        """Refuse options that an image by a point spread function does not have, and a ``reduce`` that is no number of
+        pixels."""
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
         for name, neutral in (("focus", None), ("margin", 0)):
@@ -157,7 +185,7 @@ class ImageRequest:
             )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
-        """What decides an image: this, and fingerprints of its ``shots`` and ``factors``."""
+        """Return all that decides an image: these options, and fingerprints of its ``shots`` and ``factors``."""
         asked: dict[str, Any] = {
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
@@ -170,13 +198,23 @@ class ImageRequest:
         return {**asked, "margin": self.margin} if self.margin else asked
 
 
+class ImageKeys(TypedDict, total=False):
+    """Keywords of :class:`ImageRequest`, without lambda and method."""
+
+    focus: float | Literal["auto", "map"] | None
+    margin: int
+    depth_range: tuple[float, float] | None
+    bounds: tuple[float, float] | None
+    iterations: int | None
+
+
 def plain_bounds(bounds: Bounds) -> list[float | None]:
     """``bounds`` as JSON holds them: None for an end that is infinite."""
     return [end if math.isfinite(end) else None for end in bounds]
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
-    """The ``parallax`` that a ``calibration`` states; MitsimError where it states none."""
+    """Return the ``parallax`` of a ``calibration``; MitsimError if it states none."""
     if parallax is None:
         raise MitsimError(
             f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
@@ -186,7 +224,7 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 
 
 def check_joint(lam: float | str) -> None:
-    """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
+    """Refuse a lambda ``lam`` by which runs behind colour filters are not solved."""
     if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
         raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
@@ -221,7 +259,7 @@ class ImageCost:
 
 
 def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
-    """What the Tikhonov image of ``shots`` by ``factors`` takes, at the calibrated depth."""
+    """Predict the time and memory of the Tikhonov image of ``shots`` by ``factors``, at the calibrated depth."""
     pixels = float(len(factors.left) * len(factors.right))
     count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
     measured = left.shape[1] * right.shape[1]
@@ -241,8 +279,7 @@ def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
 
 
 def keeps_frames(shots: Capture, factors: Factors) -> bool:
-    """Whether the measurements of ``shots`` are so few numbers that they are not read twice; ``factors`` tell the
-    sensor's pixels."""
+    """Return True if the measurements of ``shots`` are so few that they are kept instead of read twice."""
     left, right = shots.patterns
     return bool(left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= KEPT_NUMBERS)
 

@@ -1,6 +1,6 @@
-"""A folder that mitsim wrote in, its pictures and its page out: of a run, a calibration, an image, and those by line.
+"""`mitsim report`: pictures and a page of a run, a calibration or an image, from the files of its folder alone.
 
-Only the folder's own files are read; an image's truth is taken from its run, as long as that is where it was.
+The truth of an image is read from its run, as long as the run is where it was.
 """
 
 from __future__ import annotations
@@ -13,66 +13,66 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-from mitsim.core.exr import finite_channel, read_frame
+from mitsim.core.configuration import validate
+from mitsim.core.environment import versions
+from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.exr import finite_channel, read_frame, verify_files
 from mitsim.core.files import PAGE, PICTURES, output_folder, prepare_output, read_json, remove_page, write_text
+from mitsim.core.images import lightness, png
 from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
 from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture, load_run
-from mitsim.core.spectral_manifests import CALIBRATION, COLOUR, RUN, is_coloured, is_mosaic, read_colours, read_mosaic
-from mitsim.metrics import truth_for
+from mitsim.core.runs import load_mosaic, load_run
+from mitsim.core.spectral_manifests import CALIBRATION, COLOUR, IMAGE, MOSAIC, RUN, SpectralFolder, open_lines
+from mitsim.devices.chart import ChartPlace
+from mitsim.metrics import Quality, truth_for
+from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.reconstruct import DEPTH_FILE, MADE_OF, POINT_SPREAD, UNCERTAINTY_FILE, read_result
 from mitsim.reconstruct.request import IMAGE_FILE, RESULT_FILE
-from mitsim.report.folder_pictures import REFLECTANCE, Picture, Scale, contact_sheet, error_picture
-from mitsim.report.pages import render_page
-from mitsim.report.parts import PlanChart, lines_of, plan_rows, stages_of, total_of
+from mitsim.report.colour_image import ColourImage
+from mitsim.report.pages import (
+    LARGEST,
+    REFLECTANCE,
+    SMALLEST,
+    Picture,
+    PlanChart,
+    Scale,
+    contact_sheet,
+    lines_of,
+    plan_rows,
+    render_page,
+    stages_of,
+    total_of,
+)
 
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
     *("seconds", "warnings", "versions", "command", "kernels", "result", "estimate", "verdict", "camera"),
     "opened",
 }
-"""Keys of a manifest that are no lines of the table of numbers: they stand elsewhere on the page, or for programs."""
-
+"""Keys of a manifest outside the table of numbers: the page shows them elsewhere, or only programs need them."""
 _TRUTH = "what a perfect image shows: of each projector pixel what it lights, black where that is not seen"
 _MISFIT = 2.0
-"""Chi-square a datum that is white at least: chance alone, some hundredths about 1, would fill any smaller scale."""
+"""Least chi-square a datum that is white: chance alone, some hundredths about 1, would fill any smaller scale."""
+_SHOWN_PERCENT = 99.0
+"""Part of the errors within the scale of their picture: single pixels at edges are off by far more."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What the page of a folder shows.
+    """Content of a folder's page.
 
-    Attributes
-    ----------
-    kind
-        of folder, in a word.
-    verdict, detail
-        a line, and what there is to add.
-    warnings
-        why it is flagged.
-    command
-        that made it; None: nobody says.
-    pictures
-        of it, in order.
-    plan
-        as bars; None where there is none.
-    seconds, kernels
-        by stage; number and seconds of kernels that were compiled.
-    numbers, camera, configuration, versions
-        lines of tables, by name.
-    parts
-        what is shown of the folders in it, by their names, each with a page of its own.
+    ``kernels`` are number and seconds of compiled kernels; numbers, camera, configuration and versions are lines of
+    tables by name; ``parts`` are the pages of the folders in it; ``facts`` say how an image in colour was found.
     """
 
     kind: str
     verdict: str
     detail: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: Sequence[str] = ()
     command: str | None = None
-    pictures: tuple[Picture, ...] = ()
+    pictures: Sequence[Picture] = ()
     plan: PlanChart | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     kernels: Mapping[str, float] = field(default_factory=dict)
@@ -81,72 +81,83 @@ class Shown:
     configuration: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     parts: Mapping[str, Shown] = field(default_factory=dict)
+    colours: ColourImage | None = None
+    facts: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_folder(folder: Path) -> Path:
-    """Write the pictures and the page of a ``folder``, and of those of lines and depths in it; the page's path.
+@check_arguments
+def report_folder(folder: Path | str) -> Path:
+    """Write the pictures and the page of a folder, from its own files alone, in place of earlier ones.
 
-    MitsimError for a folder that holds no run, calibration or image, or that cannot be written.
+    Parameters
+    ----------
+    folder
+        A folder of ``mitsim capture``, ``calibrate``, ``reconstruct`` or ``import``, or one that Python saved.
+
+    Returns
+    -------
+    Path
+        The page, ``report.html``; its pictures are in the folder ``pictures`` beside it.
     """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise MitsimError(f"{folder}: no such folder; give one of mitsim capture, calibrate, reconstruct or import")
     _write(folder, _content(folder))
     return folder / PAGE
 
 
 def _write(folder: Path, shown: Shown) -> None:
-    """Pictures and page of a folder, and of those in it, whose pages come first."""
+    """Write pictures and pages, last of all the folder's own page, because it says that everything is there."""
     for name, part in shown.parts.items():
         _write(folder / name, part)
     with output_folder(folder, overwrite=True):
-        write_page(folder, shown.pictures, "folder.html", page=shown, images=[*_images_in(folder)])
-
-
-def write_page(folder: Path, pictures: tuple[Picture, ...], template: str, **shown: Any) -> None:
-    """Write pictures and page to a folder that this process holds: the page last, as it says that all is there.
-
-    Parameters
-    ----------
-    folder
-        it is of.
-    pictures
-        of it.
-    template, shown
-        of the page, and what it shows.
-    """
-    remove_page(folder)
-    text = render_page(
-        template, pictures=pictures, folder=folder.absolute(), stages_of=stages_of, total_of=total_of, **shown
-    )
-    try:
-        if pictures:
-            prepare_output(folder / PICTURES, overwrite=True)
-        for picture in pictures:
-            picture.write(folder / PICTURES)
-        write_text(folder / PAGE, text)
-    except BaseException:
         remove_page(folder)
-        raise
+        images = [path.name for path in sorted(folder.iterdir()) if (path / IMAGE_FILE).is_file()]
+        text = render_page(
+            "folder.html",
+            {"hex": _hex},
+            page=shown,
+            folder=folder.absolute(),
+            images=[name for name in images if (folder / name / PAGE).is_file() and name not in shown.parts],
+            stages=stages_of(shown.seconds),
+            total=total_of(shown.seconds),
+            chart=chart() if shown.colours and shown.colours.chart else None,
+        )
+        try:
+            if shown.pictures:
+                prepare_output(folder / PICTURES, overwrite=True)
+            for picture in shown.pictures:
+                picture.write(folder / PICTURES)
+            write_text(folder / PAGE, text)
+        except BaseException:
+            remove_page(folder)
+            raise
 
 
-def _images_in(folder: Path) -> Iterator[str]:
-    """Names of folders of images in a ``folder`` of frames."""
-    for path in sorted(folder.iterdir()):
-        if (path / IMAGE_FILE).is_file() and (path / PAGE).is_file():
-            yield path.name
+def _hex(xyz: FloatArray) -> str:
+    """Return the colour of (3,) ``xyz`` as a page names it."""
+    return f"#{bytes(np.rint(255 * lightness(linear_srgb(xyz))).astype(np.uint8)).hex()}"
 
 
 def _content(folder: Path) -> Shown:
-    """What the page of a ``folder`` shows, by the kind of its files."""
-    if is_coloured(folder) and not is_mosaic(folder):
-        kind = read_json(folder / COLOUR).get("kind")
-        return _of_parts(folder, read_colours(folder, CALIBRATION if kind == CALIBRATION else RUN).names, "line")
+    """Collect what the page shows, by the kind of the folder's files."""
+    lines = open_lines(folder, RUN, MOSAIC, CALIBRATION, IMAGE)
+    if lines.colours and lines.colours.kind == IMAGE:
+        return _of_colours(lines)
+    if lines.colours and not lines.filters:
+        return _of_parts(folder, lines.names, "line")
     if (folder / MANIFEST).is_file():
         kind = read_json(folder / MANIFEST)
         calibrated = isinstance(kind, dict) and kind.get("kind") == "calibration"
-        return _of_calibration(folder) if calibrated else _of_run(folder)
+        return _of_calibration(folder) if calibrated else _of_run(lines)
     if (folder / IMAGE_FILE).is_file() and (folder / RESULT_FILE).is_file():
         return _of_image(folder)
-    depths = sorted((path.name for path in folder.iterdir() if (path / MANIFEST).is_file()), key=_number)
-    if depths and all(_number(name) < np.inf for name in depths):
+    depths = [path.name for path in folder.iterdir() if (path / MANIFEST).is_file()]
+    try:
+        depths.sort(key=float)
+    except ValueError:  # other folders are not called by their depth
+        depths = []
+    if depths:
         return _of_parts(folder, depths, "depth", " mm")
     raise MitsimError(
         f"{folder}: holds no run, calibration or image; give a folder of mitsim capture, calibrate, reconstruct or "
@@ -154,84 +165,64 @@ def _content(folder: Path) -> Shown:
     )
 
 
-def _number(name: str) -> float:
-    try:
-        return float(name)
-    except ValueError:
-        return float("inf")
-
-
-# ---- Runs ----
-
-
-def _of_run(folder: Path) -> Shown:
-    shots = load_run(folder)
-    manifest, taken = shots.manifest, shots.manifest.patterns
-    plan = manifest.plan or {}
-    accuracy = plan.get("accuracy")
-    accuracy = accuracy if isinstance(accuracy, float) else None
-    rows = plan_rows(plan)
-    first = shots.read(taken.captures[0].file)[0]["DN"]
-    error = manifest.total_error_bound
-    known = "" if error is None else f", error at most {error:.1e}"
-    asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
+def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
+    """Show a folder of several, one for each value of an ``axis`` in a ``unit``."""
+    parts = {name: _content(folder / name) for name in names}
+    first = next(iter(parts.values()))
     return Shown(
-        kind="Capture",
-        verdict=f"{len(taken.captures)} frame{'s' if len(taken.captures) > 1 else ''}{known}",
-        detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
-        f"exposure {shots.exposure_s:.3g} s a frame",
-        warnings=manifest.warnings,
-        command=manifest.command,
-        pictures=tuple(_run_pictures(shots)),
-        plan=PlanChart.of(rows, accuracy) if rows else None,
-        seconds=manifest.seconds,
-        kernels=manifest.kernels,
-        numbers={
-            **lines_of({"patterns": {"family": taken.family, "n": taken.n, "frames": len(taken.captures)}}),
-            **_numbers(manifest.model_dump(), folder),
-        },
-        camera=lines_of(manifest.camera),
-        configuration=lines_of(manifest.configuration),
-        versions=manifest.versions,
+        kind=f"{first.kind} by {axis}",
+        verdict=f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
+        warnings=[f"{name}: {text}" for name, part in parts.items() for text in part.warnings],
+        command=first.command,
+        seconds=next(reversed(parts.values())).seconds,
+        versions=first.versions,
+        parts=parts,
     )
 
 
-def _run_pictures(shots: Capture) -> Iterator[Picture]:
-    files, left = shots.manifest.patterns.captures, shots.patterns[0]
-    black = shots.manifest.digital.black_level_dn
+# -------- Runs and calibrations
 
-    def read(number: int) -> FloatArray:
-        """Frame of that number, less the black level [DN]."""
-        return np.asarray(shots.read(files[number].file)[0]["DN"] - np.float64(black))
 
-    first = read(0)
-    yield contact_sheet(read, len(files), first.shape, max(len(files) // left.shape[1], 1))
-    if len(files) > 1:
-        yield Picture.of("frame", f"One of them, {files[0].file}", first, Scale.of(first, _ABOVE_BLACK, 0.0))
+def _of_run(lines: SpectralFolder) -> Shown:
+    shots = load_run(lines.folder)
+    manifest, taken, black = shots.manifest, shots.manifest.patterns, np.float64(shots.manifest.digital.black_level_dn)
+    accuracy = (manifest.plan or {}).get("accuracy")
+    accuracy = accuracy if isinstance(accuracy, float) else None
+    rows, error, count = plan_rows(manifest.plan), manifest.total_error_bound, len(taken.captures)
+
+    def frame(name: str) -> FloatArray:
+        """Read a frame less the black level [DN]."""
+        return np.asarray(shots.read(name)[0]["DN"] - black)
+
+    def picture(name: str, title: str, values: FloatArray, about: str = "") -> Picture:
+        return Picture.of(name, title, values, Scale.of(values, "DN above the black level", 0.0), about)
+
+    first = frame(taken.captures[0].file)
+    columns = max(count // shots.patterns[0].shape[1], 1)
+    pictures = [contact_sheet(lambda number: frame(taken.captures[number].file), count, first.shape, columns)]
+    if count > 1:
+        pictures.append(picture("frame", f"One of them, {taken.captures[0].file}", first))
     titles = {"ambient": "Projector off: what is taken off", "closing": "Closing frame: no part of the image"}
-    for kind, name in shots.manifest.others.items():
-        frame = np.asarray(shots.read(name)[0]["DN"] - np.float64(black))
-        yield Picture.of(kind, titles[kind], frame, Scale.of(frame, _ABOVE_BLACK, 0.0), name)
+    pictures += [picture(kind, titles[kind], frame(name), name) for kind, name in manifest.others.items()]
     if shots.truth is not None:
-        yield Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH)
-    if shots.folder is not None and is_mosaic(shots.folder):
-        for name in read_mosaic(shots.folder).names:
-            if (path := shots.folder / name / TRUTH).is_file():
-                truth = finite_channel(read_frame(path)[0], "reflectance", path)
-                yield Picture.of(f"truth_{name}", f"The truth at {name}", truth, REFLECTANCE)
-
-
-_ABOVE_BLACK = "DN above the black level"
-
-
-def _numbers(manifest: Mapping[str, Any], folder: Path) -> dict[str, str]:
-    """Lines of the table of numbers, of a ``manifest`` and of the sizes in its ``folder``."""
-    files = [path for path in folder.iterdir() if path.is_file() and path.name != PAGE]
-    sizes = f"{len(files)}, {size_text(sum(path.stat().st_size for path in files))}"
-    return {**lines_of({key: value for key, value in manifest.items() if key not in _ELSEWHERE}), "files": sizes}
-
-
-# ---- Calibrations ----
+        pictures.append(Picture.of("truth", "The truth", shots.truth, REFLECTANCE, _TRUTH))
+    for name in lines.names if lines.filters else ():
+        if (path := lines.folder / name / TRUTH).is_file():
+            truth = finite_channel(read_frame(path)[0], "reflectance", path)
+            pictures.append(Picture.of(f"truth_{name}", f"The truth at {name}", truth, REFLECTANCE))
+    asked = "" if error is None or accuracy is None else f"accuracy {accuracy:g} asked for, "
+    known = {"patterns": {"family": taken.family, "n": taken.n, "frames": count}}
+    return Shown(
+        kind="Capture",
+        verdict=f"{count} frame{'s' if count > 1 else ''}{'' if error is None else f', error at most {error:.1e}'}",
+        detail=f"{first.shape[0]} x {first.shape[1]} pixels, patterns {taken.family or 'from elsewhere'}, {asked}"
+        f"exposure {shots.exposure_s:.3g} s a frame",
+        pictures=pictures,
+        plan=PlanChart.of(rows, accuracy) if rows else None,
+        seconds=manifest.seconds,
+        kernels=manifest.kernels,
+        **_of_manifest(manifest, lines.folder, known),
+    )
 
 
 def _of_calibration(folder: Path) -> Shown:
@@ -241,93 +232,93 @@ def _of_calibration(folder: Path) -> Shown:
     error = next((value for value in errors if isinstance(value, float)), None)
     verdict = (manifest.verdict or "a calibration").capitalize()
     verdict = f"Flagged. {verdict}" if manifest.warnings else verdict
-    seconds, kernels = result.get("seconds"), result.get("kernels")
-    sides = {"left": (factors.left, "rows"), "right": (factors.right, "columns")}
+    pictures = [
+        Picture.of(
+            name,
+            f"The {name} factor, of {axis}",
+            side.T,
+            Scale.of(side, "sqrt(electrons/s)"),
+            f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)",
+            wide=True,
+        )
+        for name, side, axis in (("left", factors.left, "rows"), ("right", factors.right, "columns"))
+    ]
     return Shown(
         kind="Calibration",
         verdict=verdict if error is None else f"{verdict}, factor error {error:.1e}",
         detail="" if manifest.estimate in manifest.warnings else manifest.estimate or "",
-        warnings=manifest.warnings,
-        command=manifest.command,
-        pictures=tuple(
-            Picture.of(
-                name,
-                f"The {name} factor, of {axis}",
-                side.T,
-                Scale.of(side, "sqrt(electrons/s)"),
-                f"{side.shape[1]} projector {axis} (down) x {side.shape[0]} sensor {axis} (across)",
-                wide=True,
-            )
-            for name, (side, axis) in sides.items()
-        ),
-        seconds=_by_stage(seconds),
-        kernels=_by_stage(kernels),
-        numbers={
-            **lines_of({key: value for key, value in result.items() if key not in _ELSEWHERE}),
-            **_numbers(manifest.model_dump(), folder),
-        },
-        camera=lines_of(manifest.camera),
-        configuration=lines_of(manifest.configuration),
-        versions=manifest.versions,
+        pictures=pictures,
+        seconds=_by_stage(result.get("seconds")),
+        kernels=_by_stage(result.get("kernels")),
+        **_of_manifest(manifest, folder, {key: value for key, value in result.items() if key not in _ELSEWHERE}),
     )
 
 
+def _of_manifest(manifest: Any, folder: Path, known: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what pages of runs and calibrations show of a manifest; ``known`` are its first numbers."""
+    files = [path for path in folder.iterdir() if path.is_file() and path.name != PAGE]
+    sizes = f"{len(files)}, {size_text(sum(path.stat().st_size for path in files))}"
+    numbers = {key: value for key, value in manifest.model_dump().items() if key not in _ELSEWHERE}
+    return {
+        "warnings": manifest.warnings,
+        "command": manifest.command,
+        "numbers": {**lines_of(known), **lines_of(numbers), "files": sizes},
+        "camera": lines_of(manifest.camera),
+        "configuration": lines_of(manifest.configuration),
+        "versions": manifest.versions,
+    }
+
+
 def _by_stage(data: Any) -> dict[str, float]:
-    """Those of some ``data`` that are numbers, by name: others may have written them."""
+    """Return the numbers of some ``data`` by name, because other programs may have written it."""
     listed = data.items() if isinstance(data, Mapping) else ()
     return {name: value for name, value in listed if isinstance(value, (int, float))}
 
 
-# ---- Images ----
+# -------- Images
 
 
 def _of_image(folder: Path) -> Shown:
     result = read_result(folder)
     image = finite_channel(read_frame(folder / IMAGE_FILE)[0], "reflectance", folder / IMAGE_FILE)
-    truth, quality = truth_of(result), result.get("psnr")
-    similar = result.get("ssim")
+    quality, similar, warnings = result.get("psnr"), result.get("ssim"), result.get("warnings") or ()
     known = [f"PSNR {quality:.1f} dB"] if isinstance(quality, float) else ["An image, and no truth to judge it by"]
     known += [f"SSIM {similar:.3f}"] if isinstance(similar, float) else []
-    warnings = result.get("warnings") or ()
     inputs = result.get("inputs") if isinstance(result.get("inputs"), dict) else {}
     numbers = {key: value for key, value in result.items() if key not in {*_ELSEWHERE, "inputs", MADE_OF}}
     return Shown(
         kind="Image",
         verdict=("Flagged. " if warnings else "") + ", ".join(known),
         detail="" if warnings else str(result.get("status", "")),
-        warnings=tuple(map(str, warnings)),
+        warnings=[*map(str, warnings)],
         command=result.get("command"),
-        pictures=tuple(_image_pictures(folder, result, image, truth)),
+        pictures=[*_image_pictures(folder, result, image)],
         seconds=_by_stage(result.get("seconds")),
         numbers=lines_of(numbers),
         configuration=lines_of({"inputs": inputs, MADE_OF: result.get(MADE_OF) or {}}),
     )
 
 
-def _image_pictures(
-    folder: Path, result: Mapping[str, Any], image: FloatArray, truth: FloatArray | None
-) -> Iterator[Picture]:
-    """Of an ``image`` in a ``folder``, by its ``result``, and of its ``truth``, where that is known."""
-    by_spread = POINT_SPREAD in (result.get("inputs") or {})
-    white = result.get("white")
+def _image_pictures(folder: Path, result: Mapping[str, Any], image: FloatArray) -> Iterator[Picture]:
+    """Draw an ``image`` and what is known of it: truth, error, uncertainty, depth and misfit."""
+    by_spread, white = POINT_SPREAD in (result.get("inputs") or {}), result.get("white")
     scale = Scale(0.0, white, "electrons/s") if by_spread and isinstance(white, float) else REFLECTANCE
     yield Picture.of("image", "The image", image, scale, f"{image.shape[0]} x {image.shape[1]} projector pixels")
+    truth = _truth_of(result)
     if truth is not None and truth.shape == image.shape:
         yield Picture.of("truth", "The truth", truth, REFLECTANCE, _TRUTH)
-        yield error_picture(image, truth)
-    if (path := folder / UNCERTAINTY_FILE).is_file():
-        values = finite_channel(read_frame(path)[0], "uncertainty", path)
-        about = "standard uncertainty that the image states of each pixel"
-        yield Picture.of("uncertainty", "How far to trust it", values, Scale.of(values, REFLECTANCE.unit, 0.0), about)
-    if (path := folder / DEPTH_FILE).is_file():
-        channels = read_frame(path)[0]
-        for name, channel, unit, title in (
-            ("depth", "depth_mm", "mm", "Depth of each pixel"),
-            ("confidence", "confidence", "(1: certain)", "How sure the depth is"),
-        ):
-            values = finite_channel(channels, channel, path)
-            scale = Scale.of(values, unit) if name == "depth" else Scale(0.0, 1.0, unit)
-            yield Picture.of(name, title, values, scale)
+        yield _error_picture(np.abs(image - truth), REFLECTANCE.unit, "|image \N{MINUS SIGN} truth|")
+    for file, name, channel, title, unit, about in (
+        (UNCERTAINTY_FILE, "uncertainty", "uncertainty", "How far to trust it", REFLECTANCE.unit,
+         "standard uncertainty that the image states of each pixel"),
+        (DEPTH_FILE, "depth", "depth_mm", "Depth of each pixel", "mm", ""),
+        (DEPTH_FILE, "confidence", "confidence", "How sure the depth is", "(1: certain)", ""),
+    ):  # fmt: skip
+        if (path := folder / file).is_file():
+            values = finite_channel(read_frame(path)[0], channel, path)
+            scale = Scale.of(values, unit, None if name == "depth" else 0.0)
+            scale = Scale(0.0, 1.0, unit) if name == "confidence" else scale
+            yield Picture.of(name, title, values, scale, about)
     misfit = result.get("misfit")
     tiles = np.array(misfit.get("map", []) if isinstance(misfit, dict) else [], dtype=np.float64)
     if tiles.ndim == 2 and tiles.size > 1 and np.isfinite(tiles).all():
@@ -336,39 +327,93 @@ def _image_pictures(
         yield Picture.of("misfit", "Where the frames do not fit", tiles, scale, about)
 
 
-def truth_of(result: Mapping[str, Any]) -> FloatArray | None:
-    """The truth that an image was compared with, while its run and calibration are where they were; None where they are
-    not, or have changed.
+def _error_picture(error: FloatArray, unit: str, about: str, least: float = 0.0) -> Picture:
+    """Draw the error of an image, on a scale to ``least`` at least that the largest hundredth of it exceeds."""
+    scale = Scale(0.0, max(float(np.percentile(error, _SHOWN_PERCENT)), least), unit)
+    return Picture.of("error", "How they differ", error, scale, about)
 
-    Parameters
-    ----------
-    result
-        what result.json holds.
-    """
+
+def _truth_of(result: Mapping[str, Any]) -> FloatArray | None:
+    """Return the truth that an image was compared with; None where run or calibration are gone, or have changed."""
     made_of, inputs = result.get(MADE_OF), result.get("inputs")
     if not isinstance(made_of, dict) or not isinstance(inputs, dict):
         return None
     try:
-        run, calibration = (Path(str(made_of[name])) for name in ("run", "calibration"))
-        shots, board = load_run(run), read_manifest(calibration, CalibrationManifest).board_reflectance
-        return truth_for(shots, board) if shots.fingerprint == inputs.get("run") else None
+        run = Path(str(made_of["run"]))
+        if open_lines(run, RUN, MOSAIC).filters:
+            mosaic = load_mosaic(run)
+            shots, truth = mosaic.shots, mosaic.truth(result.get("board_reflectance"))
+        else:
+            calibration = read_manifest(Path(str(made_of["calibration"])), CalibrationManifest)
+            shots = load_run(run)
+            truth = truth_for(shots, calibration.board_reflectance)
+        return truth if shots.fingerprint == inputs.get("run") else None
     except (KeyError, MitsimError):
         return None
 
 
-# ---- Folders of several ----
+# -------- Images in colour
 
 
-def _of_parts(folder: Path, names: Sequence[str], axis: str, unit: str = "") -> Shown:
-    """Of a ``folder`` of those ``names``, each a value of an ``axis`` in a ``unit``."""
-    parts = {name: _content(folder / name) for name in names}
-    first = next(iter(parts.values()))
+def _of_colours(lines: SpectralFolder) -> Shown:
+    """Show an image in colour; lines that were solved one by one have pages of their own."""
+    folder, colours = lines.folder, lines.colours
+    assert colours is not None
+    data = read_json(folder / COLOUR)
+    if data.get("status") == "incomplete":
+        raise MitsimError(f"{folder / COLOUR}: holds no result of a finished image; reconstruct it again")
+    verify_files(folder, data.get("checksums"), "reconstruct it again")
+    parts = {name: _of_image(folder / name) for name in lines.names if (folder / name / RESULT_FILE).is_file()}
+    files = [folder / name / IMAGE_FILE for name in lines.names]
+    images = np.stack([finite_channel(read_frame(file)[0], "reflectance", file) for file in files], axis=-1)
+    if parts:
+        truths = [_truth_of(read_json(folder / name / RESULT_FILE)) for name in parts]
+        known = [each for each in truths if each is not None and each.shape == images.shape[:2]]
+        truth = np.stack(known, axis=-1) if len(known) == len(lines.names) else None
+    else:
+        truth = _truth_of(data)
+        truth = truth if truth is not None and truth.shape == images.shape else None
+    place = None if data.get("chart") is None else validate(ChartPlace, data["chart"], f"{folder / COLOUR}: chart")
+    qualities = {
+        name: None if truth is None else Quality.of(images[..., number], truth[..., number])
+        for number, name in enumerate(lines.names)
+    }
+    image = ColourImage.of(colours, images, data.get("board_reflectance"), place, truth=truth, qualities=qualities)
+    verdict, detail = f"An image from {len(files)} spectral lines", "No truth to compare it with."
+    quality = "" if image.psnr_db is None else f"PSNR of the {len(files)} lines: {image.psnr_db:.1f} dB. "
+    if image.patches:
+        verdict = f"Mean Delta E 2000 of {len(image.patches)} patches: {image.patch_mean('delta_e'):.2f}"
+        floor = image.patch_mean("floor")
+        detail = f"{quality}The floor is {floor:.2f}: these spectral lines alone, without a camera."
+    elif image.delta_e is not None:
+        verdict = f"Mean Delta E 2000 to the truth: {image.delta_e.mean():.2f}"
+        detail = f"{quality}Mean over all pixels."
     return Shown(
-        kind=f"{first.kind} by {axis}",
-        verdict=f"{len(parts)} {axis}{'s' if len(parts) > 1 else ''}: {', '.join(parts)}{unit}",
-        warnings=tuple(f"{name}: {text}" for name, part in parts.items() for text in part.warnings),
-        command=first.command,
-        seconds=next(reversed(parts.values())).seconds,
-        versions=first.versions,
+        kind="Image in colour",
+        verdict=verdict,
+        detail=detail,
+        warnings=data.get("warnings") or (),
+        command=data.get("command"),
+        pictures=[*_colour_pictures(image)],
+        versions=versions(),
         parts=parts,
+        colours=image,
+        facts=data.get("facts") or {},
     )
+
+
+def _colour_pictures(image: ColourImage) -> Iterator[Picture]:
+    size = f"in sRGB under D65, {image.images.shape[0]} x {image.images.shape[1]} projector pixels"
+    ideal = "what a perfect image of the same lines would show, by the same matrix"
+    for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
+        if xyz is not None:
+            caption = f"{about}; white is a perfect reflector, and what lies beyond the screen's colours is cut"
+            yield Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST))
+    if image.delta_e is not None:
+        about = "1 is about the least difference that an eye sees side by side"
+        yield _error_picture(image.delta_e, "Delta E 2000", about, 1.0)
+    for number, line in enumerate(image.lines.channels):
+        title = f"{line.wavelength_nm:g} nm"
+        yield Picture.of(f"image_{line.name}", title, image.images[..., number], REFLECTANCE)
+        if image.truth is not None:
+            yield Picture.of(f"truth_{line.name}", f"{title}, truth", image.truth[..., number], REFLECTANCE)

@@ -1,16 +1,13 @@
-"""Light of a scene and a camera in; exposures of any pattern family, and the images they come to, out.
+"""Exposures of a scene under any pattern family, and the images that they give, for comparisons in studies.
 
-Twice: *rendered*, the light itself with calibrated factors, and *idealised*, the paper's model of the same scene with
-its own exact factors. Both have the same truth and sensor.
+There are two models with the same truth and the same sensor. The *rendered* model uses the traced light and calibrated
+factors. The *idealised* model is the paper's, with its own exact factors: a planar scene that is lit evenly, without
+falloff, and a geometric shadow of one separable term. It takes reflectance and mean flux from the rendered bench, so
+that exposure and noise are equal and only the model differs.
 
 Exposure conventions: *equal peak* exposes each family so that its brightest pixel fills the same part of the full well;
 *equal frame* gives every frame the exposure of uniform light; *equal total* shares that exposure among the family's
 frames. *A peak of 5600 electrons* is an equal peak that is dim.
-
-The idealised camera sees a planar scene lit evenly, no falloff, and with a geometric shadow one separable term: the
-yardstick beside rendered measurements. It takes the reflectance and the mean flux of the rendered bench, so exposure
-and noise are the same and only the model differs. Its shadows in several lights: how far from the geometric one, how
-far from one separable term.
 """
 
 from __future__ import annotations
@@ -51,28 +48,21 @@ from mitsim.sensor.specimen import response_variance
 # -------- Light of a scene and a camera in
 
 NONUNIFORMITY, SPECKLE = "response nonuniformity", "speckle"
-"""Sources of noise beside those of :mod:`mitsim.calibrate.board_session`."""
+"""Names of noise sources beside those of :mod:`mitsim.calibrate.board_session`."""
 DIM_E = 5600
 """Electrons of the brightest pixel with which the idealised model has the paper's decibels of uniform light and of 49
 dots, mask at 2000 um: 22.8 and 34.8 (`benchmarks/noise_reading.py --distance 2`)."""
 DIM = f"a peak of {DIM_E} electrons"
 LAMBDAS = tuple(float(relative) for relative in np.logspace(-14, 0, 57))
-"""Of the largest sigma^2: where none can be chosen by the data, the best of these, a quarter of a decade apart."""
+"""Lambdas relative to the largest sigma^2, a quarter of a decade apart, for a search with the truth."""
 
 
 class LitScene:
-    """A bench in its light.
-
-    Parameters
-    ----------
-    light
-        by projector pixel.
-    """
+    """A bench in its ``light``, traced by projector pixel."""
 
     def __init__(self, light: SampledLight) -> None:
         self.light, self.bench = light, light.bench
         self.uniform_s = cache(self._uniform_s)
-        """Exposure time [s] of uniform light at equal peak, by model."""
 
     @property
     def truth(self) -> FloatArray:
@@ -80,24 +70,15 @@ class LitScene:
         return self.light.truth
 
     def quality(self, image: FloatArray) -> Quality:
-        """How near an ``image`` (n, n) is to the truth."""
+        """Compare an (n, n) ``image`` with the truth."""
         return Quality.of(image, self.truth, self.light.apparent.error)
 
     def expected_frames(
         self, model: str, family: PatternFamily, plane: Plane | None = None, bench: Apparatus | None = None
     ) -> ExpectedFrames:
-        """Frames without noise.
+        """Return frames without noise, of one of :data:`mitsim.report.MODELS`.
 
-        Parameters
-        ----------
-        model
-            one of :data:`mitsim.report.MODELS`.
-        family
-            the patterns.
-        plane
-            where the idealised scene is; None: where the camera was calibrated.
-        bench
-            another mask in the same light; None: the scene's own.
+        ``plane`` is the place of an idealised scene, None for the calibrated one; ``bench`` may have another mask.
         """
         if model == RENDERED:
             light = self._merged if bench is None else self._merged.behind(bench)
@@ -106,27 +87,14 @@ class LitScene:
         return camera.frames(family, self.truth * self.board_flux, plane)
 
     def rendered_frames(self, factors: Factors, family: PatternFamily, seed: int) -> Unexposed:
-        """Rendered frames with calibrated factors.
-
-        Parameters
-        ----------
-        factors
-            of the camera.
-        family, seed
-            the patterns, and seed of the noise.
-        """
+        """Return rendered frames, and the calibrated ``factors`` that solve them; ``seed`` is of the noise."""
         sides = factors.left, factors.right
         return Unexposed(self, RENDERED, family, sides, factors.manifest.centre, seed)
 
     def idealised_frames(self, family: PatternFamily, seed: int, plane: Plane | None = None) -> Unexposed:
-        """Frames of the paper's model, with its own factors.
+        """Return frames of the paper's model with its own factors, of a scene in the calibrated or another ``plane``.
 
-        Parameters
-        ----------
-        family, seed
-            the patterns, and seed of the noise, which is not that of rendered frames.
-        plane
-            where the scene is; None: where the factors are of.
+        The noise has another seed than that of rendered frames.
         """
         camera = self._ideal
         return Unexposed(self, IDEALISED, family, camera.calibrated(self.board_flux), camera.centre, seed + 1, plane)
@@ -144,24 +112,16 @@ class LitScene:
 
     @property
     def board_flux(self) -> float:
-        """That a projector pixel of a white board puts on the sensor without the mask [W m^-2], mean over pixels."""
+        """Mean irradiance on the sensor without the mask by a projector pixel of a white board [W m^-2]."""
         return float(self.light.apparent.board_flux.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class Unexposed:
-    """Frames of a scene under a family before any exposure, and the factors that make images of them.
+    """Frames of a scene under a family before any exposure, and the factors that solve them.
 
-    Attributes
-    ----------
-    lit, model, family
-        the scene, one of :data:`mitsim.report.MODELS`, and the patterns.
-    sides, centre
-        left and right factor, and whether means are taken out of frames.
-    seed
-        of the sensor's noise.
-    plane
-        where an idealised scene is; None: where its factors are of.
+    ``model`` is one of :data:`mitsim.report.MODELS`; ``centre`` is True where means are subtracted from frames;
+    ``plane`` is the place of an idealised scene, None for the plane of the factors.
     """
 
     lit: LitScene
@@ -174,19 +134,21 @@ class Unexposed:
 
     @cached_property
     def expected(self) -> ExpectedFrames:
-        """The frames, without noise."""
+        """Frames without noise."""
         return self.lit.expected_frames(self.model, self.family, self.plane)
 
     def seconds(self, exposure: str) -> float:
-        """Exposure time [s] of each frame by the convention ``exposure``, one of ``CONVENTIONS`` or :data:`DIM`."""
+        """Return the exposure time [s] of a frame by a convention, one of ``CONVENTIONS`` or :data:`DIM`."""
         if exposure in (EQUAL_PEAK, DIM):
             peak_e = Exposure().fraction * self.lit.bench.sensor.superpixel_full_well_e
             return peak_time(self.lit.bench, self.expected) * (DIM_E / peak_e if exposure == DIM else 1.0)
         return self.lit.uniform_s(self.model) / (len(self.family.shots) if exposure == EQUAL_TOTAL else 1)
 
     def prepare(self, binning: int = 1) -> Prepared:
-        """The factorised model of frames whose pixels are averaged ``binning`` x ``binning``. MitsimError where such
-        squares do not fill a frame."""
+        """Return the factorised model of frames whose pixels are averaged ``binning`` x ``binning``.
+
+        MitsimError where such squares do not fill a frame.
+        """
         rows, columns = (len(side) for side in self.sides)
         if rows % binning or columns % binning:
             raise MitsimError(
@@ -197,28 +159,20 @@ class Unexposed:
         return prepare(left, right, self.family.left, self.family.right, centre=self.centre)
 
     def data(self, seconds: float, binning: int = 1) -> tuple[Prepared, Accumulator]:
-        """The factorised model, and one noisy exposure of all frames added up for it.
-
-        Parameters
-        ----------
-        seconds, binning
-            as for :meth:`solve`.
-        """
+        """Return the factorised model, and one noisy exposure of all frames, accumulated for it."""
         model = self.prepare(binning)
         (sums,) = accumulate(self.exposer(seconds), self.family, self.expected, [model], binning)
         return model, sums
 
     def solve(self, seconds: float, lam: float | Literal["auto", "best"] = "auto", binning: int = 1) -> Solution:
-        """The image of one exposure.
+        """Solve one exposure of so many ``seconds`` a frame.
 
         Parameters
         ----------
-        seconds
-            exposure time of each frame.
         lam
-            lambda; best: that of :data:`LAMBDAS` which is nearest to the truth.
+            Lambda; "best" takes the one of :data:`LAMBDAS` whose image is nearest to the truth.
         binning
-            pixels a side that are averaged.
+            Pixels a side that are averaged.
         """
         model, sums = self.data(seconds, binning)
         if lam != "best":
@@ -228,7 +182,7 @@ class Unexposed:
 
     @single_threaded_blas()
     def clear(self, lam: float) -> FloatArray:
-        """(n, n) image of the frames without noise, by a lambda ``lam``; lamps' light is taken off without any, too."""
+        """Solve the frames without noise by a lambda; the light of lamps is subtracted without noise, too."""
         model, exposer, expected = self.prepare(), self.exposer(1.0), self.expected
         off = exposer.electrons(expected.projector_off) if takes_ambient_frame("auto", self.family, expected) else 0.0
         sums, positive = model.accumulator(), np.zeros(())
@@ -241,18 +195,18 @@ class Unexposed:
         return model.solve(sums, lam).image
 
     def exposer(self, seconds: float) -> Exposer:
-        """The camera, at an exposure time of so many ``seconds``."""
+        """Return the camera at an exposure time of so many ``seconds``."""
         speckle = self.lit.light.speckle(self.family) if self.model == RENDERED else 0.0
         return Exposer(self.lit.bench.devices, seconds, self.seed, speckle)
 
     def noise(self, seconds: float) -> float:
-        """Standard deviation of a datum [electrons/s], rms over all frames, of exposures of so many ``seconds``."""
+        """Return the standard deviation of a datum [electrons/s], rms over all frames, at so many ``seconds``."""
         return float(np.sqrt(sum(self.noises(seconds).values())))
 
     def noises(self, seconds: float) -> dict[str, float]:
-        """Its variance [(electrons/s)^2] by source, of exposures of so many ``seconds``.
+        """Return the variance of a datum [(electrons/s)^2] by source, at so many ``seconds``.
 
-        What pixels' responses differ by is fixed, and counts as noise: factors know nothing of it.
+        Differences between the pixels' responses are fixed, but count as noise because the factors lack them.
         """
         exposer, sensor = self.exposer(seconds), self.lit.bench.sensor
         light = [exposer.electrons(frame) for frame in self.expected]
@@ -269,13 +223,12 @@ class Unexposed:
 
 
 def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
-    """Exposure time [s] on ``bench`` at equal peak: the brightest pixel of the ``expected`` frames fills the default
-    part of the full well."""
+    """Return the exposure time [s] at which the brightest expected pixel fills the default part of the full well."""
     return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
 def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
-    """A ``frame`` (m, m') whose pixels are averaged ``binning`` x ``binning``, which divides both sides."""
+    """Average ``binning`` x ``binning`` pixels of a ``frame`` (m, m'), whose sides are multiples of it."""
     if binning == 1:
         return frame
     rows, columns = (size // binning for size in frame.shape)
@@ -285,14 +238,9 @@ def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
-    """One noisy exposure of a family's frames, ambient light taken off where there is some, added up for each model.
+    """Expose a family's frames once, subtract ambient light where there is some, and accumulate them for each model.
 
-    Parameters
-    ----------
-    exposer, family, expected, models
-        the camera and its exposure, patterns, their frames without noise, and what these are to be solved with.
-    binning
-        pixels a side that are averaged after the exposure.
+    Pixels are averaged ``binning`` x ``binning`` after the exposure.
     """
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
@@ -307,7 +255,7 @@ def accumulate(
 # -------- The paper's idealised camera
 
 BROADBAND_NM, BROADBAND_BANDS = (400.0, 700.0), 13
-"""What a camera with a usual filter sees, in bands of 23 nm, over which a shadow's fringes hardly move."""
+"""Range of a camera with a usual filter, in bands of 23 nm, over which a shadow's fringes hardly move."""
 GEOMETRIC, LINE, PROJECTOR, BROADBAND = "no diffraction", "one line", "projector", "broadband"
 
 Pair = tuple[FloatArray, FloatArray]
@@ -316,8 +264,7 @@ Pair = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera, along rows and columns (index
-    coordinates)."""
+    """A plane scene at ``depth_mm``, lit from ``baseline_mm`` beside the camera along rows and columns."""
 
     depth_mm: float
     baseline_mm: tuple[float, float]
@@ -325,7 +272,7 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class IdealCamera:
-    """The idealised camera of a ``bench``, with one mask in one light (``spectrum`` None: the geometric shadow)."""
+    """The idealised camera of a ``bench``, with one mask in one light; a ``spectrum`` of None has no diffraction."""
 
     bench: Apparatus
     mask: CameraMask
@@ -333,44 +280,40 @@ class IdealCamera:
 
     @property
     def centre(self) -> bool:
-        """Whether a solver takes row and column means off its frames."""
+        """True if a solver subtracts row and column means from the frames."""
         return self._geometry.centred
 
     @cached_property
     def terms(self) -> SeparableTerms:
-        """Its operator, from pixels that shine evenly."""
+        """The camera's operator, of projector pixels that shine evenly."""
         return self._terms(*self.directions)
 
     def points(self) -> SeparableTerms:
-        """The same operator for point sources at the centres of the projector's pixels."""
+        """Return the camera's operator for point sources at the centres of the projector's pixels."""
         rows, columns = (Directions(pixels.centres, 0.0) for pixels in self.directions)
         return self._terms(rows, columns)
 
     @cached_property
     def factors(self) -> Pair:
-        """(pixels, n) left and right factor of the nearest separable operator, of transmissions."""
+        """(pixels, n) left and right factor of the nearest separable operator [transmission]."""
         best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
     def calibrated(self, board_flux: float) -> Pair:
-        """The same factors as a calibration has them [sqrt(electrons / s)], where each pixel of a white board puts
-        ``board_flux`` [W m^-2] on the sensor without the mask."""
+        """Return the factors in a calibration's unit [sqrt(electrons / s)].
+
+        ``board_flux`` [W m^-2] is the irradiance by a pixel of a white board on the sensor without the mask.
+        """
         model = self.bench.projector
         rate = electrons_from_irradiance(board_flux, 1.0, self.bench.sensor, model.effective_wavelength_nm)
         left, right = self.factors
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
-        """Frames of a family.
+        """Return the frames of a family.
 
-        Parameters
-        ----------
-        family
-            the patterns.
-        flux
-            (n, n) [W m^-2] that each projector pixel puts on the sensor without the mask.
-        plane
-            where the scene is; None: where the camera was calibrated.
+        ``flux`` (n, n) is the irradiance by each projector pixel on the sensor without the mask [W m^-2]; a ``plane``
+        of None is the calibrated one.
         """
         light = sparse.csr_array(sparse.diags_array(flux.ravel()))
         optics = self._optics if plane is None else self._optics_at(plane)
@@ -390,7 +333,7 @@ class IdealCamera:
 
     @property
     def directions(self) -> tuple[Directions, Directions]:
-        """Of the projector's pixels, along rows and columns."""
+        """Directions of the projector's pixels, along rows and columns."""
         rows, columns = (Directions.cells(np.linspace(*edges, self.bench.n + 1)) for edges in self.bench.windows)
         return rows, columns
 
@@ -404,12 +347,12 @@ class IdealCamera:
 
 @dataclass(frozen=True)
 class ShadowRow:
-    """One mask in one light against its geometric shadow; relative rms differences of operators, no unit.
+    """A mask in one light compared with its geometric shadow: relative rms differences of operators.
 
-    ``terms``: separable terms of the operator. ``point_source`` and ``scene_pixel``: difference from the geometric
-    shadow, for point sources at the centres of projector pixels and averaged over these pixels. ``factor``: difference
-    of the factor that a solver uses on one side. ``separability``: what the best single separable term leaves of the
-    operator, and ``separability_centred`` once row and column means are taken off its frames.
+    ``terms`` counts separable terms. ``point_source`` and ``scene_pixel`` are differences from the geometric shadow,
+    for point sources at the centres of projector pixels and averaged over these pixels; ``factor`` is the difference
+    of the factor that a solver uses on one side. ``separability`` is the remainder of the operator without its best
+    separable term, and ``separability_centred`` the same after row and column means are subtracted.
     """
 
     mask: str
@@ -424,7 +367,7 @@ class ShadowRow:
 
 
 def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
-    """The study's lights on ``bench`` by name; None is light that does not diffract."""
+    """Return the lights that are compared, by name; None is light without diffraction."""
     edges = np.linspace(*BROADBAND_NM, BROADBAND_BANDS + 1)
     return {
         GEOMETRIC: None,
@@ -435,7 +378,7 @@ def lights(bench: Apparatus) -> dict[str, Spectrum | None]:
 
 
 def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
-    """The camera in one ``light`` of the ``systems`` of one mask, compared with the geometric one of them."""
+    """Compare the camera in one ``light`` with the geometric one among the ``systems`` of a mask."""
     system, geometric = systems[light], systems[GEOMETRIC]
     factor, assumed = system.factors[0], geometric.factors[0]
     # (left, right) and (-left, -right) are one camera.
@@ -454,8 +397,7 @@ def shadow_row(light: str, systems: Mapping[str, IdealCamera]) -> ShadowRow:
 
 
 def point_profiles(bench: Apparatus) -> dict[str, FloatArray]:
-    """(pixels,) shadow of a point on the axis of ``bench`` down the rows of the sensor, through the separable mask, by
-    light."""
+    """Return the (pixels,) shadow of a point on the axis, down the rows behind the separable mask, by light."""
     camera, axis = bench.geometry.model_copy(update={"mask": "separable"}), Directions(np.zeros(1), 0.0)
     return {
         name: best_term(shadow_terms(camera, axis, axis, camera.scene_distance, spectrum)).left[:, 0]

@@ -1,7 +1,6 @@
-"""What people read: rows of a study in, means with standard errors and a tidy CSV file out; numbers as text; a template
-and what it shows in, one self-contained HTML page out.
+"""Parts of HTML pages: templates, numbers as text, plans as bars, and pictures of numbers.
 
-Processes that measure points load this and neither templates nor figures.
+Processes that measure points import this module, and load neither templates nor figures.
 """
 
 from __future__ import annotations
@@ -17,10 +16,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import whole_file
-from mitsim.core.images import data_uri
+from mitsim.core.files import whole_file, write_bytes
+from mitsim.core.images import data_uri, png
+from mitsim.core.job import size_text
+from mitsim.core.parallel import in_threads
+from mitsim.light.plan import PlanRow
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -29,28 +33,16 @@ if TYPE_CHECKING:
 # -------- Pages
 
 _SHOWN_DPI = 110
-"""Figures are 8.6 inches wide at most: 946 pixels of the page."""
 
 
 def render_page(template: str, filters: Mapping[str, Callable[..., str]] | None = None, **shown: Any) -> str:
-    """A page as text.
-
-    Parameters
-    ----------
-    template
-        file of ``mitsim/report/templates``.
-    filters
-        of its own, by name, beside ``sci`` and ``seconds`` of a number, ``typeset`` of a text and ``sentence`` of a
-        warning.
-    **shown
-        what it shows, by the names that it has there; one that is missing is an error.
-    """
+    """Render a template of ``mitsim/report/templates``, with ``filters`` of its own; a missing variable is an error."""
     return _environment(tuple((filters or {}).items())).get_template(template).render(**shown)
 
 
 @cache
 def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environment:
-    """Templates with these ``filters``, kept for the next page: to compile them takes longer than to fill them."""
+    """Return templates with these ``filters``, kept for the next page because compiling takes longer than filling."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = PackageLoader("mitsim.report")
@@ -63,17 +55,9 @@ def _environment(filters: tuple[tuple[str, Callable[..., str]], ...]) -> Environ
 
 
 def page_figure(figure: Figure) -> tuple[str, int]:
-    """A figure for a page: an SVG, sharp at any size, of a third of a PNG's bytes; the same of the same figure.
+    """Return a figure as the data URI of an SVG, and its width on a page [pixels].
 
-    Parameters
-    ----------
-    figure
-        drawn.
-
-    Returns
-    -------
-    tuple of str and int
-        its data URI, and how wide it is shown [pixels].
+    An SVG is sharp at any size and has a third of a PNG's bytes. The same figure gives the same bytes.
     """
     from matplotlib import rc_context
 
@@ -83,38 +67,29 @@ def page_figure(figure: Figure) -> tuple[str, int]:
 
 
 def written_figure(figure: Figure, path: Path) -> tuple[str, int]:
-    """The same of a ``figure`` that was written to the PNG file ``path``, which takes no time."""
+    """Return a ``figure`` that was written to the PNG file ``path`` as data URI, and its width on a page [pixels]."""
     return data_uri(path.read_bytes(), "png"), round(float(figure.get_figwidth()) * _SHOWN_DPI)
 
 
 def figure_uri(figure: Figure, dots_per_inch: int) -> str:
-    """A figure as a data URI.
-
-    Parameters
-    ----------
-    figure
-        drawn.
-    dots_per_inch
-        of its picture.
-    """
+    """Return a figure as the data URI of a PNG."""
     figure.savefig(buffer := BytesIO(), format="png", dpi=dots_per_inch)
     return data_uri(buffer.getvalue())
 
 
-# -------- Numbers and plain text in, the same as a page or a figure prints them out
+# -------- Numbers and plain text as pages and figures print them
 
 DASH = "\N{EN DASH}"
-"""Where there is no number."""
 _SUPERSCRIPT = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TIMES = "\N{MULTIPLICATION SIGN}"
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]?\d+)(?![\w.]\w)")
-"""A number such as 4.9e-03, and neither a part of a name nor of a longer number."""
+"""A number such as 4.9e-03 that is no part of a name or of a longer number."""
 _SIZE = re.compile(r"(?<![\w:.])(\d+(?:\.\d+)?)( ?)x\2(?=\d+(?:\.\d+)?(?![\w:]))")
 """512 x 512 and 3x3, but not dots:7x16."""
 
 
 def scientific(value: float | None) -> str:
-    """A number of three digits, a ``value`` below 0.01 or from 10,000 on of two with a power of ten; None as a dash."""
+    """Print three digits, or two and a power of ten below 0.01 and from 10,000 on; None is a dash."""
     if value is None or value == 0.0:
         return DASH if value is None else "0"
     if 1e-2 <= abs(value) < 1e4:
@@ -123,18 +98,12 @@ def scientific(value: float | None) -> str:
 
 
 def duration(value: float) -> str:
-    """Seconds, a ``value``, in three digits."""
+    """Print seconds in three digits."""
     return f"{value:.2f} s" if value < 10 else f"{value:.1f} s" if value < 100 else f"{value:.0f} s"
 
 
 def round_to_error(value: float, error: float) -> str:
-    """A number to the second digit of its standard error.
-
-    Parameters
-    ----------
-    value, error
-        in one unit; an error of 0, or none that is finite, leaves five digits.
-    """
+    """Print a number to the second digit of its standard error, or five digits where the error is 0 or not finite."""
     if not (error > 0 and math.isfinite(error) and math.isfinite(value)):
         return f"{value:.5g}"
     places = 1 - math.floor(math.log10(error))
@@ -142,18 +111,14 @@ def round_to_error(value: float, error: float) -> str:
 
 
 def reflectance(value: float) -> str:
-    """An error in reflectance, its ``value``: four places, as all are below 1 and few below 0.001."""
+    """Print an error in reflectance in four places, because all are below 1 and few are below 0.001."""
     return f"{value:.4f}" if value >= 1e-3 else scientific(value)
 
 
 def with_error(value: float, error: float, unit: str = "") -> str:
-    """A number and its standard error, neither finer than 0.01: to the second digit of the error, without one that
-    rounds to nothing.
+    """Print a number and its standard error to the second digit of the error, but not finer than 0.01.
 
-    Parameters
-    ----------
-    value, error, unit
-        in one unit, which stands behind both.
+    An error that rounds to 0 is left out.
     """
     places = min(max(1 - math.floor(math.log10(error)), 0), 2) if error > 0 else 2
     deviation = f" \N{PLUS-MINUS SIGN} {error:.{places}f}" if round(error, 2) else ""
@@ -162,13 +127,12 @@ def with_error(value: float, error: float, unit: str = "") -> str:
 
 
 def sentence(text: str) -> str:
-    """A warning ``text`` of the command line as a sentence: a capital first, a full stop last."""
+    """Turn a warning of the command line into a sentence with a capital and a full stop."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def typeset(text: str) -> str:
-    """A ``text`` for people: 4.9e-03 as a power of ten and 4.9e-02 without one, +- as one sign, 512 x 512 with a times
-    sign, um with a Greek letter."""
+    """Replace 4.9e-03 by a power of ten, 4.9e-02 by 0.049, +- by one sign, x in sizes by a times sign and um by µm."""
     text = _POWER.sub(_power, text).replace("+-", "\N{PLUS-MINUS SIGN}")
     text = _SIZE.sub(rf"\1\2{_TIMES}\2", text)
     return re.sub(r"(?<=[\d\[(] )um\b|(?<=[\[(/])um\b", "\N{GREEK SMALL LETTER MU}m", text)
@@ -182,6 +146,227 @@ def _power(found: re.Match[str]) -> str:
         return f"{float(found[0]):.{max(len(mantissa.partition('.')[2]) - exponent, 0)}f}"
     power = f"10{str(exponent).translate(_SUPERSCRIPT)}"
     return power if float(mantissa) == 1 and "." not in mantissa else f"{mantissa}{_TIMES}{power}"
+
+
+# -------- Plans, times and plain data on a page
+
+_LEAST_STAGE = 0.01
+"""Part of the total time below which a stage has no line of its own: its bar would be three pixels wide."""
+_LEAST_ERROR = 1e-7
+"""Smallest end of the scale of errors: smaller errors in plans are rounding."""
+_MOST_LISTED = 6
+
+
+class EffectBar(NamedTuple):
+    """Row of a plan's chart, and the widths of its two bars [%]."""
+
+    row: PlanRow
+    error: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class PlanChart:
+    """A plan as bars: effects that are on or would change frames, and idle rows.
+
+    ``decades`` are the powers of ten at the ends of the scale of errors, on which ``mark`` [%] is the place of the
+    accuracy.
+    """
+
+    bars: tuple[EffectBar, ...]
+    idle: tuple[PlanRow, ...]
+    decades: tuple[int, int]
+    accuracy: float | None
+    mark: float | None
+
+    @classmethod
+    def of(cls, rows: Sequence[PlanRow], accuracy: float | None) -> PlanChart:
+        """Lay out the ``rows`` of a plan at an ``accuracy``."""
+        shown = [row for row in rows if row.state != "off" or row.error_if_off]
+        errors = [max(row.error_if_off, _LEAST_ERROR) for row in shown if row.error_if_off] + [accuracy or 0.0]
+        logs = [math.log10(error) for error in errors if error] or [-6.0, 0.0]
+        low = math.floor(min(logs))
+        high = max(math.ceil(max(logs)), low + 1)
+
+        def place(error: float | None) -> float:
+            return 100 * (math.log10(max(error, 10.0**low)) - low) / (high - low) if error else 0.0
+
+        longest = max((row.seconds for row in shown), default=0.0) or math.inf
+        bars = tuple(EffectBar(row, place(row.error_if_off), 100 * row.seconds / longest) for row in shown)
+        idle = tuple(row for row in rows if row not in shown)
+        return cls(bars, idle, (low, high), accuracy, place(accuracy) if accuracy else None)
+
+    @property
+    def costly(self) -> bool:
+        """True if any effect takes time."""
+        return any(bar.row.seconds for bar in self.bars)
+
+
+def plan_rows(plan: Mapping[str, Any] | None) -> tuple[PlanRow, ...]:
+    """Return the rows of a ``plan`` from a manifest, without rows that other programs wrote in another form."""
+    listed = (plan or {}).get("effects")
+    rows = []
+    for each in listed if isinstance(listed, list) else ():
+        match each:
+            case {
+                "name": str(name),
+                "state": ("exact" | "approximate" | "off") as state,
+                "reason": str(reason),
+                "error_if_off": (float() | int() | None) as error,
+                "seconds": (float() | int()) as seconds,
+            }:
+                rows.append(PlanRow(name, state, reason, error, seconds))
+    return tuple(rows)
+
+
+def stages_of(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Return the seconds of each stage that takes a visible part of the total, and the rest as "all else"."""
+    total, stages = total_of(seconds), {name: value for name, value in seconds.items() if name != "total"}
+    shown = {name: value for name, value in stages.items() if value >= _LEAST_STAGE * total}
+    rest = total - math.fsum(shown.values())
+    return shown | ({"all else": rest} if stages and rest > _LEAST_STAGE * total else {})
+
+
+def total_of(seconds: Mapping[str, float]) -> float:
+    """Return the total of ``seconds`` by stage, stated or added up."""
+    return seconds.get("total", math.fsum(seconds.values()))
+
+
+def lines_of(data: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Flatten JSON ``data`` to lines of a table, by dotted name, without long lists and missing values."""
+    lines: dict[str, str] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            lines |= lines_of(value, f"{name}.")
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            plain = not any(isinstance(each, (Mapping, list, tuple)) for each in value)
+            if value and plain and len(value) <= _MOST_LISTED:
+                lines[name] = ", ".join(map(_text, value))
+        elif value is not None:
+            lines[name] = size_text(value) if key.endswith("_bytes") else _text(value)
+    return lines
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# -------- Pictures of numbers, which state what black and white are
+
+SMALLEST, LARGEST = 512, 1024
+"""Pixels a side of a picture: an image of 128 is shown four times as large, and 1024 fill a page in one dot each."""
+_MOST_FRAMES = 64
+_MOST_READ = _MOST_FRAMES << 18
+"""Pixels that are read for a contact sheet: 64 frames of 512 x 512 take 0.3 s, and larger frames are fewer."""
+_LONGEST = 4
+"""Largest ratio of rows to columns of a contact sheet, and of columns to rows, that fits a page."""
+_GAP = 2
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Numbers, in a ``unit``, that are black and white in a picture."""
+
+    black: float
+    white: float
+    unit: str
+
+    @classmethod
+    def of(cls, values: npt.ArrayLike, unit: str, black: float | None = None) -> Scale:
+        """Scale numbers from ``black``, by default the least of ``values``, to the largest of them."""
+        return cls(float(np.min(values)) if black is None else black, float(np.max(values)), unit)
+
+    def levels(self, values: npt.NDArray[Any]) -> FloatArray:
+        """Return ``values`` with black at 0 and white at 1; all black where the ends are equal."""
+        span = self.white - self.black
+        return (np.asarray(values, dtype=np.float64) - self.black) / (span if span > 0 else np.inf)
+
+    def words(self, values: npt.NDArray[Any]) -> str:
+        """State both ends, and the part of the ``values`` beyond them."""
+        beyond = float(np.mean((values < self.black) | (values > self.white)))
+        cut = f"; {beyond:.2g} of the pixels lie beyond" if beyond else ""
+        black, white = (f"{end:.0f}" if abs(end) >= 1000 else f"{end:.3g}" for end in (self.black, self.white))
+        return f"black {black}, white {white} {self.unit}{cut}"
+
+
+REFLECTANCE = Scale(0.0, 1.0, "of the board's reflectance")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG with the ``name`` of its file, a title and a caption; a ``wide`` one takes the whole width of a page."""
+
+    name: str
+    title: str
+    caption: str
+    data: bytes
+    wide: bool = False
+
+    @classmethod
+    def of(
+        cls, name: str, title: str, values: npt.NDArray[Any], scale: Scale, about: str = "", wide: bool = False
+    ) -> Picture:
+        """Draw numbers (rows, columns), enlarged or reduced by whole factors, with ``about`` and the scale below."""
+        words = scale.words(values)
+        caption = f"{about}: {words}" if about else words
+        return cls(name, title, caption, png(scale.levels(values), LARGEST, SMALLEST), wide)
+
+    @property
+    def uri(self) -> str:
+        """The PNG as a data URI."""
+        return data_uri(self.data)
+
+    def write(self, folder: Path) -> Path:
+        """Write the PNG to a ``folder``, whole or not at all, and return its path."""
+        path = folder / f"{self.name}.png"
+        write_bytes(path, self.data)
+        return path
+
+
+def write_beside(path: Path, values: npt.NDArray[Any], unit: str) -> tuple[Path, str]:
+    """Write a picture beside a frame's file, as ``FRAME.exr.png``, and return its path and caption."""
+    picture = Picture.of(path.name, path.name, values, Scale.of(values, unit))
+    return picture.write(path.parent), picture.caption
+
+
+def contact_sheet(read: Callable[[int], FloatArray], count: int, shape: tuple[int, int], columns: int) -> Picture:
+    """Draw all frames of a capture side by side, or as many of them, evenly taken, as fit a page.
+
+    Parameters
+    ----------
+    read
+        Returns frame number i less the black level, (rows, columns) [DN].
+    count, shape, columns
+        Number of frames, (rows, columns) of each, and frames a row as the patterns have them.
+    """
+    most = max(1, min(_MOST_FRAMES, _MOST_READ // (shape[0] * shape[1])))
+    chosen = [number * count // most for number in range(most)] if count > most else [*range(count)]
+    if count > most or columns**2 > _LONGEST * count or columns**2 * _LONGEST < count:
+        columns = math.ceil(math.sqrt(len(chosen)))
+    rows = math.ceil(len(chosen) / columns)
+    factor = max(1, math.ceil(max(rows * shape[0], columns * shape[1]) / LARGEST))
+    down, across = (min(factor, side) for side in shape)
+    tall, broad = shape[0] // down, shape[1] // across
+
+    def reduced(number: int) -> FloatArray:
+        frame = read(number)[: tall * down, : broad * across]
+        return np.asarray(frame.reshape(tall, down, broad, across).mean(axis=(1, 3)))
+
+    frames = in_threads(reduced, chosen)
+    white = max(float(frame.max()) for frame in frames)
+    sheet = np.full((rows * (tall + _GAP) - _GAP, columns * (broad + _GAP) - _GAP), white)
+    for place, frame in enumerate(frames):
+        top, left = place // columns * (tall + _GAP), place % columns * (broad + _GAP)
+        sheet[top : top + tall, left : left + broad] = frame
+    scale = Scale(0.0, white, "DN above the black level")
+    which = f"all {count}" if len(chosen) == count else f"{len(chosen)} of {count}, evenly taken"
+    order = f"row by row, {columns} a row" if columns > 1 else "one below the other"
+    mean = f"; a pixel is the mean of {factor} x {factor}" if factor > 1 else ""
+    data = png(scale.levels(sheet), smallest=SMALLEST)
+    return Picture("frames", "What the camera recorded", f"{which}, {order}{mean}: {scale.words(sheet)}", data, True)
 
 
 # -------- Rows of a study in, their means out

@@ -1,7 +1,6 @@
-"""Arrays and means in, matplotlib Figures out: one message a figure, units on every axis.
+"""Matplotlib figures with one message each and units on every axis.
 
-Colours are safe for the colour-blind. The caller saves the figure; no pyplot state is touched. What one study alone
-draws stands with that study.
+Colours are safe for the colour-blind. The caller saves the figure, and no state of pyplot is touched.
 """
 
 from __future__ import annotations
@@ -9,65 +8,70 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import FuncNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.images import lightness
+from mitsim.core.errors import ArgumentError
+from mitsim.core.images import lightness, linear_light
 from mitsim.report.pages import Mean, scientific, typeset
+
+if TYPE_CHECKING:
+    from mitsim.acquire.reference import Rendered
+    from mitsim.acquire.sense import Sensed
+    from mitsim.core.runs import Capture
+    from mitsim.light.plan import Plan
+    from mitsim.reconstruct.factors import Factors
+    from mitsim.reconstruct.reconstruct import Reconstruction
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK = "#56B4E9", "#CC79A7", "#1b1f24"
-"""Okabe and Ito's palette: distinct in all common forms of colour blindness, and in grey."""
+"""Okabe and Ito's palette, distinct in all common forms of colour blindness and in grey."""
 _PALETTE = (BLACK, ORANGE, SKY, BLUE, VERMILION, GREEN, PURPLE)
 _STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-"""Seven of each, so that as many curves can be told apart."""
 _GRID, LINK, GREY, PALE = "#e5e7eb", "#d1d5db", "#6b7280", "#c7d2de"
-"""Lines behind the data, between them, and beside them: lighter than any curve; and bars that others stand beside."""
+"""Colours of grid lines, lines between data, lines beside data, and bars for comparison."""
 FONT = 11.0
-"""Points: as large as the text of a page of 8.6 inches."""
+"""Points: as large as the text of a page that is :data:`WIDTH` inches wide."""
 WIDTH = 8.6
-"""Inches: a page of text."""
 COLUMN = 4.65
-"""Inches of a figure of curves: two stand beside each other on a page, and one fits a telephone without shrinking its
-letters below 12 pixels."""
+"""Inches of a figure of curves: two fit a page side by side, and one fits a telephone with letters of 12 pixels."""
 _BARS = 6.2
-"""Inches of a figure of bars with their names: one fits a telephone with letters of 10 pixels."""
+"""Inches of a figure of bars with their names, which fits a telephone with letters of 10 pixels."""
 _PANEL = 2.3
-"""Inches of a panel of curves: half as high as it is wide."""
 _CELL = 1.5
-"""Inches of an image in a grid, at most: six stand on a page."""
+"""Largest size [inches] of an image in a grid: six fit a page."""
 _LABEL = 1.1
 """Inches beside a grid for the names of its rows."""
 _CAPTION = 0.32
 """Inches of a row for the captions below its images."""
 _LETTER = 0.085
-"""Inches of a letter of such a name, on the average."""
+"""Mean width of a letter [inches]."""
 _HANDLE = 0.6
-"""Inches of a line in a legend, and of the room beside its name."""
+"""Inches of a line in a legend, and of the space beside its name."""
 ROW = 0.27
-"""Inches of a row of bars: a line of text, and a third of one between two."""
+"""Inches of a row of bars: a line of text, and a third of a line between two."""
 _NAME_LETTERS = 34
-"""Of a line of the name of a bar: half of the figure is left for bars."""
+"""Letters in a line of a bar's name, which leave half of the figure to the bars."""
 _UPRIGHT_LETTERS, TITLE_LETTERS = 26, 46
-"""Of a line along a panel of curves, and above it."""
+"""Letters in a line beside and above a panel of curves."""
 LOGARITHMIC = 30.0
-"""Largest over least value from which an axis is logarithmic: on a linear one the smaller half of its decades lies
-within a dot of nothing."""
+"""Ratio of the largest to the least value from which an axis is logarithmic."""
 Curve = Mapping[Any, Mean]
 """Means by what varies: numbers, or their text."""
 Point = tuple[float, float]
 """Wall seconds, relative error."""
 _SHORT_AXIS = 30.0
-"""Range of a logarithmic axis below which powers of ten alone leave one tick or none."""
+"""Range of a logarithmic axis below which powers of ten alone leave at most one tick."""
 
 
 # -------- Figures
@@ -81,25 +85,18 @@ def curves(
     ticks: bool = True,
     title: str = "",
 ) -> Figure:
-    """Curves with bars of one standard error, in panels below each other on one scale.
+    """Draw curves with bars of one standard error, in panels below each other on one scale.
+
+    Panels with fewer than two places along x are left out; a figure without panels is empty (:func:`tells`).
 
     Parameters
     ----------
     panels
-        curves by name, by the panels' titles; one without points has its colour all the same.
-    x, y
-        names of the axes, with units.
+        Curves by name, by the panels' titles. A curve without a name is not in the legend.
     log
-        whether x is logarithmic even where its numbers span little (:func:`spans_decades`).
+        True for a logarithmic x axis even where the numbers span less than :func:`spans_decades` asks for.
     ticks
-        whether every x that was measured has a tick, as far as there is room.
-    title
-        of all panels.
-
-    Notes
-    -----
-    A curve alone needs no name: an empty one has no line in the legend. A panel without two places along x tells
-    nothing and is left out; a figure without panels is empty (:func:`tells`).
+        True for a tick at every x that was measured, as far as there is room.
     """
     names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
     found = {panel: {name: _points(curve) for name, curve in shown.items()} for panel, shown in panels.items()}
@@ -133,26 +130,25 @@ def curves(
 
 
 def _points(curve: Curve) -> FloatArray:
-    """(points, 3) numbers, means and standard errors of a ``curve`` in the order of its numbers, where all is finite
-    but the error."""
+    """Return (points, 3) numbers, finite means and standard errors of a ``curve``, sorted."""
     points = sorted((float(number), mean.value, mean.error) for number, mean in curve.items())
     found = np.array(points, dtype=np.float64).reshape(-1, 3)
     return found[np.isfinite(found[:, :2]).all(axis=1)]
 
 
 def _column(shown: Mapping[str, FloatArray], column: int) -> set[float]:
-    """Different values of a ``column`` of all curves ``shown``."""
+    """Return the different values of a ``column`` of all curves."""
     return {float(value) for points in shown.values() for value in points[:, column]}
 
 
 def spans_decades(values: Iterable[float]) -> bool:
-    """Whether ``values`` are above 0, all of them, and the largest is :data:`LOGARITHMIC` times the least or more."""
+    """Return True if all ``values`` are positive and span a factor of :data:`LOGARITHMIC` at least."""
     found = np.array(list(values), dtype=np.float64)
     return bool(found.size and found.min() > 0 and found.max() >= LOGARITHMIC * found.min())
 
 
 def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
-    """Ticks along x at those of some ``numbers``, in ascending order, whose text does not run into the one before."""
+    """Set ticks along x at the ``numbers``, in ascending order, whose labels do not overlap."""
     logarithmic = axes.get_xscale() == "log"
     places = np.log(numbers) if logarithmic else np.asarray(numbers, dtype=np.float64)
     inches = (places - places[0]) / np.ptp(places) * (COLUMN - 1.2)
@@ -168,17 +164,7 @@ def _tick_at(axes: Axes, numbers: Sequence[float]) -> None:
 
 
 def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Sequence[str], title: str = "") -> Figure:
-    """Images (n, n) [reflectance] with a caption below each, cut to 0..1 for display only.
-
-    Parameters
-    ----------
-    rows
-        images and captions by the rows' names.
-    columns
-        titles.
-    title
-        of all.
-    """
+    """Draw (n, n) images [reflectance] with captions below, by the rows' names, cut to 0..1 for display only."""
     size = min(_CELL, (WIDTH - _LABEL) / len(columns))
     inches = (size + _CAPTION) * len(rows) + 0.3, size * len(columns) + _LABEL
     figure, cells = panels_of(len(rows), len(columns), *inches, layout="compressed")
@@ -203,17 +189,7 @@ def image_grid(rows: Mapping[str, Sequence[tuple[FloatArray, str]]], columns: Se
 
 
 def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str], x: str) -> Figure:
-    """Two means of each thing beside each other, the first as a bar, the second as a dot, the largest on top.
-
-    Parameters
-    ----------
-    values
-        both means by name.
-    labels
-        of the two.
-    x
-        name of the axis, with its unit.
-    """
+    """Draw two means for each name, the first as a bar, the second as a dot, the largest on top."""
     ordered = sorted(values.items(), key=lambda item: item[1][0].value)
     figure, axes = figure_of(0.9 + _rows_height(name for name, _ in ordered), _BARS)
     rows = np.arange(len(ordered))
@@ -229,15 +205,7 @@ def pair_chart(values: Mapping[str, tuple[Mean, Mean]], labels: tuple[str, str],
 
 
 def bars(kinds: Mapping[str, Mapping[str, Mean]], x: str) -> Figure:
-    """A bar and its error for each value, the largest on top.
-
-    Parameters
-    ----------
-    kinds
-        values by name, by what they are: two kinds at most, each in its colour.
-    x
-        name of the axis, with its unit.
-    """
+    """Draw a bar with its error for each value by name, for at most two kinds, the largest on top."""
     values = [(mean, name, kind) for kind, means in kinds.items() for name, mean in means.items()]
     ordered = sorted(values, key=lambda value: value[0].value)
     figure, axes = figure_of(1.2 + _rows_height(name for _, name, _ in ordered), _BARS)
@@ -284,15 +252,7 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
 
 
 def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
-    """A bar for each row, the first on top, that its parts make up in their order.
-
-    Parameters
-    ----------
-    rows
-        the parts' values >= 0 by name, by the rows' names.
-    x
-        name of the axis, with its unit.
-    """
+    """Draw a bar for each row, the first on top, stacked from its parts (values >= 0) in their order."""
     parts = list(dict.fromkeys(part for row in rows.values() for part in row))
     figure, axes = figure_of(1.6 + ROW * len(rows), _BARS)
     places, ends = np.arange(len(rows))[::-1], np.zeros(len(rows))
@@ -309,10 +269,7 @@ def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
 
 
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    """Singular values of each family's system, {family: values in any order}, log scale over rank in percent.
-
-    Each of the ``curves`` is divided by its own largest value: what remains is the conditioning.
-    """
+    """Draw the singular values of each family's system, relative to the largest, over their rank in percent."""
     figure, axes = figure_of(0.42 * WIDTH)
     for index, (name, values) in enumerate(curves.items()):
         ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
@@ -325,8 +282,10 @@ def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
 
 
 def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
-    """Errors of singular values of each of ``factors``, and their standard errors as lines; rows are of (without noise,
-    with noise less its bias, standard error)."""
+    """Draw errors of the singular values of ``factors``, and their standard errors as lines.
+
+    Rows are (value without noise, value with noise less its bias, standard error).
+    """
     figure, axes = figure_of(0.45 * WIDTH)
     for index, (name, rows) in enumerate(factors.items()):
         exact, noisy, error = rows.T
@@ -349,15 +308,7 @@ def singular_errors(factors: Mapping[str, FloatArray]) -> Figure:
 
 
 def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
-    """A map of a factor's errors.
-
-    Parameters
-    ----------
-    values, largest
-        (m, n) error of each entry in predicted deviations, and up to how many the scale goes, of either sign.
-    title
-        what is said above.
-    """
+    """Draw a map of a factor's errors (m, n) in predicted deviations, on a scale to ``largest`` of either sign."""
     figure, axes = figure_of(0.5 * WIDTH, 0.5 * WIDTH)
     axes.set_title(title, fontsize=FONT)
     drawn = axes.imshow(
@@ -372,15 +323,7 @@ def deviations(values: npt.ArrayLike, largest: float, title: str) -> Figure:
 
 
 def quality_bars(quality: Mapping[str, tuple[Mean, Mean]], title: str = "") -> Figure:
-    """PSNR [dB] by family, a pair of bars each, with one standard error where there is one.
-
-    Parameters
-    ----------
-    quality
-        of the idealised model, and of the rendered light.
-    title
-        of both.
-    """
+    """Draw the PSNR [dB] by family in the idealised model and with rendered light, with one standard error."""
     figure, axes = figure_of(0.36 * WIDTH)
     place = np.arange(len(quality), dtype=np.float64)
     looks = (-0.2, PALE, "idealised model, ideal factors"), (0.2, BLUE, "rendered light, calibrated factors")
@@ -403,18 +346,18 @@ def error_bars(
     bounds: Mapping[str, float] | None = None,
     axes: Axes | None = None,
 ) -> Figure:
-    """Relative errors on a logarithmic axis, largest on top; numbers stand beside the axes, where no line crosses them.
+    """Draw relative errors on a logarithmic axis, the largest on top, with the numbers beside the axes.
 
     Parameters
     ----------
     errors
-        by name, >= 0: one of 0 has no dot.
+        Errors >= 0 by name; an error of 0 has no dot.
     limit
-        accuracy asked for.
+        Accuracy that was asked for.
     bounds
-        what each error is below at some confidence, by name: a line runs on to it.
+        Upper bounds at some confidence by name, drawn as thin lines.
     axes
-        that are drawn on; None: those of a new figure.
+        Axes to draw on; None for those of a new figure.
     """
     ordered = sorted(errors.items(), key=lambda item: item[1])
     if axes is None:
@@ -449,8 +392,10 @@ def error_bars(
 
 @dataclass(frozen=True)
 class Cost:
-    """An ``error``, and the median, least and most ``seconds`` of the work called ``name``; ``text`` stands beside it.
-    It is hollow where it was not ``measured``."""
+    """An ``error`` and the median, least and most ``seconds`` of the work ``name``, with a ``text`` beside the dot.
+
+    The dot is hollow where the seconds were not ``measured``.
+    """
 
     name: str
     error: float
@@ -460,16 +405,9 @@ class Cost:
 
 
 def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str, float] | None = None) -> Figure:
-    """Error against time, in panels below each other; rings are around what no other in the panel beats in both.
+    """Draw error against time, in panels below each other, with rings around the Pareto front.
 
-    Parameters
-    ----------
-    panels
-        points by the panels' titles, one at least each.
-    error
-        name of the axis of errors, with its unit.
-    levels
-        errors that others are held against, by name.
+    ``levels`` are errors for comparison, by name.
     """
     figure, places = panels_of(len(panels), 1, 1.3 + 2.8 * len(panels), _BARS, sharex=True)
     names = list(dict.fromkeys(point.name for points in panels.values() for point in points))
@@ -499,7 +437,7 @@ def costs(panels: Mapping[str, Sequence[Cost]], error: str, levels: Mapping[str,
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """Those of ``points`` that no other beats in both seconds and error, fastest first."""
+    """Return the ``points`` that no other point beats in both seconds and error, the fastest first."""
     front: list[Point] = []
     for seconds, error in sorted(points):
         if not front or error < front[-1][1]:
@@ -511,7 +449,7 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:
-    """Names of bars, from below, and a legend above the axes, where no bar is, of two or more kinds."""
+    """Set the names of bars, from below, and for two or more kinds a legend above the axes."""
     axes.set_yticks(range(len(names)), [fill(typeset(name), _NAME_LETTERS) for name in names])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(-0.6, len(names) - 0.4)
@@ -520,18 +458,18 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _rows_height(names: Iterable[str]) -> float:
-    """Inches of rows of bars with these ``names``, all as high as the one of the most lines."""
+    """Return the height [inches] of rows of bars, all as high as the name with the most lines."""
     lines = [len(fill(typeset(name), _NAME_LETTERS).split("\n")) for name in names]
     return ROW * len(lines) * (1 + 0.6 * (max(lines, default=1) - 1))
 
 
 def _bar_errors(errors: FloatArray) -> FloatArray | None:
-    """Errors of bars; None where none is known, so that no bar of zero is drawn."""
+    """Return the errors, or None where no error is known, so that no bar of zero is drawn."""
     return None if np.isnan(errors).all() else errors
 
 
 def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Ticks at these ``parts`` of a decade where powers of ten alone leave the x axis of ``axes`` one or none."""
+    """Set ticks at ``parts`` of a decade where powers of ten alone leave at most one tick on the x axis."""
     low, high = axes.get_xlim()
     if high < _SHORT_AXIS * low:
         axes.xaxis.set_major_locator(LogLocator(subs=parts))
@@ -540,22 +478,12 @@ def log_ticks(axes: Axes, parts: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
 
 
 def line_style(index: int) -> dict[str, Any]:
-    """Colour and dashes of the curve number ``index``."""
+    """Return colour and dashes of curve number ``index``."""
     return {"color": _PALETTE[index % len(_PALETTE)], "ls": _STYLES[index % len(_STYLES)]}
 
 
 def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "both") -> None:
-    """Names of the axes, where given, and a grid behind the data.
-
-    Parameters
-    ----------
-    axes
-        that are drawn on.
-    x, y
-        names, with units; empty for none.
-    grid
-        lines of which axis.
-    """
+    """Set the names of the axes with units, where given, and a grid behind the data."""
     if x:
         axes.set_xlabel(x, fontsize=FONT)
     if y:
@@ -565,15 +493,7 @@ def label_axes(axes: Axes, x: str, y: str, grid: Literal["both", "x", "y"] = "bo
 
 
 def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
-    """A legend below a figure, in as many columns as its width has room for; none without names.
-
-    Parameters
-    ----------
-    figure
-        that it is of.
-    handles, labels
-        matplotlib's.
-    """
+    """Draw a legend below a figure, in as many columns as fit its width; without labels there is none."""
     names = list(labels)
     if not names:
         return
@@ -583,13 +503,7 @@ def legend_below(figure: Figure, handles: Any, labels: Iterable[str]) -> None:
 
 
 def tells(figure: Figure) -> bool:
-    """Whether a figure shows an image, or two points at least: a chart of nothing, or of one point, is not drawn.
-
-    Parameters
-    ----------
-    figure
-        of any study; only numbers count, and no line across all of the axes.
-    """
+    """Return True if a figure shows an image, or two points or bars; lines across all of the axes do not count."""
     for axes in figure.axes:
         if axes.images or any(
             isinstance(each, PolyCollection) or len(each.get_offsets()) > 1 for each in axes.collections
@@ -611,15 +525,9 @@ def tells(figure: Figure) -> bool:
 def figure_of(
     height: float, width: float = WIDTH, layout: Literal["constrained", "compressed"] = "constrained"
 ) -> tuple[Figure, Axes]:
-    """An empty figure with its own Agg canvas and one open axes.
+    """Return an empty figure [inches] with its own Agg canvas and one axes.
 
-    Parameters
-    ----------
-    height, width
-        inches.
-    layout
-        matplotlib's engine: "compressed" makes room around an image of fixed aspect, whose row label "constrained" lets
-        run off the figure.
+    The layout "compressed" leaves space around an image of fixed aspect, whose labels "constrained" would cut off.
     """
     figure, places = panels_of(1, 1, height, width, layout)
     axes: Axes = places[0, 0]
@@ -634,17 +542,7 @@ def panels_of(
     layout: Literal["constrained", "compressed"] = "constrained",
     **shared: Any,
 ) -> tuple[Figure, Any]:
-    """An empty figure with (rows, columns) open axes.
-
-    Parameters
-    ----------
-    rows, columns
-        of axes.
-    height, width, layout
-        as for :func:`figure_of`.
-    **shared
-        as for matplotlib's ``subplots``.
-    """
+    """Return an empty figure with (rows, columns) axes; ``shared`` are options of matplotlib's ``subplots``."""
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     places: Any = figure.subplots(rows, columns, squeeze=False, **shared)
@@ -652,3 +550,128 @@ def panels_of(
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=FONT - 1)
     return figure, places
+
+
+# -------- Results on axes: frames, factors, images and plans, for the `plot` methods
+
+
+def draw_shot(
+    shots: Capture, shot: int = 0, quantity: Literal["dn", "electrons", "truth"] = "dn", ax: Axes | None = None
+) -> Axes:
+    """Draw a frame of a capture in digital numbers or expected electrons, or its truth, and return the axes.
+
+    MitsimError for a shot that does not exist, and for a quantity that a real camera does not know.
+    """
+    name = shots.manifest.patterns.family or "patterns"
+    if quantity == "truth":
+        if shots.truth is None:
+            raise ArgumentError("quantity", "'truth': is not known of frames of a real camera; draw dn")
+        return _draw(ax, shots.truth, f"{name}: truth", "reflectance, 1 = board", pixel="projector ", white=1.0)
+    captures = shots.manifest.patterns.captures
+    if not 0 <= shot < len(captures):
+        raise ArgumentError("shot", f"{shot}: give 0 to {len(captures) - 1}")
+    taken = captures[shot]
+    channels, _ = shots.read(taken.file)
+    channel, unit = ("DN", "digital number [DN]") if quantity == "dn" else ("electrons", "expected electrons [e-]")
+    if channel not in channels:
+        raise ArgumentError("quantity", "'electrons': are not known of frames of a real camera; draw dn")
+    sign = {1: ", its positive half", -1: ", its negative half"}.get(taken.sign, "")
+    return _draw(ax, channels[channel], f"{name}, shot {shot}: pattern ({taken.row}, {taken.column}){sign}", unit)
+
+
+def draw_sensed(sensed: Sensed, ax: Axes | None = None) -> Axes:
+    """Draw the digital numbers of a ``sensed`` frame, and return the axes."""
+    title = f"{sensed.sensor.name}, exposure {sensed.exposure_s:.3g} s"
+    return _draw(ax, sensed.digital, title, "digital number [DN]")
+
+
+def draw_rendered(rendered: Rendered, ax: Axes | None = None) -> Axes:
+    """Draw the irradiance of a ``rendered`` frame, the mean of its channels, and return the axes."""
+    channels = rendered.mean.shape[2]
+    title = f"{rendered.facts['estimator']} estimator" + (f", mean of {channels} channels" if channels > 1 else "")
+    return _draw(ax, rendered.mean.mean(axis=2), title, "irradiance [W/m$^2$]")
+
+
+def draw_factor(factors: Factors, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
+    """Draw the factor of a camera's rows (``left``) or columns (``right``), and return the axes."""
+    line = "row" if side == "left" else "column"
+    title = f"{side.capitalize()} factor, of {line}s"
+    axes = _draw(ax, getattr(factors, side), title, r"entry [$\sqrt{\mathrm{e^-/s}}$]")
+    axes.set(aspect="auto", xlabel=f"scene {line} [projector pixel]", ylabel=f"sensor {line} [pixel]")
+    return axes
+
+
+def draw_image(
+    image: Reconstruction, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None
+) -> Axes:
+    """Draw a recovered image, its standard uncertainty, or its depths, and return the axes.
+
+    MitsimError for an uncertainty or depths that are not known.
+    """
+    board = "reflectance, 1 = board"
+    if quantity == "image":
+        unit, title = "light [electrons/s]" if "psf" in image.inputs else board, f"Image: {image.status.verdict.value}"
+        return _draw(ax, image.image, title, unit, pixel="projector ", white=image.white)
+    values, title, unit = {
+        "uncertainty": (image.uncertainty, "Standard uncertainty of each pixel", board),
+        "depth": (None if image.depths is None else image.depths.mm, "Depth of each pixel", "depth [mm]"),
+    }[quantity]
+    if values is None:
+        raise ArgumentError("quantity", f"{quantity!r}: is not known of this image; draw image")
+    return _draw(ax, values, title, unit, pixel="projector ", cmap="viridis")
+
+
+def draw_plan(plan: Plan, quantity: Literal["error", "seconds"] = "error", ax: Axes | None = None) -> Axes:
+    """Draw the relative error that each effect would leave if it were off, or the predicted seconds of each stage."""
+    if quantity == "error":
+        errors = {f"{row.name} ({row.state})": row.error_if_off for row in plan.effects if row.error_if_off is not None}
+        axes = _axes(ax, 0.7 + 0.36 * len(errors))
+        error_bars(errors, plan.accuracy, axes=axes)
+        axes.set_xlabel("relative error of the frames if it were off [1]", fontsize=FONT)
+        axes.set_title(f"Plan at accuracy {plan.accuracy:g}", fontsize=FONT, pad=22)
+        return axes
+    axes = _axes(ax, 1.0 + ROW * len(plan.predicted))
+    names = [*plan.predicted][::-1]
+    bars = axes.barh(names, [plan.predicted[name] for name in names], color=BLUE)
+    axes.bar_label(bars, fmt="%.2f", padding=3, fontsize=FONT - 1)
+    axes.margins(x=0.12)
+    label_axes(axes, "predicted time [s]", "", grid="x")
+    axes.set_title(f"Plan: {plan.predicted_seconds:.2f} s from start to finish", fontsize=FONT)
+    return axes
+
+
+def _axes(ax: Axes | None, height: float = 0.5 * WIDTH, width: float = 0.7 * WIDTH) -> Axes:
+    """Return ``ax``, or the axes of a new figure of pyplot, which notebooks show [inches]."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    return pyplot.subplots(figsize=(width, height), layout="constrained")[1]
+
+
+def _draw(
+    ax: Axes | None,
+    values: npt.ArrayLike,
+    title: str,
+    unit: str,
+    pixel: str = "",
+    white: float | None = None,
+    cmap: str = "gray",
+) -> Axes:
+    """Draw numbers (rows, columns) in equal steps, or, where ``white`` is given, as a screen shows reflectances."""
+    shown, axes = np.asarray(values, dtype=np.float64), _axes(ax)
+    style: dict[str, Any] = {"cmap": cmap, "interpolation": "none"}
+    extend, scale = "neither", "linear"
+    if white is not None:
+        curve = (lambda part: lightness(part / white), lambda shade: white * linear_light(shade))
+        style["norm"], scale = FuncNorm(curve, 0.0, white), "shown by the sRGB curve"
+        below, above = shown.min() < 0, shown.max() > white
+        extend = "both" if below and above else "min" if below else "max" if above else "neither"
+    drawn = axes.imshow(shown, **style)
+    axes.set_title(title, fontsize=FONT)
+    axes.set_xlabel(f"column [{pixel}pixel]", fontsize=FONT)
+    axes.set_ylabel(f"row [{pixel}pixel]", fontsize=FONT)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
+    axes.figure.colorbar(drawn, ax=axes, extend=extend).set_label(f"{unit}, {scale}", fontsize=FONT - 1)
+    return axes

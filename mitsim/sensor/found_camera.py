@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import validate
+from mitsim.core.configuration import toml_value, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.field_docs import toml_value
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.emva import LEAST_DARK
 from mitsim.sensor.photon_transfer import Taken, Transfer, fit, nonuniform, saturation_of

@@ -18,13 +18,13 @@ from mitsim.core.errors import MitsimError, check_arguments, cut
 from mitsim.core.exr import checksum
 from mitsim.core.files import plain, read_json, write_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.spectral_manifests import COLOUR, IMAGE, MOSAIC, checked_colours, is_coloured, spectral_of
+from mitsim.core.spectral_manifests import COLOUR, IMAGE, KINDS, is_coloured, open_lines, spectral_of
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.reconstruct.reconstruct import MADE_OF, read_result
 from mitsim.reconstruct.request import METHODS, RESULT_FILE
-from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, TABLES, read_session, session_text, value_of
+from mitsim.sessions.session_file import SESSION_FILE, SUMMARY, fields_of, read_session, session_text, value_of
 from mitsim.studies.framework.campaign import read_scope
 
 _PLANNED = "patterns", "accuracy", "seed", "effects"
@@ -80,7 +80,7 @@ class Repeat:
 
 @check_arguments
 def session_of(folder: Path | str) -> Repeat:
-    """The session file that repeats what is in a folder, with the calibration and the images that stand beside it.
+    """Return the session file that repeats a folder, with the calibration and the images that belong to its frames.
 
     Parameters
     ----------
@@ -128,7 +128,6 @@ class _Found:
     taken: dict[str, str] = field(default_factory=dict)
 
     def run_or_calibration(self) -> None:
-        """Of the folder's manifest."""
         data = read_json(self._first(self.folder) / MANIFEST)
         if isinstance(data, dict) and data.get("kind") == "calibration":
             self.calibration(self.folder)
@@ -138,21 +137,19 @@ class _Found:
             self.image(image)
 
     def _images(self) -> Iterator[Path]:
-        """Folders of images of the folder's frames, in it and beside it."""
+        """Iterate over folders of images of the folder's frames, in the folder and next to it."""
         for path in sorted([*self.folder.iterdir(), *self.folder.parent.iterdir()]):
             made_of = _made_of(path) if path.is_dir() else {}
             if made_of.get("run") == str(self.folder):
                 yield path
 
     def _first(self, folder: Path) -> Path:
-        """The folder whose manifest tells of a ``folder``: of lines, that of the first."""
-        data = read_json(folder / COLOUR) if is_coloured(folder) else {}
-        if not data or data.get("kind") == MOSAIC:
-            return folder
-        return folder / checked_colours(data, str(data.get("kind")), folder).names[0]
+        """Return the folder whose manifest describes a ``folder``: of several lines, that of the first."""
+        return next(iter(open_lines(folder, *KINDS).parts.values()))
 
     def _scene(self, conf: Mapping[str, Any], opened: Mapping[str, Any] | None, folder: Path, coloured: bool) -> None:
-        """Take over what opened the bench of a ``folder``; MitsimError where another is taken already."""
+        """Add the table of the scene that a manifest's ``conf`` describes; raise MitsimError if another scene is there
+        already."""
         if "scene" not in conf or "defines" not in conf:
             raise MitsimError(f"{folder}: is not of a simulated scene, so no session file makes it anew")
         if "board" in conf:
@@ -161,7 +158,7 @@ class _Found:
             self._warn(f"{folder} does not tell its devices' files: the usual ones are taken")
         where = f"{folder}/{MANIFEST}"
         files, scene = validate(_Opened, dict(opened or {}), where), validate(_Scene, dict(conf), where)
-        if own := scene.defines.keys() & TABLES["scene"].model_fields.keys():
+        if own := scene.defines.keys() & fields_of("scene").keys():
             raise MitsimError(f"{where}: defines.{min(own)} is no parameter of a scene; remove it")
         devices = {name: _short_name(getattr(files, name), "calibration") for name in ("camera", "projector")}
         usual = spectral_of(DEFAULT_VARIANT) if coloured else DEFAULT_VARIANT
@@ -179,7 +176,7 @@ class _Found:
     def _compare(
         self, conf: Mapping[str, Any], sums: Mapping[str, str | None], devices: Mapping[str, str | None], coloured: bool
     ) -> None:
-        """Note files that are others than a manifest's ``conf`` and its ``sums`` of the scene's files say."""
+        """Warn of files that differ from those that a manifest's ``conf`` and its ``sums`` describe."""
         for name, known in sums.items():
             if not Path(name).is_file():
                 self._warn(f"{name} is not there")
@@ -204,7 +201,7 @@ class _Found:
             self.warnings.append(text)
 
     def run(self, folder: Path) -> None:
-        """Take over the request of the frames in a ``folder``."""
+        """Add the request of the frames in a ``folder``."""
         manifest = read_manifest(self._first(folder), RunManifest)
         conf, coloured = manifest.configuration, is_coloured(folder)
         self._scene(conf, manifest.opened, folder, coloured)
@@ -227,19 +224,17 @@ class _Found:
         self.taken["capture"] = str(folder)
 
     def _colour(self, folder: Path) -> dict[str, str]:
-        """The word for the colours of a ``folder``; none of one that tells none apart."""
-        if not is_coloured(folder):
-            return {}
-        data = read_json(folder / COLOUR)
-        if data["kind"] == MOSAIC:
-            return {"colour": "mosaic"}
-        count = len(checked_colours(data, data["kind"], folder).names)
+        """Return the word of the colours of a ``folder``; nothing if none are told apart."""
+        lines = open_lines(folder, *KINDS)
+        if lines.colours is None or lines.filters:
+            return {"colour": "mosaic"} if lines.filters else {}
+        count = len(lines.names)
         _, projector = check_devices(None, self.tables["scene"].get("projector"))
         several = load_model(projector, ProjectorModel).wavelengths_nm or ()
         return {"colour": "lines" if count == len(several) else f"bands:{count}"}
 
     def calibration(self, folder: Path) -> None:
-        """Take over the request of the calibration in a ``folder``."""
+        """Add the request of the calibration in a ``folder``."""
         manifest = read_manifest(self._first(folder), CalibrationManifest)
         conf = manifest.configuration
         if (
@@ -259,11 +254,11 @@ class _Found:
         self.taken["calibrate"] = str(folder)
 
     def image(self, folder: Path) -> None:
-        """Take over how the image in a ``folder`` was solved for, of which frames and calibration."""
+        """Add the request of the image in a ``folder``, of its frames and of its calibration."""
         made_of = _made_of(folder)
         if "calibration" not in made_of:
             raise MitsimError(f"{folder}: does not tell the calibration that it is made of")
-        first = self._first(folder) if is_coloured(folder) else folder
+        first = self._first(folder)
         stated = read_result(first).get("inputs") if (first / RESULT_FILE).is_file() else {}
         inputs = {
             name: value for name, value in (stated if isinstance(stated, dict) else {}).items() if name not in made_of
@@ -291,14 +286,12 @@ class _Found:
         images.append({**inputs, **named})
 
     def demo(self) -> None:
-        """Take over what the demo was asked for, by its capture."""
         manifest = read_manifest(self.folder / "run", RunManifest)
         conf = manifest.configuration
         self._scene(conf, manifest.opened, self.folder, False)
         self.tables["demo"] = {name: conf[name] for name in ("patterns", "accuracy", "seed")}
 
     def study(self) -> None:
-        """Take over the scope of a study of many points."""
         name, scope = read_scope(self.folder)
         setup = scope.setup
         given = {
@@ -320,7 +313,7 @@ class _Found:
 
 
 def _made_of(folder: Path) -> dict[str, str]:
-    """Folders that the image in a ``folder`` is made of; none of another folder."""
+    """Return the folders that the image in a ``folder`` is made of; none for another folder."""
     for name in (RESULT_FILE, COLOUR):
         data = read_json(folder / name) if (folder / name).is_file() else {}
         if isinstance(data, dict) and isinstance(data.get(MADE_OF), dict):
@@ -329,7 +322,7 @@ def _made_of(folder: Path) -> dict[str, str]:
 
 
 def _short_name(path: str | None, shelf: str) -> str | None:
-    """The name of a shipped file at a ``path`` on its ``shelf``; else the path."""
+    """Return the name of a shipped file at a ``path`` on its ``shelf``; else the path."""
     if path is None:
         return None
     place = Path(path)
@@ -338,6 +331,6 @@ def _short_name(path: str | None, shelf: str) -> str | None:
 
 
 def _value(text: str) -> Any:
-    """A number, or true or false, where a scene spells it as this ``text``."""
+    """Return the number or truth that a scene spells as this ``text``; else the text."""
     value = value_of(text)
     return value if isinstance(value, (bool, int, float)) and spelling(value) == text else text

@@ -20,11 +20,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, Field
 
-from mitsim.bench.apparatus import check_devices
-from mitsim.bench.request import Exposure, Request
-from mitsim.core.configuration import Configuration, load_model, validate
+from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.core.configuration import Configuration, validate
 from mitsim.core.environment import deciding_versions
-from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, options_of
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import (
     PAGE,
     PICTURES,
@@ -39,8 +38,9 @@ from mitsim.core.files import (
 )
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.spectral_manifests import bands_of, is_coloured, is_mosaic, spectral_of
-from mitsim.devices.sensor import load_sensor
+from mitsim.core.options import refuse_unused, takes
+from mitsim.core.spectral_manifests import MOSAIC, RUN, is_coloured, open_lines
+from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, check_export, check_format, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions.session_file import (
@@ -54,42 +54,21 @@ from mitsim.sessions.session_file import (
     image_request,
     portable,
     read_session,
-    recipe_of,
     request_of,
     session_text,
     sweep_options,
     swept_values,
 )
 from mitsim.studies.framework.experiment import is_experiment
-from mitsim.verbs import WHOLE, Opening, prepare_study
+from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, open_as, prepare_study
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from mitsim.acquire.capture import Light
     from mitsim.api.bench import Bench
     from mitsim.light.plan import Plan
-
-
-@checked_fields
-@dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """How a session is run.
-
-    Attributes
-    ----------
-    resume
-        go on in a folder of an earlier run: what is finished, and of the same request, is left alone.
-    pictures
-        whether folders get pictures and pages.
-    shard
-        "I/N": measure part I of N of the points of a sweep, or of studies.
-    scheduler
-        of Dask, that measures these points.
-    """
-
-    resume: bool = False
-    pictures: bool = True
-    shard: str = WHOLE
-    scheduler: str | None = None
+    from mitsim.verbs import RunKeys
 
 
 class _Made(Configuration):
@@ -138,28 +117,26 @@ class SessionResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Of all steps, each with its folder."""
+        """Warnings of all steps, each with its folder."""
         return tuple(dict.fromkeys(f"{step.output}: {text}" for step in self.steps for text in step.warnings))
 
     def payload(self) -> dict[str, Any]:
-        """As JSON."""
         return {**asdict(self), "warnings": self.warnings}
 
     def lines(self) -> list[str]:
-        """For people."""
         each = [f"{step.output}: {step.says}{' (finished before)' if step.left_alone else ''}" for step in self.steps]
         return [*each, f"Page: {self.page}" if self.page else f"Session: {self.output}"]
 
 
-@check_arguments
+@takes(RunOptions)
 def run(
     session: Path | str | Mapping[str, Any],
     output: Path | str = "session-output",
     values: Mapping[str, Any] | None = None,
     job: Job | None = None,
-    **options: Any,
+    **options: Unpack[RunKeys],
 ) -> SessionResult:
-    """Take all steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its folder.
+    """Run the steps of a session: plan, capture, calibrate, reconstruct, study and export, each into its own folder.
 
     Parameters
     ----------
@@ -171,8 +148,6 @@ def run(
         of fields, in place of the file's, by name: ``{"capture.patterns": "dots:4"}``.
     job
         clock, progress and limits.
-    **options
-        of :class:`mitsim.sessions.run_session.RunOptions`: ``resume``, ``pictures``, ``shard``, ``scheduler``.
 
     Raises
     ------
@@ -186,7 +161,7 @@ def run(
     >>> done = ms.run("demo", "repeated", {"capture.patterns": "dots:4"})  # doctest: +SKIP
     >>> ms.load_run("repeated/run").truth  # doctest: +SKIP
     """
-    asked = RunOptions(**options_of(RunOptions, options, "run"))
+    asked = RunOptions(**options)
     read, place = read_session(session, values), Path(output)
     again = (place / SUMMARY).is_file()
     if again and not asked.resume:
@@ -201,7 +176,7 @@ def run(
         results, text = list[StepResult](), session_text(read.tables, folder)
 
         def note() -> None:
-            """Keep what is done, and what is at work, so that a killed session goes on."""
+            """Write what is finished and what is at work, so that a killed session can be resumed."""
             kept = {**steps.earlier.by_output, **{each.output: each for each in results}}
             told = {"status": "incomplete", "steps": [*map(asdict, kept.values())], "made": steps.made}
             write_json(folder / SUMMARY, {**head, **told})
@@ -241,12 +216,11 @@ class _Earlier(BaseModel):
 
     @property
     def by_output(self) -> dict[str, StepResult]:
-        """The steps by their outputs."""
         return {step.output: step for step in self.steps}
 
 
 def _earlier(folder: Path) -> _Earlier:
-    """What an earlier run in a ``folder`` came to; MitsimError where it holds none of a session."""
+    """Return the state of an earlier run in a ``folder``; MitsimError if the folder holds no session."""
     found = read_json(folder / SUMMARY)
     if not isinstance(found, dict) or found.get("kind") != KIND:
         raise MitsimError(f"resume=True: {folder / SUMMARY} is not that of a session; use another folder")
@@ -254,7 +228,7 @@ def _earlier(folder: Path) -> _Earlier:
 
 
 def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
-    """Take a ``step`` by its ``task``, unless it is ``finished``, and write its page."""
+    """Run the ``task`` of a ``step``, unless it is ``finished``, and write the step's page."""
     started, folder, pictures = time.perf_counter(), steps.folder, steps.asked.pictures
     place = folder / step.output
     if finished:
@@ -265,7 +239,7 @@ def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
         steps.end(step)
         found = StepResult(step.verb, step.output, says, tuple(warnings), time.perf_counter() - started)
     if pictures and step.verb in FOLDERS and not (found.left_alone and (place / PAGE).is_file()):
-        from mitsim.report.folders import report_folder
+        from mitsim.report.folder_page import report_folder
 
         report_folder(place)
     pages = [place / PAGE, *sorted(place.glob("*.html"))] if place.is_dir() else []
@@ -274,7 +248,7 @@ def _take(step: Step, task: _Task, steps: _Steps, finished: bool) -> StepResult:
 
 
 def _write_page(folder: Path, session: str, results: Sequence[StepResult], job: Job | None) -> str:
-    """Write the page of a session, whose file has this text, in its ``folder``, of its ``results``; its path."""
+    """Write the page of a session into its ``folder``, and return the page's path."""
     from mitsim.report.pages import render_page
 
     images = [step.output for step in results if (folder / step.output / "image.png").is_file()]
@@ -352,15 +326,19 @@ class _Steps:
     light: Light | None = field(default=None, init=False)
 
     def makes(self, step: Step) -> bool:
-        """Whether a ``step`` makes anything itself: beside a sweep some are values of its points."""
+        """Return True if a ``step`` makes files itself; next to a sweep, some steps only state values of its points."""
         return self.session.step("sweep") is None or step.verb not in FOLDERS
 
     def prepare(self, step: Step) -> _Task:
-        """A ``step`` that is checked; MitsimError for what it would refuse, before any work."""
+        """Check a ``step`` before any work, and return its task."""
         shared = step.verb == "sweep" or (step.verb == "study" and is_experiment(step.values["name"]))
-        for name, value in (("shard", self.asked.shard != WHOLE), ("scheduler", self.asked.scheduler is not None)):
-            if value and not shared:
-                raise ArgumentError(name, f"has no effect on [{step.verb}], which has no points to share; leave it out")
+        if not shared:
+            idle = self.asked.without("resume", "pictures")
+            refuse_unused(
+                [name for name in idle if idle[name] != RunOptions.model_fields[name].default],
+                idle,
+                f"on [{step.verb}], which has no points to share",
+            )
         task = _TASKS[step.verb](self, step)
         self.checks += [task.check] if step.verb in OF_A_BENCH else []
         return task
@@ -384,8 +362,8 @@ class _Steps:
         return hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
 
     def is_finished(self, step: Step, task: _Task) -> bool:
-        """Return True if an earlier run took a ``step`` with the same inputs and its files are what they were; what
-        later steps need of it is then read by its ``task``."""
+        """Return True if an earlier run made the ``step``'s files from the same inputs and they have not changed; the
+        ``task`` then loads what later steps need."""
         if step.verb == "transport":  # whose light is in no file
             capture = self.session.step("capture")
             known = step.output in self.earlier.by_output
@@ -400,18 +378,17 @@ class _Steps:
         return same
 
     def begin(self, step: Step) -> None:
-        """Note that a ``step`` is at work: its files are no longer those of before."""
+        """Note that a ``step`` is at work, so that its earlier files no longer count as finished."""
         self.before = self.made.get(step.output)
         self.made[step.output] = _Made(inputs="")
 
     def end(self, step: Step) -> None:
-        """Note the files of a ``step`` that was taken."""
         self.made[step.output] = _Made(inputs=self.inputs(step), files=_checksums(self.folder / step.output))
 
     @contextmanager
     def earlier_aside(self, step: Step) -> Iterator[None]:
-        """Keep what an image or an export was before beside it, until it is made anew; where that is refused it is
-        what it was. MitsimError where files of somebody else are among it."""
+        """Keep an earlier image or export aside until it is made again, and restore it if that is refused. MitsimError
+        if the folder has files that the session did not make."""
         place, aside = self.folder / step.output, self.folder / f".{step.output}.before"
         _remove(aside)
         if self.before is None or step.verb not in ("reconstruct", "export") or not place.exists():
@@ -435,7 +412,7 @@ class _Steps:
     # ---- the bench ----
 
     def check_bench(self) -> None:
-        """Open the scene, if a step needs it, and refuse what only that shows."""
+        """Open the scene if a step needs it, and refuse what only the opened scene shows."""
         if self.checks:
             self.bench  # noqa: B018 - opens it
         for check in self.checks:
@@ -443,32 +420,17 @@ class _Steps:
 
     @cached_property
     def opening(self) -> Opening:
-        """How the scene is opened."""
-        scene = self.session.scene
-        own = {name: value for name, value in scene.items() if name in _OPENING}
-        if any(step.values.get("colour", "no") != "no" for step in self.session.steps):
-            own["variant"] = spectral_of(own.get("variant", Opening.variant))
-        return Opening(**own, parameters={name: scene[name] for name in scene.keys() - {*own, "scene"}})
+        scene = {name: value for name, value in self.session.scene.items() if name != "scene"}
+        own = {name: scene.pop(name) for name in [*scene] if name in Opening.model_fields}
+        return Opening(**own, parameters=scene)
 
     @cached_property
     def bench(self) -> Bench:
-        """The scene with its devices."""
-        return self.opening.open(self.session.scene["scene"], self.job)
+        colours = {step.values.get("colour", NO) for step in self.session.steps} - {NO}
+        return open_as(self.session.scene["scene"], self.opening, self.job, min(colours, default=NO))
 
-    def _check_bench(self, patterns: str, timing: Exposure | None, colour: str = "no") -> None:
-        """MitsimError for ``patterns``, an exposure and a ``colour`` that the devices cannot have."""
-        camera, projector = check_devices(self.opening.camera, self.opening.projector)
-        sensor = load_sensor(camera)
-        if colour == "mosaic" and sensor.mosaic is None:
-            raise MitsimError(f"colour mosaic: camera {camera} has no colour filters; give one that has")
-        if colour != "mosaic" and timing is not None:
-            timing.check(sensor, camera)
-        if colour not in ("no", "mosaic"):
-            from mitsim.devices.projector import ProjectorModel
-
-            light = load_model(projector, ProjectorModel)
-            (light if colour == "lines" else light.in_bands(bands_of(colour))).traced_lines  # noqa: B018 - checks itself
-        self.opening.check(self.session.scene["scene"], patterns, None)
+    def _check_bench(self, patterns: str | None, timing: Exposure | None, colour: str = NO) -> None:
+        self.opening.check(self.session.scene["scene"], patterns, timing, colour)
 
     # ---- a verb each ----
 
@@ -508,7 +470,7 @@ class _Steps:
         return lambda: self.bench.family(request.patterns, request.seed)
 
     def _capture(self, step: Step) -> _Task:
-        own, colour, place = request_of(step), step.values.get("colour", "no"), self.folder / step.output
+        own, colour, place = request_of(step), step.values.get("colour", NO), self.folder / step.output
         above = self.session.step("transport") or self.session.step("plan")
         planned = Request.of(**request_of(above)) if above else None
         request = (
@@ -517,49 +479,39 @@ class _Steps:
         self._check_bench(request.patterns, request.timing, colour)
 
         def work() -> Said:
-            job, resume = self.job.apart("capture "), self.asked.resume
-            more = {name: value for name, value in own.items() if name != "patterns"}
-            if self.light is not None:
-                from mitsim.acquire.capture import expose
-
-                return _of_run(expose(self.light, request.patterns, place, job, resume, **more).summary())
-            if self.plan is not None:
-                return _of_run(self.bench.capture(self.plan, place, resume, job, **own).summary())
-            if colour == "mosaic":
-                return _of_run(self.bench.capture_mosaic(request.patterns, place, resume, job, **more).summary())
-            if colour == "no":
-                return _of_run(self.bench.capture(request.patterns, place, resume, job, **more).summary())
-            runs = _in_colour(self.bench, colour).capture_lines(request.patterns, place, resume, job, **more)
-            return _of_lines({name: _of_run(run.summary()) for name, run in runs.items()})
+            task = Task(place, self.asked.resume, self.job.apart("capture "))
+            what = self.plan or request.patterns
+            more = own if self.plan else {name: value for name, value in own.items() if name != "patterns"}
+            found = capture_in(self.bench, colour, what, more, task, self.light)
+            if isinstance(found, Mapping):
+                return _of_lines({name: _of_run(run.summary()) for name, run in found.items()})
+            return _of_run(found.summary())
 
         return _Task(work, check=self._fits({"patterns": request.patterns, "seed": request.seed}))
 
     def _calibrate(self, step: Step) -> _Task:
-        values, place = step.values, self.folder / step.output
-        colour, recipe = values.get("colour", "no"), recipe_of(values)
-        asked = {name: values.get(name, default) for name, default in (("seed", 0), ("accuracy", 1e-3))}
-        if colour != "no":
+        place, colour = self.folder / step.output, step.values.get("colour", NO)
+        values = {name: value for name, value in step.values.items() if name in SessionRequest.model_fields}
+        if (own := values.get("recipe")) is not None:
+            table = isinstance(own, Mapping)
+            values["recipe"] = validate(SessionRecipe, dict(own), "recipe") if table else load_recipe(own)
+        asked = SessionRequest(**values)
+        recipe = asked.recipe or load_recipe()
+        if colour != NO:
             recipe.of_one_depth()
         self._check_bench("uniform", Exposure(None, recipe.exposure_fraction), colour)
 
         def check() -> None:
             from mitsim.calibrate.board_session import Session as BoardSession
 
-            if colour == "no" and not recipe.depths:
-                BoardSession(self.bench, recipe, asked["seed"]).check_mask(self.job)
+            if colour == NO and not recipe.depths:
+                BoardSession(self.bench, recipe, asked.seed).check_mask(self.job)
 
         def work() -> Said:
-            whole: dict[str, Any] = {**asked, "output": place, "resume": self.asked.resume}
-            whole |= {"job": self.job.apart("calibrate "), "recipe": recipe}
-            if colour == "no" and not recipe.depths:
-                return _of_calibration(self.bench.calibrate(**whole).manifest.result)
-            if recipe.depths:
-                found: Mapping[Any, Any] = self.bench.calibrate_depths(**whole)
-            elif colour == "mosaic":
-                found = self.bench.calibrate_mosaic(**{**whole, "recipe": recipe if "recipe" in values else None})
-            else:
-                found = _in_colour(self.bench, colour).calibrate_lines(**whole)
-            return _of_lines({str(name): _of_calibration(each.manifest.result) for name, each in found.items()})
+            task = Task(place, self.asked.resume, self.job.apart("calibrate "))
+            found = calibrate_in(self.bench, colour, asked, task)
+            said = {name: _of_calibration(each.manifest.result) for name, each in found.items()}
+            return said[""] if [*said] == [""] else _of_lines(said)
 
         return _Task(work, check=check)
 
@@ -567,8 +519,10 @@ class _Steps:
         values, place, options = step.values, self.folder / step.output, image_request(step)
         run, calibration = (self._source(step, name) for name in ("run", "calibration"))
         capture = self.session.step("capture")
-        coloured = is_coloured(run) if "run" in values else bool(capture and capture.values.get("colour", "no") != "no")
-        mosaic = is_mosaic(run) if "run" in values else bool(capture and capture.values.get("colour") == "mosaic")
+        coloured = is_coloured(run) if "run" in values else bool(capture and capture.values.get("colour", NO) != NO)
+        mosaic = bool(capture and capture.values.get("colour") == "mosaic")
+        if "run" in values:
+            mosaic = open_lines(run, RUN, MOSAIC).filters is not None
         if str(options.get("method", "")).endswith(MODEL):
             from mitsim.learn.verbs import load_network
 
@@ -591,14 +545,14 @@ class _Steps:
             chart = load_chart(values["chart"])
 
         def work() -> Said:
-            from mitsim.report import quality
+            from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 
             job = self.job.apart(f"{step.output} ")
             if coloured:
-                colours = quality.reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
+                colours = reconstruct_colours(run, calibration, place, chart, job=job, page=False, **options)
                 known = "" if colours.psnr_db is None else f", PSNR {colours.psnr_db:.2f} dB over all lines"
                 return f"an image of every line{known}", colours.warnings
-            judged = quality.reconstruct(run, calibration, place, job=job, **options)
+            judged = reconstruct(run, calibration, place, job=job, **options)
             image = judged.reconstruction
             return str(judged.quality or f"{image.status.sentence}."), judged.summary()["warnings"]
 
@@ -634,11 +588,8 @@ class _Steps:
         return _Task(work, check=self._fits(request_of(step)))
 
     def _sweep(self, step: Step) -> _Task:
-        scene = {name: getattr(self.opening, name) for name in (*_OPENING, "parameters")}
-        options = {name: value for name, value in scene.items() if value != getattr(Opening(), name)}
-        return self._study_of(
-            "sweep", self.session.scene["scene"], step, {**sweep_options(self.session, step), **options}
-        )
+        options = {**sweep_options(self.session, step), **self.opening.given}
+        return self._study_of("sweep", self.session.scene["scene"], step, options)
 
     def _study(self, step: Step) -> _Task:
         values = {name: value for name, value in step.values.items() if name not in ("name", "scene")}
@@ -647,12 +598,9 @@ class _Steps:
         return self._study_of(step.values["name"], step.values.get("scene"), step, values)
 
     def _study_of(self, name: str, scene: str | None, step: Step, options: Mapping[str, Any]) -> _Task:
-        """The study of a ``name`` and its ``options``, of points shared as is asked for."""
-        shared = {"shard": self.asked.shard} if self.asked.shard != WHOLE else {}
-        shared |= {"scheduler": self.asked.scheduler} if self.asked.scheduler else {}
-        place, patterns = self.folder / step.output, options.get("patterns")
-        others = {key: value for key, value in options.items() if key != "patterns"}
-        study = prepare_study(name, scene, place, patterns, self.job.apart(f"{step.output} "), **others, **shared)
+        """Return the study of a ``name`` with its ``options``, of points shared as is asked for."""
+        asked = StudyOptions(**options, **self.asked.without("resume", "pictures"))
+        study = prepare_study(name, scene, self.folder / step.output, asked, self.job.apart(f"{step.output} "))
 
         def work() -> Said:
             found = study()
@@ -690,8 +638,6 @@ _TASKS: Mapping[str, Callable[[_Steps, Step], _Task]] = {
     "study": _Steps._study,
     "export": _Steps._export,
 }
-_OPENING = "variant", "camera", "projector", "allow_outside_files"
-"""Arguments that open a bench, beside the scene and its parameters."""
 
 
 def _checksums(place: Path) -> dict[str, str]:
@@ -729,10 +675,6 @@ def _remove(place: Path) -> None:
         place.unlink(missing_ok=True)
 
 
-def _in_colour(bench: Bench, colour: str) -> Bench:
-    return bench if colour == "lines" else bench.in_bands(bands_of(colour))
-
-
 def _of_run(found: Mapping[str, Any]) -> Said:
     size = "x".join(map(str, found["shape"]))
     says = f"{found['frames']} frames of {size}, error up to {found['total_error_bound']:.1e}"
@@ -748,6 +690,5 @@ def _of_calibration(result: Mapping[str, Any]) -> Said:
 
 
 def _of_lines(each: Mapping[str, Said]) -> Said:
-    """What is said of several folders, by their names."""
     warnings = [f"{name}: {text}" for name, (_, texts) in each.items() for text in texts]
     return "; ".join(f"{name} {says}" for name, (says, _) in each.items()), warnings

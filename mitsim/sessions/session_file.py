@@ -1,182 +1,170 @@
-"""A session file in; what each verb is asked for, or a refusal with all mistakes, out; and back to its text.
+"""Session files: tables of options become the steps of a session, or a refusal with all mistakes; and text again.
 
-A table is a verb, and its fields are the arguments of the Python call that does the work: names, kinds and defaults are
-read from there, so that each stands once.
+A table is a verb, and its fields are those of the models that the verb takes on the command line and in Python.
 """
 
 from __future__ import annotations
 
-import inspect
 import os
 import sys
 import unicodedata
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
-import pydantic
 import tomli_w
+from pydantic.fields import FieldInfo
 
-from mitsim.api.bench import open_bench
-from mitsim.bench.request import Request, SessionRequest
-from mitsim.core.configuration import Configuration, locate, read_toml, shipped_path, validate
+from mitsim.bench.request import NO, Family, FixedColour, Opening, Planned, Request, Sampled, SessionRequest
+from mitsim.core.configuration import (
+    Mistake,
+    Place,
+    Table,
+    locate,
+    read_toml,
+    refuse_together,
+    shipped_path,
+    validate,
+)
 from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, short_text
 from mitsim.core.files import PAGE, PICTURES, resolve
-from mitsim.core.mistakes import Mistake, Place, Table, mistakes, told_together
-from mitsim.devices.session import SessionRecipe, load_recipe
-from mitsim.exchange.formats import PNG, check_format, export
-from mitsim.reconstruct.request import ImageRequest
-from mitsim.verbs import StudyOptions, demo
+from mitsim.core.options import FilePath, Options, option, validated_by
+from mitsim.devices.session import SessionRecipe
+from mitsim.exchange.formats import PNG, Exported, check_format
+from mitsim.reconstruct.request import MODEL, ImageRequest
+from mitsim.verbs import StudyOptions
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-# ---- Tables, from the calls that take their fields -------------------------------------------------------------------
+# ---- Tables ----------------------------------------------------------------------------------------------------------
 
 
-def _one_value(value: Any) -> Any:
-    """A ``value`` of a parameter; ValueError for another."""
+def _one_value(name: str, value: Any) -> Any:
+    """Return a ``value`` of a parameter of a ``name``; ArgumentError for a list or a table."""
     if not isinstance(value, (str, int, float)):
-        raise ValueError(f"got {cut(repr(value))}; give a number, text in quotes, or true or false")
+        raise ArgumentError(name, f"{short_text(value)}: give a number, text in quotes, or true or false")
     return value
 
 
-def _several_values(values: Any) -> Any:
-    """A list of ``values``, or the ends and the count of a range; ValueError for anything else."""
+def _several_values(name: str, values: Any) -> Any:
+    """Return a list of ``values``, or the ends and the count of a range; ArgumentError for anything else."""
     if isinstance(values, Mapping):
-        numbers = [isinstance(values.get(name), (int, float)) for name in ("from", "to", "count")]
+        numbers = [isinstance(values.get(end), (int, float)) for end in ("from", "to", "count")]
         if values.keys() == {"from", "to", "count"} and all(numbers):
             return values
     elif isinstance(values, (list, tuple)) and values:
-        return [_one_value(value) for value in values]
-    raise ValueError(f"got {cut(repr(values))}; give a list of values, or {{ from = A, to = B, count = N }}")
+        return [_one_value(name, value) for value in values]
+    raise ArgumentError(name, f"{short_text(values)}: give a list of values, or {{ from = A, to = B, count = N }}")
 
 
-def _path(value: Any) -> Any:
-    """A ``value`` that is no text, or one that can be a path; ValueError for another."""
-    if isinstance(value, str) and not is_path(value):
-        raise ValueError(f"got {cut(repr(value))}; give a path")
-    return value
+class _Placed(Options):
+    """Name of a step's folder or file in that of the session."""
+
+    output: FilePath | None = option(None, "folder of the step")
 
 
-_Value = Annotated[Any, pydantic.AfterValidator(_one_value)]
-_Values = Annotated[Any, pydantic.AfterValidator(_several_values)]
-_Path = Annotated[str, pydantic.AfterValidator(_path)]
-_Recipe = Annotated[str | dict[str, Any], pydantic.AfterValidator(_path)]
-_Number = Annotated[float, pydantic.Field(allow_inf_nan=True)]
-_Two = Annotated[tuple[_Number, _Number], pydantic.Field(strict=False)] | None
-_OWN = {"self", "output", "resume", "job", "overwrite", "for_render"}
-"""Arguments that are the session's own: where results go, and how work is watched."""
+def _recipe(recipe: Any) -> None:
+    """Refuse a ``recipe`` that is neither a file's path nor a table of a recipe."""
+    if isinstance(recipe, Mapping):
+        validate(SessionRecipe, dict(recipe), "recipe")
+    elif not is_path(recipe):
+        raise ArgumentError("recipe", f"{short_text(recipe)}: give a path, or a table of a recipe's fields")
 
 
-def _fields(call: Callable[..., Any], *leave_out: str, **other: Any) -> dict[str, Any]:
-    """Fields of a table.
-
-    Parameters
-    ----------
-    call
-        whose arguments they are.
-    leave_out
-        names of some that it does not have.
-    **other
-        kinds and defaults of some: what another room's type is there is text or a number in a file.
-    """
-    known = vars(sys.modules[call.__module__])
-    found = {}
-    for name, each in inspect.signature(call).parameters.items():
-        if name in _OWN or name in leave_out or each.kind == each.VAR_KEYWORD:
-            continue
-        if name in other:
-            continue
-        kind = eval(each.annotation, known)  # as typing.get_type_hints does
-        if Path in getattr(kind, "__args__", (kind,)):
-            kind = _Path | None if type(None) in kind.__args__ else _Path
-            _PATHS.add(name)
-        found[name] = kind, ... if each.default is each.empty else each.default
-    return {**found, **other}
+class _Scene(Opening):
+    scene: FilePath
 
 
-_PATHS = {"run", "calibration", "camera", "projector", "recipe", "scene"}
-"""Fields that name files and folders."""
-_REQUEST: dict[str, Any] = {
-    name: (kind, Request.model_fields[name].default)
-    for name, kind in get_type_hints(Request).items()
-    if name in Request.model_fields
+class _Plan(_Placed, Planned):
+    pass
+
+
+class _Capture(_Placed, Request, FixedColour):
+    pass
+
+
+class _Calibration(_Placed, SessionRequest, FixedColour):
+    recipe: Annotated[Any, validated_by(_recipe)] = None
+
+
+class _Image(_Placed, ImageRequest):
+    run: FilePath | None = None
+    calibration: FilePath | None = None
+    chart: FilePath | None = None
+
+
+class _Demo(_Placed, Sampled, Family):
+    pass
+
+
+class _Sweep(_Placed):
+    scene: Mapping[str, Any] = {}
+    capture: Mapping[str, Any] = {}
+    measure: str = "psnr"
+    jobs: int | None = None
+
+    def model_post_init(self, _: object) -> None:
+        """Refuse values that a sweep cannot take."""
+        for name, values in self.scene.items():
+            _several_values(f"scene.{name}", values)
+        for name, values in self.capture.items():
+            if name not in _SWEPT:
+                raise ArgumentError(f"capture.{name}", f"is not varied by a sweep; use {', '.join(_SWEPT)}")
+            _several_values(f"capture.{name}", values)
+
+
+class _Study(_Placed, StudyOptions):
+    name: str
+    scene: FilePath | None = None
+
+    def model_post_init(self, _: object) -> None:
+        """Refuse values that parameters, and what is varied, cannot have."""
+        for name, value in self.parameters.items():
+            _one_value(f"parameters.{name}", value)
+        for name, values in self.over.items() if isinstance(self.over, Mapping) else ():
+            _several_values(f"over.{name}", values)
+
+
+class _Export(Exported):
+    run: FilePath | None = None
+
+
+_SWEPT = "patterns", "seed", "accuracy"
+"""Fields of a capture that a sweep may vary."""
+TABLES: dict[str, type[Options]] = {
+    "scene": _Scene,
+    "plan": _Plan,
+    "transport": _Plan,
+    "capture": _Capture,
+    "calibrate": _Calibration,
+    "reconstruct": _Image,
+    "demo": _Demo,
+    "sweep": _Sweep,
+    "study": _Study,
+    "export": _Export,
 }
-"""Without the request's own checks, which refuse one value and see no file."""
-_REQUEST["effects"] = (str | dict[str, bool], {})
-_PLANNED = {name: _REQUEST[name] for name in ("patterns", "accuracy", "seconds", "seed", "effects")}
-_COLOUR = {"colour": (str, "no")}
-_WHERE = {"output": (_Path | None, None)}
-
-
-class _SceneTable(Configuration):
-    """Further names are the scene's parameters."""
-
-    model_config = pydantic.ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, _Value] = pydantic.Field(init=False)
-
-
-class _SweptScene(Configuration):
-    model_config = pydantic.ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, _Values] = pydantic.Field(init=False)
-
-
-def _table(name: str, fields: Mapping[str, Any], base: type[Configuration] = Configuration) -> Any:
-    return pydantic.create_model(name, __base__=base, **fields)
-
-
-_SWEPT = _table("capture", {name: (_Values, None) for name in ("patterns", "seed", "accuracy")})
-_IMAGE = _fields(
-    ImageRequest, "lam", method=(str, "tikhonov"), depth_range=(_Two, None), bounds=(_Two, None)
-)  # fmt: skip
-TABLES: dict[str, Any] = {
-    "scene": _table("scene", _fields(open_bench), _SceneTable),
-    "plan": _table("plan", _PLANNED),
-    "transport": _table("transport", {**_PLANNED, **_WHERE}),
-    "capture": _table("capture", {**_REQUEST, **_COLOUR, **_WHERE}),
-    "calibrate": _table(
-        "calibrate", {**_fields(SessionRequest, recipe=(_Recipe | None, None)), **_COLOUR, **_WHERE}
-    ),
-    "reconstruct": _table(
-        "reconstruct",
-        {"run": (_Path | None, None), "calibration": (_Path | None, None), "lambda": (float | str, "auto"), **_IMAGE,
-         "chart": (_Path | None, None), **_WHERE},
-    ),
-    "demo": _table("demo", {**_fields(demo, "scene"), **_WHERE}),
-    "sweep": _table(
-        "sweep",
-        {"scene": (_SweptScene | None, None), "capture": (_SWEPT | None, None), "measure": (str, "psnr"),
-         "jobs": (int | None, None), **_WHERE},
-    ),
-    "study": _table(
-        "study",
-        {"name": (str, ...), "scene": (_Path | None, None), "patterns": (str | None, None),
-         **_fields(StudyOptions, "shard", "scheduler", "experiment", parameters=(dict[str, _Value], {}),
-                   over=(dict[str, _Values], {})),
-         **_WHERE},
-    ),
-    "export": _table("export", {**_fields(export, run=(_Path | None, None)), "output": (_Path, ...)}),
-}  # fmt: skip
 """Model of each table, in the order in which the steps are taken."""
 SEVERAL = "reconstruct", "study", "export"
 """Tables that may stand there more than once, as ``[[reconstruct]]``."""
-
-
-def _kind_of(name: str, model: Any) -> Any:
-    """Kind and default of the table of a ``name``."""
-    if name in SEVERAL:
-        return Annotated[tuple[model, ...], pydantic.Field(strict=False)], ()
-    return model | None, None
-
-
-_SESSION = _table("session", {name: _kind_of(name, model) for name, model in TABLES.items()})
+_LEFT_OUT = {"scene": {"parameters"}, "export": {"overwrite"}, "study": {"shard", "scheduler", "experiment"}}
+"""Fields of the models that a table does not have."""
 FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
 """Where the results of some steps go, which others are called like their table."""
+
+
+def fields_of(table: str) -> dict[str, FieldInfo]:
+    """Return the fields of a ``table`` by the names that a file gives them."""
+    left_out = _LEFT_OUT.get(table, set())
+    return {
+        "lambda" if name == "lam" else name: each
+        for name, each in TABLES[table].model_fields.items()
+        if name not in left_out
+    }
 
 
 # ---- Steps -----------------------------------------------------------------------------------------------------------
@@ -223,7 +211,7 @@ class Session:
     where: str = "session"
 
     def step(self, verb: str) -> Step | None:
-        """The first step of a ``verb``."""
+        """Return the first step of a ``verb``."""
         return next((step for step in self.steps if step.verb == verb), None)
 
 
@@ -278,30 +266,15 @@ def _copy(value: Any, unset: bool = True) -> Any:
 # ---- Reading ---------------------------------------------------------------------------------------------------------
 
 
-class _Lined(Table):
-    """The tables of a session, those that may stand there twice as lists; ``written`` is what the file holds."""
-
-    def __init__(self, written: Table, changed: set[Place]) -> None:
-        once = {name for name in SEVERAL if isinstance(written.get(name), dict)}
-        super().__init__({name: [each] if name in once else each for name, each in written.items()}, written.text)
-        self._once, self._changed = once, changed
-
-    def lines(self) -> dict[Place, int]:
-        """As :meth:`Table.lines`; what was changed has no line."""
-        found = super().lines()
-        found |= {(place[0], 0, *place[1:]): line for place, line in found.items() if place[0] in self._once}
-        return {**found, **dict.fromkeys(self._changed, 0)}
-
-
 def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> Session:
-    """What a session file says.
+    """Return the session in a file.
 
     Parameters
     ----------
     source
-        path of the file, the name of a shipped one, or its tables.
+        Path of the file, the name of a shipped one, or its tables.
     changes
-        values of fields by name, as ``capture.patterns``; paths in them count from the working folder.
+        Values of fields by name, as ``capture.patterns``; paths in them count from the working folder.
 
     Raises
     ------
@@ -315,16 +288,78 @@ def read_session(source: Path | str | Mapping[str, Any], changes: Mapping[str, A
         path = locate(source, "sessions", ".toml")
         data, base, where = read_toml(path), resolve(path.absolute().parent), f"file {path}"
     _replace_paths(data, lambda path: os.path.normpath(base / path), base)
-    changed = {_change(data, name, value, where) for name, value in (changes or {}).items()}
-    lined = _Lined(data, changed)
-    found = mistakes(_SESSION, lined)
-    if not found:
-        model = _SESSION.model_validate(lined)
-        session = _session_of(model, where)
-        found = [*_mistakes_of_values(session, lined)]
-    if found:
-        raise told_together(where, found)
+    found = _Mistakes(data, {_change(data, name, value, where) for name, value in (changes or {}).items()})
+    for name, held in data.items():
+        if name not in TABLES:
+            found.say((name,), f"got {short_text(held)}, no such field; {near_name(name, TABLES) or 'use '}"
+                               f"{', '.join(TABLES) if not near_name(name, TABLES) else ''}".rstrip())  # fmt: skip
+    tables, steps = dict[str, Any](), list[Step]()
+    for name in (name for name in TABLES if name in data):
+        each = data[name] if name in SEVERAL and isinstance(data[name], list) else [data[name]]
+        for number, values in enumerate(each):
+            place: Place = (name, number) if name in SEVERAL else (name,)
+            if not isinstance(values, Mapping):
+                found.say(place, f"got {short_text(values)}; give a table of names and values")
+                continue
+            _check_table(name, values, place, found)
+            own = {key: value for key, value in values.items() if key != "output"}
+            first = str(own.get("name")) if name == "study" else FOLDERS.get(name, name)
+            output = values.get("output") or f"{first}{f'-{number + 1}' if number else ''}"
+            steps.append(Step(name, own, str(output)))
+        tables[name] = [*each] if name in SEVERAL else data[name]
+    session = Session(
+        dict(tables.get("scene") or {}), tuple(step for step in steps if step.verb != "scene"), tables, where
+    )
+    _check_steps(session, found)
+    if found.mistakes:
+        raise refuse_together(where, [*dict.fromkeys(found.mistakes)])
     return session
+
+
+@dataclass
+class _Mistakes:
+    """Mistakes in the ``tables`` of a file, each with its line; a value that was ``changed`` has none."""
+
+    data: Table
+    changed: set[Place]
+    mistakes: list[Mistake] = field(default_factory=list)
+    tables: set[Place] = field(default_factory=set)
+
+    def say(self, place: Place, text: str) -> None:
+        """Note a ``text`` on what is wrong at a ``place``."""
+        once = len(place) > 1 and place[0] in SEVERAL and not isinstance(self.data.get(str(place[0])), list)
+        there = (place[0], *place[2:]) if once else place
+        self.tables.add(place[: 1 + (place[0] in SEVERAL)])
+        line = 0 if place in self.changed or there in self.changed else self.data.line(there)
+        self.mistakes.append((line, f"{'.'.join(map(str, place))}: {text}"))
+
+    def attempt(self, place: Place, call: Callable[[], object]) -> None:
+        """Note all that a ``call`` refuses of a table at a ``place``."""
+        try:
+            call()
+        except ArgumentError as error:
+            for one in (error, *error.others):
+                argument = "lambda" if one.argument == "lam" else one.argument
+                text = str(one).removeprefix(f"{one.argument} ")
+                self.say((*place, *argument.split(".")), text)
+        except MitsimError as error:
+            self.say(place, str(error))
+
+
+def _check_table(name: str, values: Mapping[str, Any], place: Place, found: _Mistakes) -> None:
+    """Note the mistakes in the ``values`` of a table."""
+    fields, asked = fields_of(name), dict[str, Any]()
+    for key, value in values.items():
+        if key in fields:
+            asked["lam" if key == "lambda" else key] = value
+        elif name == "scene" and key != "parameters":
+            found.attempt(place, partial(_one_value, key, value))
+        else:
+            hint = near_name(key, fields).strip() or f"known fields: {', '.join(fields)}"
+            found.say((*place, key), f"got {short_text(value)}, no such field; {hint}")
+    if name == "reconstruct" and str(asked.get("method")).endswith(MODEL):
+        del asked["method"]
+    found.attempt(place, partial(TABLES[name], **asked))
 
 
 def _change(data: Table, name: str, value: Any, where: str) -> Place:
@@ -355,7 +390,7 @@ def _change(data: Table, name: str, value: Any, where: str) -> Place:
 
 
 def value_of(text: str) -> Any:
-    """The value in a ``text`` as TOML has it; the text itself, where it is none."""
+    """Return the TOML value in a ``text``; the text itself if it has none."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
@@ -390,82 +425,37 @@ def _replace_paths(
 
 
 def _is_file(table: str, key: str, value: str, base: Path) -> bool:
-    """Whether a ``value`` names a file beside the session's, and no shipped one; none does that is too long."""
+    """Return True if a ``value`` names a file beside the session's, and no shipped one; none does that is too long."""
     if "\0" in value or table not in TABLES:
         return False
-    path = Path(value)
-    if key not in TABLES[table].model_fields:  # a parameter of the scene
+    path, fields = Path(value), fields_of(table)
+    if key not in fields:  # a parameter of the scene
         return bool(path.suffix) and os.path.isfile(base / path)
-    if key not in _PATHS:
-        return key == "method" and path.suffix == ".pt"
+    if not (key == "recipe" or "Path" in str(fields[key].annotation)) or key == "output":
+        return key == "method" and path.suffix == MODEL
     if os.sep in value or path.suffix:
         return True
     shipped = shipped_path("scenes") / value, shipped_path("calibration") / f"{value}.toml"
     return not any(map(os.path.exists, shipped)) and os.path.exists(base / path)
 
 
-def _session_of(model: Any, where: str) -> Session:
-    tables: dict[str, Any] = {}
-    steps: list[Step] = []
-    for name in TABLES:
-        held = getattr(model, name)
-        for number, one in enumerate(held if name in SEVERAL else [held] if held is not None else []):
-            values = one.model_dump(exclude_unset=True, by_alias=True)
-            own = {key: value for key, value in values.items() if key != "output"}
-            first = own["name"] if name == "study" else FOLDERS.get(name, name)
-            steps.append(Step(name, own, values.get("output") or f"{first}{f'-{number + 1}' if number else ''}"))
-            if name in SEVERAL:
-                tables.setdefault(name, []).append(values)
-            else:
-                tables[name] = values
-    scene = dict(tables.get("scene", {}))
-    return Session(scene, tuple(step for step in steps if step.verb != "scene"), tables, where)
-
-
-# ---- What a model of fields does not tell ----------------------------------------------------------------------------
+# ---- Steps that need each other --------------------------------------------------------------------------------------
 
 OF_A_BENCH = "plan", "transport", "capture", "calibrate", "demo"
 """Verbs that open the scene here; a sweep does so itself."""
 SESSION_FILE, SUMMARY = "session.toml", "session.json"
-"""What a folder of a session says of itself: what was asked for, and what each step came to."""
+"""Files in a session's folder: what was asked for, and the result of each step."""
 _RESERVED = PAGE, PICTURES, SESSION_FILE, SUMMARY
 """Names in the session's folder that no step may write to."""
 
 
-@dataclass
-class _Mistakes:
-    """Mistakes, each with its line."""
-
-    lines: Mapping[Place, int]
-    mistakes: list[Mistake] = field(default_factory=list)
-
-    def say(self, place: Place, text: str) -> None:
-        """That a ``text`` is wrong with what stands at a ``place``."""
-        line = next((self.lines[place[:end]] for end in range(len(place), 0, -1) if place[:end] in self.lines), 0)
-        self.mistakes.append((line, f"{'.'.join(map(str, place))}: {text}"))
-
-    def attempt(self, place: Place, call: Callable[[], object]) -> bool:
-        """Note what a ``call``, which checks values of a table at a ``place``, refuses; whether it refuses none."""
-        try:
-            call()
-        except ArgumentError as error:
-            argument = "lambda" if error.argument == "lam" else error.argument
-            text = str(error).removeprefix(f"{error.argument} ")
-            self.say(place if place[-1] == argument else (*place, argument), text)
-        except MitsimError as error:
-            self.say(place, str(error))
-        else:
-            return True
-        return False
-
-
-def _mistakes_of_values(session: Session, data: _Lined) -> Iterator[Mistake]:
-    """What the calls would refuse before they look at files, and steps that lack another."""
-    found, numbers = _Mistakes(data.lines()), dict[str, int]()
+def _check_steps(session: Session, found: _Mistakes) -> None:
+    """Note steps that lack another, or that stand in the way of another."""
+    numbers = dict[str, int]()
     for step in session.steps:
         number = numbers[step.verb] = numbers.get(step.verb, -1) + 1
         place: Place = (step.verb, number) if step.verb in SEVERAL else (step.verb,)
-        if step.verb in _CHECKS:
+        if step.verb in _CHECKS and place not in found.tables and not (step.verb == "sweep" and found.mistakes):
             _CHECKS[step.verb](session, step, place, found)
         if Path(step.output).name != step.output or step.output.startswith("."):
             found.say((*place, "output"), f"{cut(repr(step.output))}: give a name without folders and no dot before it")
@@ -481,7 +471,6 @@ def _mistakes_of_values(session: Session, data: _Lined) -> Iterator[Mistake]:
             found.say(place, 'is of a scene, and there is none; add a table [scene] with scene = "NAME"')
     if not session.steps:
         found.mistakes.append((0, f"asks for nothing; add a table, such as [capture]: {', '.join(TABLES)}"))
-    yield from dict.fromkeys(found.mistakes)
 
 
 def _same_name(name: str) -> str:
@@ -490,19 +479,17 @@ def _same_name(name: str) -> str:
 
 
 def request_of(step: Step) -> dict[str, Any]:
-    """Fields of the request in the values of a ``step``."""
+    """Return the fields of a request in the values of a ``step``."""
     return {name: value for name, value in step.values.items() if name in Request.model_fields}
 
 
-def _check_request(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    request = request_of(step)
-    if all([found.attempt((*place, name), partial(Request.of, **{name: value})) for name, value in request.items()]):
-        found.attempt(place, partial(Request.of, **request))
+def image_request(step: Step) -> dict[str, Any]:
+    """Return the options of an image in the values of a ``step``."""
+    named = {"lam" if name == "lambda" else name: value for name, value in step.values.items()}
+    return {name: value for name, value in named.items() if name in ImageRequest.model_fields}
 
 
 def _check_capture(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    _check_request(session, step, place, found)
-    _check_colour(step, place, found)
     plan, light = session.step("plan"), session.step("transport")
     above = light or plan
     if above is None:
@@ -512,47 +499,18 @@ def _check_capture(session: Session, step: Step, place: Place, found: _Mistakes)
         found.say((*place, name), f"is the {above.verb}'s; give it in [{above.verb}]")
     if plan is not None and light is not None:
         found.say(("plan",), "stands beside [transport], which plans itself; leave one of them out")
-    if step.values.get("colour", "no") != "no":
+    if step.values.get("colour", NO) != NO:
         found.say((*place, "colour"), f"stands beside [{above.verb}], which tells no light apart; leave one out")
 
 
-def _check_colour(step: Step, place: Place, found: _Mistakes) -> None:
-    from mitsim.core.spectral_manifests import BANDS, bands_of
-
-    word = step.values.get("colour", "no")
-    if word.startswith(f"{BANDS}:"):
-        found.attempt(place, lambda: bands_of(word))
-    elif word not in ("no", "lines", "mosaic"):
-        found.say((*place, "colour"), f"{cut(repr(word))}: give no, lines, bands:K or mosaic")
-
-
 def _check_calibrate(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    _check_request(session, step, place, found)
-    _check_colour(step, place, found)
     capture = session.step("capture")
-    if isinstance(step.values.get("recipe"), Mapping):
-        found.attempt((*place, "recipe"), partial(recipe_of, step.values))
-    words = [each.values.get("colour", "no") for each in (step, capture) if each]
-    if len(set(words)) > 1:
-        found.say((*place, "colour"), f"{words[0]}, but the capture's is {words[1]}; give both the same")
-
-
-def recipe_of(values: Mapping[str, Any]) -> SessionRecipe:
-    """The recipe of a calibration with these ``values``: in a file, in the session's, or the shipped one; MitsimError
-    for one that breaks a rule."""
-    recipe = values.get("recipe")
-    return validate(SessionRecipe, dict(recipe), "recipe") if isinstance(recipe, Mapping) else load_recipe(recipe)
-
-
-def image_request(step: Step) -> dict[str, Any]:
-    """Arguments that an image is solved with, in the values of a ``step``."""
-    own = {name: value for name, value in step.values.items() if name not in ("run", "calibration", "chart")}
-    return {"lam" if name == "lambda" else name: value for name, value in own.items()}
+    own, other = (each.values.get("colour", NO) if each else None for each in (step, capture))
+    if capture and own != other:
+        found.say((*place, "colour"), f"{own}, but the capture's is {other}; give both the same")
 
 
 def _check_reconstruct(session: Session, step: Step, place: Place, found: _Mistakes) -> None:
-    asked = {name: value for name, value in image_request(step).items() if not str(value).endswith(".pt")}
-    found.attempt(place, lambda: ImageRequest(**asked))
     for name, verb in (("run", "capture"), ("calibration", "calibrate")):
         if name not in step.values and session.step(verb) is None:
             found.say((*place, name), f"is missing, and there is no [{verb}]; give the folder, or add the table")
@@ -567,7 +525,7 @@ def _check_export(session: Session, step: Step, place: Place, found: _Mistakes) 
 
 
 def calibration_for(session: Session, step: Step) -> str | None:
-    """The calibration that an export ``step`` takes of its own ``session``: that which its format can hold."""
+    """Return the session's own calibration if the format of an export ``step`` can hold it."""
     own = session.step("calibrate")
     return own.output if own and step.values["format"] != PNG else None
 
@@ -585,7 +543,7 @@ def _check_sweep(session: Session, step: Step, place: Place, found: _Mistakes) -
 
 
 def sweep_options(session: Session, step: Step) -> dict[str, Any]:
-    """Arguments of the study that a sweep is.
+    """Return the options of the study that a sweep is.
 
     Parameters
     ----------
@@ -615,7 +573,7 @@ def sweep_options(session: Session, step: Step) -> dict[str, Any]:
 
 
 def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What is ``swept``, values or a range of them by name, as values; MitsimError for a range of too many."""
+    """Return the values that are ``swept``, by name, with ranges as lists of values."""
     from mitsim.studies.framework.experiment import values_of
 
     def values(name: str, each: Any) -> list[Any]:
@@ -627,12 +585,9 @@ def swept_values(swept: Mapping[str, Any]) -> dict[str, list[Any]]:
 
 
 _CHECKS: dict[str, Callable[[Session, Step, Place, _Mistakes], None]] = {
-    "plan": _check_request,
-    "transport": _check_request,
     "capture": _check_capture,
     "calibrate": _check_calibrate,
     "reconstruct": _check_reconstruct,
-    "demo": _check_request,
     "export": _check_export,
     "sweep": _check_sweep,
 }

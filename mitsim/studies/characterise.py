@@ -9,7 +9,6 @@ sessions of such statistics are evaluated as that of the frames is (GUM, supplem
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +68,7 @@ def characterise(
         stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
         images = lambda index: np.mean([*frames.images(index)], axis=0)  # noqa: E731
         found = find_camera(taken, images, stated, lambda places: frames.take(job, places))
-        return _hold_against(frames, taken, found, {"asked": asdict(procedure), "camera": sensor.name}, folder)
+        return _hold_against(frames, taken, found, {"asked": procedure.stated, "camera": sensor.name}, folder)
 
     return _write(measure, output)
 

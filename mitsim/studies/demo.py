@@ -123,7 +123,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: tuple[str, ...], j
     light = trace_request(bench, plan, job)
     shots = expose(light, request.patterns, folder / "run", job)
     session = job.apart("calibration ")
-    factors = bench.calibrate(request.seed, request.accuracy, output=folder / "calibration", job=session)
+    factors = bench.calibrate(seed=request.seed, accuracy=request.accuracy, output=folder / "calibration", job=session)
     job.clock.add(session.clock.seconds(), "calibration ")
     comparison, families = Comparison(light, factors), {}
     with job.clock.stage("compare families"):

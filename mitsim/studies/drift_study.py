@@ -564,7 +564,7 @@ def _session(studio: Studio, point: Point, recipe: SessionRecipe, drift: Drift) 
         return studio.factors(point.setup, seed)
     bench = studio.bench(point.setup)
     key = bench.devices_digest, seed, own
-    return studio.once("drifting session", 2, key, lambda: bench.calibrate(seed, recipe=own))
+    return studio.once("drifting session", 2, key, lambda: bench.calibrate(seed=seed, recipe=own))
 
 
 def _move_projector(lit: LitScene, drift: Drift) -> LitScene:

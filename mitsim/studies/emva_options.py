@@ -3,48 +3,44 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
-from mitsim.bench.request import check_wavelength
-from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.seeds import check_root
+from mitsim.bench.request import Lit, Seeded, SeedKeys
+from mitsim.core.errors import MitsimError
+from mitsim.core.options import option
 from mitsim.devices.sensor import SensorModel
 
-_PIXELS, _STEPS, _FRAMES = (32, 4096), (20, 1000), (2, 10_000)
-"""Least and most. Below 32 rows a row's part is known to a quarter; 50 steps and 16 frames are EMVA's own least."""
 
+class Procedure(Lit, Seeded):
+    """How a camera is characterised on simulated frames.
 
-@dataclass(frozen=True)
-class Procedure:
-    """How a camera is characterised.
-
-    Attributes
-    ----------
-    pixels
-        rows and columns of the frames, of binned pixels.
-    steps
-        of the light.
-    frames
-        of each stack.
-    seed
-        root of every draw; the camera's fixed pattern has its own.
-    wavelength_nm
-        of the light, where the camera has a curve of quantum efficiency.
+    Below 32 rows a row's part is known to a quarter; 50 steps and 16 frames are the least that EMVA 1288 asks for.
     """
 
-    pixels: int = 256
-    steps: int = 50
-    frames: int = 100
-    seed: int = 0
-    wavelength_nm: float = 550.0
+    VERB = "characterise"
 
-    def __post_init__(self) -> None:
-        for name, (least, most) in (("pixels", _PIXELS), ("steps", _STEPS), ("frames", _FRAMES)):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ArgumentError(name, f"{value}: give a whole number from {least} to {most}")
-        check_root(self.seed)
-        check_wavelength(self.wavelength_nm)
+    pixels: int = option(256, "rows and columns of the frames", ge=32, le=4096)
+    steps: int = option(50, "steps of light, from dark to beyond saturation", ge=20, le=1000)
+    frames: int = option(100, "frames of each stack", kind=False, ge=2, le=10_000)
+    wavelength: float = option(550.0, "of the light, for a curve of quantum efficiency [nm]", ge=1, le=1e6)
+
+    @property
+    def wavelength_nm(self) -> float:
+        """Wavelength of the light [nm]."""
+        return self.wavelength
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """What JSON states of the procedure."""
+        sizes = {name: getattr(self, name) for name in ("pixels", "steps", "frames", "seed")}
+        return {**sizes, "wavelength_nm": self.wavelength}
+
+
+class ProcedureKeys(SeedKeys, total=False):
+    """Keywords of :class:`Procedure`, without the frames."""
+
+    pixels: int
+    steps: int
+    wavelength: float
 
 
 def efficiency_of(sensor: SensorModel, procedure: Procedure) -> float:

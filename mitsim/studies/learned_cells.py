@@ -154,7 +154,7 @@ class School:
         train_network(
             store,
             factors,
-            Training(cell.method, steps=self.budget.steps, seed=cell.seed),
+            Training(method=cell.method, steps=self.budget.steps, seed=cell.seed),
             place,
             resume=True,
             sums=sums,
@@ -196,7 +196,9 @@ class School:
             if not _is_complete(folder):
                 vary = variation(self.budget.groups) if training == VARIED else None
                 request = Request.of(patterns=patterns, seed=self.seed)
-                asked = PairsRequest(request, self.budget.pairs, training == IDEALISED, variation=vary)
+                asked = PairsRequest(
+                    capture=request, count=self.budget.pairs, idealised=training == IDEALISED, vary=vary
+                )
                 make_pairs(self._opening(training), asked, Task(folder, resume=(folder / PAIRS).is_file()))
         return PairStore.open(folder)
 

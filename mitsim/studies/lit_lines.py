@@ -3,7 +3,7 @@
 Each line has a bench of its own, with the line's power, diffraction, photons and factors; light of all is traced on the
 same paths (:mod:`mitsim.acquire.spectral`). Daylight beside the projector is that of a lamp, in frames of its own.
 
-Three ways to images of the lines are compared (:mod:`mitsim.report.mosaic_images`), all with factors that were
+Three ways to images of the lines are compared (:mod:`mitsim.report.reconstruct_run`), all with factors that were
 calibrated line by line, each with its best lambda.
 
 Beside daylight the brightest pixel fills the well in every frame, by daylight too, whose frame is taken off. That
@@ -56,7 +56,7 @@ from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LAMBDAS, LitScene
-from mitsim.report.mosaic_images import LineImages, MosaicCamera, Solver, solver_of
+from mitsim.report.reconstruct_run import LineImages, MosaicCamera, Solver
 from mitsim.sensor.chain import electrons_from_irradiance
 from mitsim.studies.framework.experiment import Setup
 
@@ -122,7 +122,7 @@ def light_lines(setup: Setup, seed: int) -> tuple[LitLine, ...]:
     plan = plan_request(colours.whole, request)
     lighting = colours.whole.family(request.patterns, seed).lighting
     lights = trace_lines(colours.whole, colours.benches, plan, lighting, seed)
-    factors = calibrate_lines(colours.whole, SessionRequest(seed, setup.accuracy), Task())
+    factors = calibrate_lines(colours.whole, SessionRequest(seed=seed, accuracy=setup.accuracy), Task())
     return tuple(
         LitLine(name, light.bench.projector.effective_wavelength_nm, LitScene(light), factors[name])
         for name, light in zip(colours.names, lights, strict=True)
@@ -262,7 +262,7 @@ class MosaicShots:
         MitsimError for demosaicing without colour-demosaicing.
         """
         patterns = self.family.left.astype(np.float64), self.family.right.astype(np.float64)
-        solver = solver_of(WAYS[way], self.camera, patterns)
+        solver = Solver(WAYS[way], self.camera, patterns)
         with single_threaded_blas():
             return self._best(solver, way)
 

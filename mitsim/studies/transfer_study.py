@@ -155,7 +155,7 @@ def teach(method: str, prepared: Prepared, sums: Sums, budget: Budget, seed: int
     """
     from mitsim.learn.training import State, Trainer, first_network
 
-    started, request = time.process_time(), Training(method, budget.steps, budget.batch, seed=seed)
+    started, request = time.process_time(), Training(method=method, steps=budget.steps, batch=budget.batch, seed=seed)
     shape = prepared.left.scene_size, prepared.right.scene_size
     trainer = Trainer(request, prepared, sums, first_network(request, shape))
     state = State.first(trainer)

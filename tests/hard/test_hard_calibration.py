@@ -25,7 +25,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
 from mitsim.reconstruct.reconstruct import Reconstruction
-from mitsim.report.quality import reconstruct
+from mitsim.report.reconstruct_run import reconstruct
 from tests.robustness import Recorder
 
 pytestmark = pytest.mark.robustness("Calibration")

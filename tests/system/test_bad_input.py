@@ -79,7 +79,7 @@ def test_calibrate_refuses(refused: Refused, lab: Any, options: list[str], fragm
 @pytest.mark.parametrize(
     ("options", "fragments"),
     [
-        (["--count", "0"], ["--count 0", "give 1 to 1000000 pairs"]),
+        (["--count", "0"], ["--count 0", "give a number from 1 to 1000000"]),
         (["--count", "some"], ["'some'"]),
         (["--pictures", "nowhere"], ["nowhere", "is no folder"]),
         (["--vary", "nowhere.toml"], ["nowhere.toml"]),

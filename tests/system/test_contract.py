@@ -491,7 +491,7 @@ def test_an_interrupt_leaves_the_terminal_whole(
         time.sleep(0.3)  # a few refreshes
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mitsim.cli._plan_of", interrupt)
+    monkeypatch.setattr("mitsim.cli.bench_verbs.plan_in", interrupt)
     out, err = on_a_terminal(monkeypatch, capsys, "plan", *lab.arguments)
     shown, _, after = err.rpartition("\x1b[?25h")
     assert out == "" and "plan" in shown and "mitsim: interrupted" in after

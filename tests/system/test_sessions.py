@@ -67,7 +67,7 @@ def test_what_no_session_makes_is_refused(refused: Callable[..., str], lab: Any,
     assert "give a session file, or --from FOLDER" in refused("run")
     assert "did you mean demo? " in refused("run", "dmeo")
     assert "-D 'x': give TABLE.FIELD=VALUE" in refused("run", "demo", "-D", "x")
-    assert "capture.patterns: patterns 'dotz'" in refused("run", "demo", "-D", "capture.patterns=dotz", "-o", "new")
+    assert "capture.patterns: 'dotz'" in refused("run", "demo", "-D", "capture.patterns=dotz", "-o", "new")
 
 
 @pytest.mark.slow

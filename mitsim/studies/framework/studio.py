@@ -262,9 +262,9 @@ class Studio:
     def _calibrate(self, bench: Bench, seed: int) -> Factors:
         """The same of factors."""
         if self._shared is None:
-            return bench.calibrate(seed)
+            return bench.calibrate(seed=seed)
         place = self._shared / "calibrations" / f"{bench.devices_digest[:_KEY_DIGITS]}-{seed}"
-        return load_calibration(_made_once(place, lambda part: bench.calibrate(seed).save(part)))
+        return load_calibration(_made_once(place, lambda part: bench.calibrate(seed=seed).save(part)))
 
     def _open(self, setup: Setup) -> Bench:
         path = setup.scene if setup.picture is None else self._copy_with_print(setup.scene, setup.picture)

@@ -94,5 +94,5 @@ def test_an_interrupted_run_is_resumed_with_its_closing_frame(bench: Bench, tmp_
 
 
 def test_another_kind_is_refused(light: Light) -> None:
-    with pytest.raises(ArgumentError, match=r"closing_frame 'last': use first or uniform"):
+    with pytest.raises(ArgumentError, match=r"closing_frame 'last': give 'first' or 'uniform'"):
         light.expose("dots:3", closing_frame="last")

@@ -80,8 +80,8 @@ def test_the_ends_of_a_range_are_within_it(argument: str, ends: tuple[float, flo
         *(("exposure_fraction", value, "to 1") for value in (0.0, -0.5, 1.01, math.nan)),
         *(("effects", value, "diffraction") for value in ("fog", "+fog", "diffraction", {"fog": True})),
         ("effects", "+ambient,-ambient", "keep one"),
-        *(("ambient_shots", value, f"1 to {MOST_SHOTS} shots") for value in (0, MOST_SHOTS + 1)),
-        *(("ambient_frame", value, "use auto, yes or no") for value in ("maybe", "", True)),
+        *(("ambient_shots", value, f"from 1 to {MOST_SHOTS}") for value in (0, MOST_SHOTS + 1)),
+        *(("ambient_frame", value, "give 'auto', 'yes' or 'no'") for value in ("maybe", "", True)),
     ],
 )
 def test_values_out_of_range_name_the_argument(argument: str, value: Any, allowed: str) -> None:

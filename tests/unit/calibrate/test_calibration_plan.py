@@ -108,7 +108,7 @@ def test_a_session_by_the_plan_has_the_images_that_it_promised(bench: Any, plan:
     found = []
     for seed in range(1, 5):
         shots = bench.capture("dots:2", seed=seed, accuracy=0.005)
-        factors = bench.calibrate(seed, 0.005, plan.recipe)
+        factors = bench.calibrate(seed=seed, accuracy=0.005, recipe=plan.recipe)
         assert factors.manifest.result["frames"] == plan.frames
         assert factors.manifest.result["exposure_s"] == pytest.approx(plan.exposure_s, rel=0.01)
         found.append(ms.psnr(ms.reconstruct(shots, factors).image, shots.truth))

@@ -66,7 +66,7 @@ def session(
             folder = tmp_path_factory.mktemp("calibration") / "cal"
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr("mitsim.calibrate.board_session.make_plan", geometric_plan)
-                factors = bench.calibrate(2, recipe=recipe(mode), output=folder)
+                factors = bench.calibrate(seed=2, recipe=recipe(mode), output=folder)
             made[key] = bench, factors, factors.estimate, folder
         return made[key]
 
@@ -82,7 +82,7 @@ def test_each_depth_has_factors_of_its_own(
     monkeypatch.setattr("mitsim.calibrate.board_session.make_plan", geometric_plan)
     bench = open_bench(shared_scene("depths16", n=16))
     depths = recipe("pair").model_copy(update={"depths": (350.0, 450.0)})
-    found = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal")
+    found = bench.calibrate_depths(seed=2, recipe=depths, output=tmp_path / "cal")
     geometry = bench.geometry
     code = geometry.build_mask().terms[-1][1]
     for depth, factors in found.items():
@@ -106,7 +106,7 @@ def test_each_depth_has_factors_of_its_own(
         assert np.array_equal(load_calibration(folder).left, factors.left)
     assert len({factors.manifest.configuration["seed"] for factors in found.values()}) == 2
     stamp = (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns
-    again = bench.calibrate_depths(2, recipe=depths, output=tmp_path / "cal", resume=True)
+    again = bench.calibrate_depths(seed=2, recipe=depths, output=tmp_path / "cal", resume=True)
     assert np.array_equal(again[450.0].right, found[450.0].right)
     assert (tmp_path / "cal" / "350" / "manifest.json").stat().st_mtime_ns == stamp
     with pytest.raises(MitsimError, match="use calibrate_depths"):
@@ -227,7 +227,7 @@ def test_flatcam_is_centred(session: Callable[..., Done]) -> None:
 
 def test_seeds(shared_scene: Callable[..., Path]) -> None:
     bench = open_bench(shared_scene("separable16", n=16))
-    one, again, other = (bench.calibrate(seed, 2e-2, recipe("uniform")).left for seed in (1, 1, 2))
+    one, again, other = (bench.calibrate(seed=seed, accuracy=2e-2, recipe=recipe("uniform")).left for seed in (1, 1, 2))
     assert np.array_equal(one, again) and not np.allclose(one, other, rtol=1e-6)
 
 
@@ -279,7 +279,7 @@ def test_frames_that_are_written_give_the_same_factors_bit_for_bit(
     if ending == ".npy":
         bench = replace(bench, devices=replace(bench.devices, sensor=bench.sensor.model_copy(update={"bits": None})))
     own = recipe("pair").model_copy(update=more)
-    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", 3, recipe=own)
+    simulated = bench.write_session(tmp_path / "frames", tmp_path / "cal", seed=3, recipe=own)
     found = calibrate_frames(tmp_path / "frames")
     assert np.array_equal(found.left, simulated.left) and np.array_equal(found.right, simulated.right)
     assert simulated.manifest.result["frames"] == files == len(list((tmp_path / "frames").glob(f"*{ending}")))

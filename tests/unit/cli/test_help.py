@@ -7,20 +7,22 @@ import json
 import os
 import re
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from unittest.mock import patch
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from mitsim.bench.request import Seeded
 from mitsim.cli import app
-from mitsim.cli.frame_verbs import method_names
-from mitsim.cli.help_page import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, parts_of
-from mitsim.cli.options import Seed, option, verb
+from mitsim.cli.commands import show, verb
+from mitsim.cli.screen import parts_of
+from mitsim.core.errors import ArgumentError
+from mitsim.core.options import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
 from mitsim.devices.patterns import pattern_names
+from mitsim.reconstruct.request import method_names
 
 LIST = Path(__file__).with_name("options.json")
 """Help, metavar and default of each option; written anew by ``python -m tests.unit.cli.test_help``."""
@@ -115,23 +117,25 @@ def test_examples_of_a_page_are_command_lines(verb: str) -> None:
         PROGRAM.commands[name].make_context(name, words)
 
 
-# ---- groups of options -----------------------------------------------------------------------------------------------
+# ---- from models to options ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Base:
+class Base(Seeded):
+    """A model that another one derives from."""
+
     PANEL = OUTPUT
 
-    seed: Seed = 0
-    quick: bool = option(False, "a few", "--quick")
+    quick: bool = option(False, "a few")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Group(Base):
+    """A model of options of several kinds."""
+
     PANEL = WHAT
 
     name: str = option(..., "of it", metavar="NAME")
-    sizes: list[int] | None = option(None, "of it")
+    sizes: list[int] | None = option(None, "of it", kind=list[int])
+    level: float | Literal["auto"] = option("auto", "of it")
 
 
 def call(*words: str) -> Any:
@@ -139,36 +143,63 @@ def call(*words: str) -> Any:
 
     @program.command()
     @verb
-    def read(*, context: typer.Context, place: Annotated[str, typer.Argument()], group: Group, last: int = 1) -> int:
-        seen.append((context.get_parameter_source("seed").name, place, group, last))
+    def read(*, place: Annotated[str, typer.Argument()], group: Group, last: int = 1, given: set[str]) -> int:
+        seen.append((given, place, group, last))
         return 0
 
     done = CliRunner().invoke(program, [*words])
-    return seen[0] if seen else done.exit_code
+    return seen[0] if seen else done.exception if isinstance(done.exception, ArgumentError) else done.exit_code
 
 
-def test_the_fields_of_a_group_are_options() -> None:
-    """Its own before those that it inherits. (Planted: a default that is the option itself.)"""
-    assert call("here", "--name", "x") == ("DEFAULT", "here", Group(name="x"), 1)
-    words = "there --seed 3 --sizes 1 --sizes 2 --quick --last 5 --name y"
-    assert call(*words.split()) == ("COMMANDLINE", "there", Group(seed=3, quick=True, name="y", sizes=[1, 2]), 5)
-    assert [*inspect.signature(verb(of_a_group)).parameters] == ["name", "sizes", "seed", "quick"]
+def test_the_fields_of_a_model_are_options() -> None:
+    """Those that are given make the model, which knows them. (Planted: defaults that count as given.)"""
+    given, place, group, last = call("here", "--name", "x")
+    assert (given, place, group, last) == ({"place", "name"}, "here", Group(name="x"), 1)
+    assert group.given == {"name": "x"}
+    words = "there --seed 3 --sizes 1 --sizes 2 --quick --last 5 --name y --level 0.5"
+    *_, group, last = call(*words.split())
+    assert (group, last) == (Group(seed=3, quick=True, name="y", sizes=[1, 2], level=0.5), 5)
+    assert [*inspect.signature(verb(of_a_group)).parameters] == ["context", "name", "sizes", "level", "quick", "seed"]
 
 
-def test_a_group_names_the_heading_of_its_own_options() -> None:
-    """Not of those that it inherits, nor of one that names another. (Planted: the last group's for all.)"""
-    options = inspect.signature(verb(of_a_group)).parameters.values()
+def test_a_model_names_the_heading_of_its_own_options() -> None:
+    """Not of those that it inherits, nor of one that names another. (Planted: the last model's for all.)"""
+    options = [each for each in inspect.signature(verb(of_a_group)).parameters.values() if each.name != "context"]
     panels = {each.name: each.annotation.__metadata__[0].rich_help_panel for each in options}
-    assert panels == {"name": WHAT, "sizes": WHAT, "seed": QUALITY, "quick": OUTPUT}
+    assert panels == {"name": WHAT, "sizes": WHAT, "level": WHAT, "seed": QUALITY, "quick": OUTPUT}
+
+
+def test_a_verb_shows_some_fields_as_it_needs() -> None:
+    """(Planted: changes of one verb that all others have, too.)"""
+    for _ in range(2):
+        help_ = {
+            each.name: each.annotation.__metadata__[0].help
+            for each in inspect.signature(verb(of_some)).parameters.values()
+            if each.name != "context"
+        }
+        assert help_ == {"seed": "another", "name": "of it"}
+    plain = inspect.signature(verb(of_a_group)).parameters["seed"].annotation
+    assert plain.__metadata__[0].help == Group.model_fields["seed"].description == "root of every random stream"
 
 
 def of_a_group(group: Group) -> int:
     return 0
 
 
+def of_some(group: Annotated[Group, show("seed name", seed={"help": "another"})]) -> int:
+    return 0
+
+
 @pytest.mark.parametrize("words", ["here", "here --name x --seed y", "--name x", "here --name x --size 1"])
-def test_options_of_a_group_are_refused_as_others_are(words: str) -> None:
+def test_options_of_a_model_are_refused_as_others_are(words: str) -> None:
     assert call(*words.split()) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "refusal"), [("--level y", "level 'y': give a number or auto"), ("--seed -1", "seed")]
+)
+def test_values_that_a_model_refuses_are_refused(words: str, refusal: str) -> None:
+    assert str(call("here", "--name", "x", *words.split())).startswith(refusal)
 
 
 if __name__ == "__main__":

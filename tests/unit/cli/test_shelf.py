@@ -198,7 +198,7 @@ def test_what_cannot_be_begun_is_refused(
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(MitsimError) as caught:
         PROGRAM.main(words.split(), standalone_mode=False)
-    from mitsim.cli.options import message_of
+    from mitsim.cli.commands import message_of
 
     message = message_of(caught.value)
     assert all(fragment in message for fragment in fragments) and "\n" not in message, message

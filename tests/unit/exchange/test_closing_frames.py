@@ -151,7 +151,9 @@ def test_pictures_end_with_the_closing_one_and_frames_are_read_again(kind: str, 
     """`patterns` and `export --format png`. (Planted: the last picture for the first; none drawn.)"""
     (tmp_path / "p.toml").write_text(PROJECTOR)
     projector, bench = str(tmp_path / "p.toml"), made(tmp_path / "bench", closing=kind)
-    drawn = pattern_pictures("dots:2x3", tmp_path / "drawn", projector, 10, closing_frame=kind)
+    drawn = pattern_pictures(
+        "dots:2x3", tmp_path / "drawn", projector=projector, projector_pixels=10, closing_frame=kind
+    )
     export(bench.run, "png", tmp_path / "out", projector=projector)
     for folder in ("drawn", "out"):
         files = sorted((tmp_path / folder / "patterns").glob("pattern_*.png"))
@@ -165,4 +167,4 @@ def test_pictures_end_with_the_closing_one_and_frames_are_read_again(kind: str, 
                      closing_frame=kind)  # fmt: skip
     assert np.array_equal(again.dn, shots.dn) and np.array_equal(again.closing.light, shots.closing.light)
     with pytest.raises(MitsimError, match="closing_frame has no effect on stripes"):
-        pattern_pictures("stripes", tmp_path / "s", projector, 4, closing_frame=kind)
+        pattern_pictures("stripes", tmp_path / "s", projector=projector, projector_pixels=4, closing_frame=kind)

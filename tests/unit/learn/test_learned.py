@@ -6,7 +6,7 @@ import itertools
 import json
 import pickle
 import re
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -52,7 +52,7 @@ def _one_thread() -> Any:
 
 
 def trained(path: Path, method: str = "unrolled", patterns: str = "uniform", **more: Any) -> LearnedSolver:
-    request = Training(method, steps=more.pop("steps", STEPS), seed=3)
+    request = Training(method=method, steps=more.pop("steps", STEPS), seed=3)
     return train_network(FakeStore(patterns=patterns), bench().calibrated(1), request, path, **more).model
 
 
@@ -105,7 +105,7 @@ def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) ->
     assert 1e-4 < float((rounded - single).abs().max() / single.abs().max()) < 0.1
 
     store, factors = FakeStore(8), bench().calibrated(1)
-    prepared, request = SOLVERS["tikhonov"].init(factors, store.patterns), Training("refined", batch=4)
+    prepared, request = SOLVERS["tikhonov"].init(factors, store.patterns), Training(method="refined", batch=4)
     trainer = training.Trainer(
         request, prepared, training.Sums.of(store, prepared, Job()), training.first_network(request, (16, 16))
     )
@@ -251,10 +251,10 @@ def test_plug_and_play_is_the_scheme_of_deepinv() -> None:
 def test_every_method_learns(method: str, tmp_path: Path) -> None:
     """Of a few pairs, on pairs that did not teach, and on frames of one more. (Planted: truths of other pairs.)"""
     made = train_network(
-        FakeStore(), bench().calibrated(1), Training(method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
+        FakeStore(), bench().calibrated(1), Training(method=method, steps=STEPS, batch=4, seed=3), tmp_path / "m.pt"
     )
     assert made.curve[0][0] == 0 and max(value for _, value in made.curve) > made.curve[0][1] + 0.5
-    blank = replace(made.model, network=training.first_network(Training(method), (16, 16)))
+    blank = replace(made.model, network=training.first_network(Training(method=method), (16, 16)))
     before, after = (psnr(image_of(each).image, picture(5)) for each in (blank, made.model))
     assert after > before + 0.3
 
@@ -275,7 +275,7 @@ def test_an_interrupted_training_goes_on_bit_equal(
     any precision taken for the same.)"""
     store, factors = FakeStore(12), bench().calibrated(1)
     other = 0.1 if method == "flatnet" else 0.0
-    request = Training(method, steps=6, batch=4, seed=1, feature_weight=other, adversary_weight=other)
+    request = Training(method=method, steps=6, batch=4, seed=1, feature_weight=other, adversary_weight=other)
 
     def weights(name: str, **more: Any) -> dict[str, np.ndarray]:
         made = train_network(store, factors, request, tmp_path / name, **more)
@@ -297,7 +297,7 @@ def test_an_interrupted_training_goes_on_bit_equal(
         train_network(store, factors, request, tmp_path / "c.pt", Job(progress=stop))
     assert not (tmp_path / "c.pt").exists() and parts == [step / 6 for step in (1, 2, 3, 4)]
     with pytest.raises(MitsimError, match="other pairs, factors or options"):
-        train_network(store, factors, replace(request, seed=2), tmp_path / "c.pt", resume=True)
+        train_network(store, factors, request.model_copy(update={"seed": 2}), tmp_path / "c.pt", resume=True)
     with monkeypatch.context() as patch, pytest.raises(MitsimError, match="numbers of other precision"):
         patch.setattr(training, "has_half", lambda device: not has_half(device))
         train_network(store, factors, request, tmp_path / "c.pt", resume=True)
@@ -316,11 +316,11 @@ def test_a_critic_tells_images_from_truths() -> None:
     random = torch.Generator().manual_seed(1)
     truths = torch.as_tensor(np.stack([picture(seed, 32) for seed in range(8)]))[:, None].to(like)
     images = truths + 0.1 * torch.randn(truths.shape, generator=random)
-    of_features = Critic(Training("flatnet", feature_weight=1.0), like)
+    of_features = Critic(Training(method="flatnet", feature_weight=1.0), like)
     near, nearer, far = (of_features.loss(each, truths) for each in (truths, 0.5 * (images + truths), images))
     assert_allclose(near, len(LEVELS) * np.log(1e-5), rtol=1e-5)
     assert near < nearer < far
-    critic = Critic(Training("flatnet", adversary_weight=1.0), like)
+    critic = Critic(Training(method="flatnet", adversary_weight=1.0), like)
     for _ in range(30):
         critic.learn(images, truths)
         critic.optimiser.step()
@@ -331,7 +331,7 @@ def test_a_turned_picture_has_the_frames_of_its_own(tmp_path: Path) -> None:
     """Without noise and misfit, what a batch holds of a turned picture is what its frames would add up to. (Planted:
     data turned and truth not.)"""
     store, factors = FakeStore(8), bench().calibrated(1, error=0.0)
-    request = Training("unrolled", batch=8)
+    request = Training(method="unrolled", batch=8)
     prepared = SOLVERS["tikhonov"].init(factors, store.patterns)
     sums = training.Sums.of(store, prepared, Job())
     exact = prepared.sigma * (prepared.left.basis.T @ sums.truths.astype(np.float64) @ prepared.right.basis)
@@ -357,7 +357,7 @@ def test_oblong_pictures_are_turned_to_their_own_shape_alone() -> None:
 def test_the_rate_goes_over_one_cycle() -> None:
     """Up to the one that is asked for and down to nothing, by half a cosine: either has half of it for its mean.
     (Planted: another phase of the fall.)"""
-    trainer: Any = SimpleNamespace(request=Training("unrolled", steps=1000, rate=1e-3))
+    trainer: Any = SimpleNamespace(request=Training(method="unrolled", steps=1000, rate=1e-3))
     rates = [training.Trainer.rate(trainer, number) for number in range(1000)]
     assert max(rates) == pytest.approx(1e-3, rel=0.01) and 100 < int(np.argmax(rates)) < 200
     assert rates[0] < 1e-5 and rates[-1] < 1e-8 and np.mean(rates) == pytest.approx(0.5e-3, rel=1e-3)
@@ -388,7 +388,7 @@ def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
         return judge(trainer, pairs)
 
     monkeypatch.setattr(training.Trainer, "judge", note)
-    made = train_network(store, bench().calibrated(1), Training("unrolled", steps=2), tmp_path / "m.pt")
+    made = train_network(store, bench().calibrated(1), Training(method="unrolled", steps=2), tmp_path / "m.pt")
     *looks, before, after = asked
     assert len(looks) == len(made.curve) == 3 and {*np.concatenate(looks)}.isdisjoint({*before, *after})
     summary = made.summary()
@@ -397,7 +397,7 @@ def test_the_stated_psnr_is_of_photographs_that_neither_teach_nor_choose(
 
 
 def test_trainings_that_are_refused(tmp_path: Path) -> None:
-    factors, request = bench().calibrated(1), Training("unrolled", steps=2)
+    factors, request = bench().calibrated(1), Training(method="unrolled", steps=2)
     with pytest.raises(MitsimError, match="holds 7 pairs; give at least 8"):
         train_network(FakeStore(7), factors, request, tmp_path / "m.pt")
     with pytest.raises(MitsimError, match="its pairs show 2 photographs; give at least 3"):
@@ -414,7 +414,7 @@ def test_trainings_that_are_refused(tmp_path: Path) -> None:
         training.Sums.of(FakeStore(8), prepared, Job(limits=Limits(memory_bytes=0.99 * held)))
     for device in ("abacus", "meta"):
         with pytest.raises(ArgumentError, match=f"device '{device}': cannot be used"):
-            train_network(FakeStore(8), factors, replace(request, device=device), tmp_path / "m.pt")
+            train_network(FakeStore(8), factors, request.model_copy(update={"device": device}), tmp_path / "m.pt")
     with pytest.raises(MitsimError, match="ran away at step"):
         train_network(HotStore(8), factors, request, tmp_path / "m.pt")
     assert not (tmp_path / "m.pt").exists()
@@ -566,8 +566,8 @@ def test_without_torch_a_line_says_what_to_install(tmp_path: Path, monkeypatch: 
 def test_a_request_says_what_no_network_is_trained_by() -> None:
     for name, value in (("method", "unroled"), ("steps", 0), ("batch", 1000), ("rate", 0.0), ("rate", float("nan"))):
         with pytest.raises(MitsimError, match=f"^{name} "):
-            Training(**{**asdict(Training("unrolled")), name: value})
+            Training(**{**dict(Training(method="unrolled")), name: value})
     for name in ("feature_weight", "adversary_weight"):
         for method, value in (("flatnet", -1.0), ("flatnet", float("nan")), ("plug-and-play", 0.1)):
             with pytest.raises(MitsimError, match=f"^{name} "):
-                Training(method, **{name: value})
+                Training(method=method, **{name: value})

@@ -68,11 +68,11 @@ class Lab:
         **asked: Any,
     ) -> PairStore:
         """So many pairs in a folder of that ``name``; ``asked``: fields of a request, or of what pairs are."""
-        own = {key: asked.pop(key) for key in ("idealised", "folder", "variation") if key in asked}
+        own = {key: asked.pop(key) for key in ("idealised", "pictures", "vary") if key in asked}
         request = Request.of(**{"patterns": "dots:2", "accuracy": 2e-3, "seed": 3, **asked})
         bench_of = dict(scene or {})
         store, _ = make_pairs(
-            lambda drawn: self.bench(**bench_of, **drawn), PairsRequest(request, count, **own),
+            lambda drawn: self.bench(**bench_of, **drawn), PairsRequest(capture=request, count=count, **own),
             Task(self.folder / name, resume),
         )  # fmt: skip
         return store
@@ -93,7 +93,7 @@ def test_programs_make_the_same_pairs(lab: Lab) -> None:
         ms.make_pairs(bench, lab.folder / "timed", 2, seconds=3.0)
     with pytest.raises(MitsimError, match="nowhere: is no folder"):
         ms.make_pairs(bench, lab.folder / "timed", 2, pictures="nowhere", idealised=True)
-    with pytest.raises(MitsimError, match="count 0: give 1 to"):
+    with pytest.raises(MitsimError, match="count 0: give a number from 1 to"):
         ms.make_pairs(bench, lab.folder / "timed", 0)
     with pytest.raises(MitsimError, match=r"^2 pairs"):
         ms.make_pairs(bench, lab.folder / "timed", 2, "dots:2", job=ms.Job(limits=ms.Limits(memory_bytes=1e6)))
@@ -258,7 +258,7 @@ def test_benches_vary_by_group(lab: Lab) -> None:
     )
     scene = {"extra": POINT.replace("300", "$albedo"), "albedo": "2"}
     still = lab.pairs(4, "still", scene=scene, accuracy=1e-2)
-    store = lab.pairs(4, variation=variation, scene={"extra": scene["extra"]}, accuracy=1e-2)
+    store = lab.pairs(4, vary=variation, scene={"extra": scene["extra"]}, accuracy=1e-2)
     first, second = store.manifest.groups
     assert first != second and first.keys() == {"exposure_fraction", "mask.mask_rows_um", "scene.albedo"}
     assert [(shard.first, shard.count, shard.group) for shard in store.manifest.shards] == [(0, 2, 0), (2, 2, 1)]
@@ -284,7 +284,7 @@ def test_a_bench_that_cannot_share_its_light_is_refused_before_any_work(
     with pytest.raises(
         MitsimError, match=r"bench 2 \(albedo [12]\..*\): the sheet is turned, other than before bench 0"
     ):
-        lab.pairs(3, variation=variation, scene=scene)
+        lab.pairs(3, vary=variation, scene=scene)
     assert not (lab.folder / "store").exists()
 
 
@@ -344,9 +344,9 @@ def test_a_picture_that_cannot_be_shown_is_refused_before_any_work(lab: Lab) -> 
     for name in ("a.npy", "b.npy"):
         np.save(folder / name, np.full((N, N) if name == "a.npy" else (N - 1, N), 0.5))
     with pytest.raises(MitsimError, match=r"b\.npy: has 15 pixels on its shorter side, and 16 are shown"):
-        lab.pairs(3, folder=folder)
+        lab.pairs(3, pictures=folder)
     assert not (lab.folder / "store").exists()
-    assert len(lab.pairs(1, folder=folder)) == 1, "which does not show the other"
+    assert len(lab.pairs(1, pictures=folder)) == 1, "which does not show the other"
 
 
 def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) -> None:
@@ -379,20 +379,20 @@ def test_a_damaged_store_is_refused_in_a_line(drawn: PairStore, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("own", "words"),
     [
-        ({"count": 0}, "count 0: give 1 to"),
+        ({"count": 0}, "count 0: give a number from 1 to"),
         ({"seconds": 5.0, "accuracy": None}, "pairs share their light"),
-        ({"idealised": True, "variation": Variation(groups=1)}, "the idealised model has no bench"),
-        ({"variation": Variation(groups=3)}, "3 groups of 2 pairs"),
-        ({"variation": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
-        ({"variation": Variation(groups=1, mask={"mask_rows_um": (0.0, 1e5)})}, "mask_rows_um: got 100000.0"),
-        ({"exposure": 0.1, "variation": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
+        ({"idealised": True, "vary": Variation(groups=1)}, "the idealised model has no bench"),
+        ({"vary": Variation(groups=3)}, "3 groups of 2 pairs"),
+        ({"vary": Variation(groups=1, exposure_fraction=(0.1, 2.0))}, "exposure_fraction 2.0: give a part of"),
+        ({"vary": Variation(groups=1, mask={"mask_rows_um": (0.0, 1e5)})}, "mask_rows_um: got 100000.0"),
+        ({"exposure": 0.1, "vary": Variation(groups=1, exposure_fraction=(0.1, 0.2))}, "exposure_fraction varies"),
     ],
 )
 def test_a_request_that_cannot_be_served_is_refused(own: dict[str, Any], words: str) -> None:
-    kept = {key: own.pop(key) for key in ("count", "idealised", "variation") if key in own}
+    kept = {key: own.pop(key) for key in ("count", "idealised", "vary") if key in own}
     request = Request.of(**{key: value for key, value in own.items() if value is not None})
     with pytest.raises(MitsimError, match=words):
-        PairsRequest(request, **{"count": 2, **kept}).check()
+        PairsRequest(capture=request, **{"count": 2, **kept}).check()
 
 
 def test_prints_show_what_a_bitmap_of_the_picture_shows(lab: Lab) -> None:

@@ -26,7 +26,7 @@ from mitsim.reconstruct.request import ImageCost, predict_cost
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Tikhonov
-from mitsim.report.quality import reconstruct as reconstruct_folders
+from mitsim.report.reconstruct_run import reconstruct as reconstruct_folders
 from tests import ideal_sessions
 from tests.ideal_sessions import picture
 
@@ -294,7 +294,9 @@ def test_the_folders_are_refused_before_work(
     folders = shots.save(tmp_path / "run"), factors.save(tmp_path / "cal"), tmp_path / "image"
     reconstruct_folders(*folders, 1.0)
     reconstruct_folders(*folders, 1.0)
-    monkeypatch.setattr("mitsim.report.quality.reconstruct_request", lambda *_: pytest.fail("work was done first"))
+    monkeypatch.setattr(
+        "mitsim.report.reconstruct_run.reconstruct_request", lambda *_: pytest.fail("work was done first")
+    )
     with pytest.raises(MitsimError, match=r"other inputs \(lambda differ\).*overwrite=True"):
         reconstruct_folders(*folders, 2.0)
     (tmp_path / "image" / "result.json").unlink()

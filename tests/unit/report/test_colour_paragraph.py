@@ -1,7 +1,7 @@
 """One warning for all lines of a run."""
 
 from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.report.colour_image import one_paragraph
+from mitsim.report.reconstruct_run import one_paragraph
 
 
 def test_lines_share_one_warning_and_no_flag_is_repeated() -> None:

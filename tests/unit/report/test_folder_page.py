@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsim.cli.options import Pictured, command_line
-from mitsim.cli.report_verb import finish_folder, finish_frame
+from mitsim.cli.commands import Pictured, command_line
+from mitsim.cli.screen import finish_folder, finish_frame
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json
@@ -27,10 +27,9 @@ from mitsim.core.recorders import RunFolder
 from mitsim.core.runs import load_run
 from mitsim.core.spectral_manifests import RUN, ColourManifest, write_colours
 from mitsim.light.plan import PlanRow
-from mitsim.report.folder_pictures import Picture, Scale, contact_sheet
-from mitsim.report.folders import report_folder
-from mitsim.report.parts import PlanChart, lines_of, plan_rows
-from mitsim.report.quality import reconstruct
+from mitsim.report.folder_page import report_folder
+from mitsim.report.pages import Picture, PlanChart, Scale, contact_sheet, lines_of, plan_rows
+from mitsim.report.reconstruct_run import reconstruct
 from tests.exchanged import COLUMNS, DIGITAL, ROWS, Made, made
 from tests.unit.report.test_report import _Outside
 

@@ -17,8 +17,7 @@ from mitsim.light.plan import PlanRow
 from mitsim.metrics import Quality
 from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
-from mitsim.report.pages import page_figure
-from mitsim.report.parts import stages_of
+from mitsim.report.pages import page_figure, stages_of
 from mitsim.studies.demo import _no_image
 from mitsim.studies.framework.page import Part, build_findings
 
@@ -173,8 +172,9 @@ def test_every_number_that_was_given_is_shown(page: str) -> None:
 
 
 def test_each_image_stands_in_its_place(page: str) -> None:
-    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 4 plots.
-    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 4
+    # Truth: in the scene and in each row. Then 10 recoveries, 5 patterns, 3 frames, the scene, 3 plots, stated and
+    # actual errors.
+    assert page.count("<img ") == 3 + 10 + 5 + 3 + 1 + 3 + 2
     assert page.count('class="picture result best"') == 2
 
 
@@ -204,7 +204,7 @@ def test_trust_is_a_row_a_family_and_one_picture_of_the_main_one(page: str) -> N
         assert float(row[3]) == pytest.approx(stated, rel=0.1)
         assert float(row[4].removesuffix(" %")) == pytest.approx(95, abs=2.1)
     assert [re.sub(r"<.*?>", "", row[6]) for row in rows] == ["depth", "fits", "fits", "fits", "fits"]
-    assert section.count("<img ") == 1 and 'alt="Stated uncertainty and actual error, 49 dots"' in section
+    assert section.count("<img ") == 2 and 'alt="Stated: standard uncertainty"' in section
 
 
 @pytest.mark.usefixtures("unpainted")

@@ -68,14 +68,15 @@ def test_predicted_standard_errors_are_the_spread_over_seeds_and_specimens() -> 
             [
                 row.deviations
                 for row in characterise(
-                    camera("nonuniform").model_copy(update={"pattern_seed": seed}), Procedure(48, 20, 8, seed)
+                    camera("nonuniform").model_copy(update={"pattern_seed": seed}),
+                    Procedure(pixels=48, steps=20, frames=8, seed=seed),
                 ).rows
             ]
             for seed in range(24, 36)
         ]
     )
     squares = np.square(off).sum(axis=0)
-    names = [row.name for row in characterise(camera("plain"), Procedure(48, 20, 8)).rows]
+    names = [row.name for row in characterise(camera("plain"), Procedure(pixels=48, steps=20, frames=8)).rows]
     for name, value in zip(names, squares, strict=True):
         # The largest variance falls on the same step in all: its figure is known to a step, not to its noise.
         least = 0.0 if name == "saturation_capacity" else 1.6
@@ -122,7 +123,7 @@ def test_few_bits_and_clipped_darks_are_expected_and_flagged(name: str) -> None:
 
     (Planted: `bias` left at 0.)
     """
-    done = characterise(coarse(name), Procedure(128, 20, 4))
+    done = characterise(coarse(name), Procedure(pixels=128, steps=20, frames=4))
     cause = COARSE[name][1]
     assert (cause in done.warnings[0]) if cause else not done.warnings
     for row in done.rows:
@@ -137,7 +138,11 @@ def test_few_bits_and_clipped_darks_leave_the_predicted_spread(name: str) -> Non
     names = ("system_gain", "dark_noise", "full_well")
     off = np.array(
         [
-            [row.deviations for row in characterise(coarse(name), Procedure(64, 20, 4, seed)).rows if row.name in names]
+            [
+                row.deviations
+                for row in characterise(coarse(name), Procedure(pixels=64, steps=20, frames=4, seed=seed)).rows
+                if row.name in names
+            ]
             for seed in range(20)
         ]
     )
@@ -155,7 +160,7 @@ def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.Mo
 
 
 def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
-    done = characterise(camera("plain"), Procedure(32, 20, 2), tmp_path / "found")
+    done = characterise(camera("plain"), Procedure(pixels=32, steps=20, frames=2), tmp_path / "found")
     assert sorted(path.name for path in (tmp_path / "found").glob("[!.]*")) == [
         "camera.toml", "characterise.html", "characterise.json", "dark_current.png", "deviations.png", "linearity.png",
         "photon_transfer.png",
@@ -173,7 +178,7 @@ def test_page_plots_and_json_lie_in_the_folder(tmp_path: Path) -> None:
 
 
 def test_without_a_quantum_efficiency_light_is_counted_in_electrons() -> None:
-    done = characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), Procedure(32, 20, 2))
+    done = characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), Procedure(pixels=32, steps=20, frames=2))
     assert "quantum_efficiency" not in {row.name for row in done.rows} and done.rows[0].name == "system_gain"
 
 
@@ -181,11 +186,11 @@ def test_of_a_curve_the_efficiency_is_found_at_the_light_s_wavelength() -> None:
     """That of a mosaic has no one value: its light is counted in electrons."""
     curve = {"wavelengths_nm": [400.0, 600.0], "efficiency": [0.2, 0.6]}
     of_a_curve = sensor(**{**PLAIN, "quantum_efficiency": None, "quantum_efficiency_curve": curve})
-    small = Procedure(32, 20, 2, wavelength_nm=500.0)
+    small = Procedure(pixels=32, steps=20, frames=2, wavelength=500.0)
     by_number = characterise(sensor(**{**PLAIN, "quantum_efficiency": 0.4}), small)
     assert characterise(of_a_curve, small).rows == by_number.rows and by_number.rows[1].set == 0.4
     with pytest.raises(MitsimError, match="700 nm"):
-        characterise(of_a_curve, Procedure(32, 20, 2, wavelength_nm=700.0))
+        characterise(of_a_curve, Procedure(pixels=32, steps=20, frames=2, wavelength=700.0))
     filters = {"quantum_efficiency": None, "mosaic": "RGGB", "mosaic_curves": {plane: curve for plane in "RGB"}}
     rows = characterise(sensor(**{**PLAIN, **filters}), small).rows
     assert rows == characterise(sensor(**{**PLAIN, "quantum_efficiency": None}), small).rows

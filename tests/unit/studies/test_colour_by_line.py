@@ -16,7 +16,7 @@ from mitsim.core.runs import load_run
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.quality import reconstruct, reconstruct_colours
+from mitsim.report.reconstruct_run import reconstruct, reconstruct_colours
 from mitsim.studies.lit_lines import LitLine, serving
 from tests.coloured import LINES, PLACE, folders
 
@@ -112,7 +112,7 @@ def test_folders_that_do_not_belong_together_are_refused(pair: tuple[Path, Path]
 def test_a_chart_of_a_grey_run_is_refused(pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     run, calibration = (str(folder / "638nm") for folder in pair)
     assert main(["reconstruct", run, "--calibration", calibration, "--chart", "colour_checker"]) == 2
-    assert "is not coloured; leave out --chart" in capsys.readouterr().err
+    assert "which is not coloured; leave it out" in capsys.readouterr().err
 
 
 def test_a_calibration_of_another_line_is_refused(

@@ -13,8 +13,8 @@ from mitsim.core.runs import load_mosaic
 from mitsim.core.spectral_manifests import HALF, JOINT, WAYS, check_way
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
-from mitsim.report.colour_image import JudgedColours
-from mitsim.report.quality import reconstruct_colours
+from mitsim.report.colour_image import ColourImage
+from mitsim.report.reconstruct_run import reconstruct_colours
 from tests.coloured import LINES, PLACE, WEIGHTS, mosaic_folders, scenes
 from tests.unit.studies.test_colour_by_line import main
 
@@ -26,7 +26,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return mosaic_folders(tmp_path_factory.mktemp("mosaic"))
 
 
-def solved(pair: tuple[Path, Path], output: Path, **options: object) -> JudgedColours:
+def solved(pair: tuple[Path, Path], output: Path, **options: object) -> ColourImage:
     return reconstruct_colours(*pair, output, **options)  # type: ignore[arg-type]
 
 
@@ -41,20 +41,16 @@ def test_the_folder_holds_what_was_saved(pair: tuple[Path, Path]) -> None:
 def test_lines_come_apart_and_have_their_colours(pair: tuple[Path, Path], tmp_path: Path) -> None:
     found = solved(pair, tmp_path / "image", chart=PLACE)
     for number, (name, truth) in enumerate(scenes().items()):
-        assert psnr(found.colours.images[..., number], truth) > 30
+        assert psnr(found.images[..., number], truth) > 30
         kept = read_frame(tmp_path / "image" / name / "image.exr")[0]["reflectance"]
-        assert np.allclose(kept, found.colours.images[..., number], atol=1e-6)
+        assert np.allclose(kept, found.images[..., number], atol=1e-6)
     floor = delta_e(ColourModel.of_lines(LINES).xyz(chart().at(LINES)), chart().xyz)
     reported = json.loads((tmp_path / "image" / "colour.json").read_text())
-    assert (
-        reported["kind"] == "colour-image"
-        and reported["mosaic"] == "joint"
-        and reported["psnr"] == found.colours.psnr_db
-    )
+    assert reported["kind"] == "colour-image" and reported["mosaic"] == "joint" and reported["psnr"] == found.psnr_db
     assert reported["delta_e_floor"] == pytest.approx(floor.mean()) and reported["delta_e_chart"] < floor.mean() + 1
     assert [patch["name"] for patch in reported["patches"]] == list(chart().names)
     assert reported["unexplained"] < 3.5e-3 and found.ok
-    seen = found.colours.delta_e
+    seen = found.delta_e
     assert seen is not None and reported["delta_e"] == pytest.approx(seen.mean())
     page = (tmp_path / "image" / "report.html").read_text()
     assert all(text in page for text in ("638 nm", "black 2", "The truth", "joint", "the chart in this image"))
@@ -68,10 +64,10 @@ def test_the_joint_solve_is_best_where_each_line_has_a_camera_of_its_own(
     quality = {}
     for way in (JOINT, HALF):
         found = solved(pair, tmp_path / way, way=way)
-        quality[way] = found.colours.psnr_db
+        quality[way] = found.psnr_db
         assert quality[way] is not None
         ladder = [
-            solved(pair, tmp_path / way, way=way, lam=found.solution["lambda"] * step, overwrite=True).colours.psnr_db
+            solved(pair, tmp_path / way, way=way, lam=found.solution["lambda"] * step, overwrite=True).psnr_db
             for step in (0.1, 0.3, 3.0, 10.0)
         ]
         assert quality[way] > max(ladder) - 0.5, (way, quality, ladder)
@@ -90,7 +86,7 @@ def test_an_image_of_other_inputs_is_kept(pair: tuple[Path, Path], tmp_path: Pat
 
 def test_a_real_camera_has_no_truth(tmp_path: Path) -> None:
     found = solved(mosaic_folders(tmp_path, truths=False), tmp_path / "image")
-    assert found.colours.psnr_db is None and found.colours.delta_e is None and found.summary()["delta_e_chart"] is None
+    assert found.psnr_db is None and found.delta_e is None and found.summary()["delta_e_chart"] is None
     page = (tmp_path / "image" / "report.html").read_text()
     assert "No truth to compare it with" in page and "The truth." not in page
 
@@ -119,7 +115,7 @@ def test_the_command_line_tells_of_every_line(
         "planes that see several lines have no camera"
     )
     half = capsys.readouterr()
-    assert "half: lambda" in half.out and "Misfit" in half.err
+    assert "solved: half" in half.out.lower() and "Misfit" in half.err
 
 
 @pytest.mark.parametrize(
@@ -156,7 +152,7 @@ def test_folders_that_do_not_fit_are_refused(
         solved((run, tmp_path / "cal"), tmp_path / "image")
     line = calibration / "638nm"
     assert main(["reconstruct", str(line), "--calibration", str(line), "--mosaic", "joint"]) == 2
-    assert "is not coloured; leave out --mosaic" in capsys.readouterr().err
+    assert "which is not coloured; leave it out" in capsys.readouterr().err
 
 
 def test_a_manifest_has_a_weight_for_each_line(pair: tuple[Path, Path], tmp_path: Path) -> None:

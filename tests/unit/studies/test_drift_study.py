@@ -130,7 +130,7 @@ def test_a_session_whose_power_drifts_gives_other_factors(stand: DriftStand, sig
     drift, recipe = Drift(session_ramp=0.2, session_flicker=0.02), RECIPE.model_copy(update={"signed_capture": signed})
     calibrate = stand.lit.bench.calibrate
     still, factors = (
-        calibrate(SEED, recipe=recipe.model_copy(update={"drift": moving})) for moving in (Drift(), drift)
+        calibrate(seed=SEED, recipe=recipe.model_copy(update={"drift": moving})) for moving in (Drift(), drift)
     )
     own = replace(stand, factors=still, recipe=recipe)
     for before, after, mix in zip(

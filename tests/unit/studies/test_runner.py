@@ -63,7 +63,7 @@ def test_findings_that_may_not_be_trusted_end_with_1(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """(Planted: no warnings on the command line.)"""
-    monkeypatch.setattr("mitsim.verbs.Opening.open", lambda *_: BENCH)
+    monkeypatch.setattr("mitsim.verbs.open_as", lambda *_: BENCH)
     for number, (toy, status) in enumerate(((Toy, 0), (Doubtful, 1))):
         measure = partial(run_study, "calibration", lambda bench, request, job, toy=toy: toy(1.0))
         monkeypatch.setattr("mitsim.studies.framework.run.find_study", lambda *_, measure=measure: measure)

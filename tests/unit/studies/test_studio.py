@@ -65,7 +65,7 @@ def test_a_rendered_image_is_what_a_user_gets(studio: Studio, setup: Setup) -> N
     found = studio.image(setup, RENDERED, "dots:4", 3)
     bench = ms.open_bench(setup.scene, variant=setup.variant)
     shots = bench.light(accuracy=1e-2).expose("dots:4", seed=3)
-    own = ms.reconstruct(shots, bench.calibrate(3))
+    own = ms.reconstruct(shots, bench.calibrate(seed=3))
     assert np.array_equal(found.image, own.image) and found.lam == own.lam
     assert found.shots == 16 and found.exposure_s == shots.exposure_s and found.flags["flagged"] == (not own.ok)
     assert found.quality.psnr_db == pytest.approx(ms.psnr(own.image, shots.truth))

@@ -1,0 +1,547 @@
+"""Images of a run's spectral lines from the folders RUN and CAL, compared with the truth where there is one.
+
+A run has one unnamed line, a folder for each line, or frames of all lines behind colour filters. :func:`reconstruct`
+makes the image of one line, :func:`reconstruct_colours` the images of several lines and one image in colour.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError, check_arguments
+from mitsim.core.exr import write_frame
+from mitsim.core.files import output_folder, read_json, write_bytes
+from mitsim.core.images import png
+from mitsim.core.job import Job
+from mitsim.core.manifests import CalibrationManifest, read_manifest
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import load_mosaic, load_run
+from mitsim.core.spectral_manifests import (
+    COLOUR,
+    DEMOSAIC,
+    IMAGE,
+    JOINT,
+    MOSAIC,
+    RUN,
+    ColourManifest,
+    check_lines,
+    check_way,
+    is_coloured,
+    open_lines,
+    read_colours,
+)
+from mitsim.devices.chart import ChartPlace
+from mitsim.devices.mask_profile import load_psf
+from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
+from mitsim.optics.terms import best_term
+from mitsim.reconstruct.colour import PLANES, JointMosaic
+from mitsim.reconstruct.factors import load_calibration
+from mitsim.reconstruct.misfit import UNEXPLAINED
+from mitsim.reconstruct.reconstruct import (
+    MADE_OF,
+    Reconstruction,
+    check_same_inputs,
+    may_replace,
+    reconstruct_request,
+)
+from mitsim.reconstruct.regularisation import automatic_lambda
+from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
+from mitsim.reconstruct.solution import Solution, Status
+from mitsim.reconstruct.solver import prepare
+from mitsim.report.colour_image import ColourImage, begin_image
+from mitsim.report.folder_page import report_folder
+
+# -------- The image of one line
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A reconstruction, the folder that holds it, and its quality against the truth (None for a real camera)."""
+
+    reconstruction: Reconstruction
+    quality: Quality | None
+    output: str
+    truth: FloatArray | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Return all but the images, by the keys of the command line's JSON."""
+        return {**summary_of(self.quality), **self.reconstruction.summary(), "output": self.output}
+
+
+def reconstruct(
+    run: Path | str,
+    calibration: Path | str,
+    output: Path | str,
+    lam: float | Literal["auto"] = "auto",
+    overwrite: bool = False,
+    job: Job | None = None,
+    **options: Any,
+) -> Judged:
+    """Recover the image of a run with a calibration, and write image.exr, image.png and result.json.
+
+    Parameters
+    ----------
+    run, calibration, output
+        RUN and CAL folders, and one for the image: new or empty, or with an earlier image of the same inputs.
+    lam, **options
+        As for :class:`mitsim.reconstruct.request.ImageRequest`.
+    overwrite
+        Whether an earlier image of other inputs may be replaced.
+    job
+        Clock of the work.
+
+    Raises
+    ------
+    MitsimError
+        For folders that do not fit each other, options that are not allowed, or an output that cannot be written.
+    """
+    started, job, request = time.perf_counter(), job or Job(), ImageRequest(lam=lam, **options)
+    with job.clock.stage("read"):
+        shots, factors = load_run(run), load_calibration(calibration)
+        factors.check_fit(shots)
+        board = factors.manifest.board_reflectance
+        truth, truth_error = truth_for(shots, board), truth_error_for(shots, board)
+    replaces = may_replace(Path(output), request.inputs(shots, factors), overwrite)
+    with output_folder(output, overwrite=replaces) as folder:
+        read = time.perf_counter() - started
+        image = reconstruct_request(shots, factors, request, job)
+        quality = None if truth is None else Quality.of(image.image, truth, truth_error)
+        judged = Judged(replace(image, seconds={"read": read, **image.seconds}), quality, str(folder), truth)
+        with job.clock.stage("write"):
+            judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run, calibration)})
+    return judged
+
+
+def reconstruct_psf(
+    run: Path | str,
+    psf: Path | str,
+    output: Path | str,
+    reduce: int = 1,
+    overwrite: bool = False,
+    job: Job | None = None,
+    **options: Any,
+) -> Judged:
+    """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
+
+    Parameters
+    ----------
+    psf
+        Picture of the light of a scene point.
+    reduce
+        Pixels a side, of frames and picture, that become one.
+    run, output, overwrite, job, **options
+        As for :func:`reconstruct`; the options are ``lam``, ``method``, ``bounds`` and ``iterations``.
+    """
+    from mitsim.reconstruct.point_spread_image import psf_inputs, reconstruct_psf_request
+
+    request = ImageRequest(**options)
+    request.check_point_spread(reduce)
+    shots, light = load_run(run), load_psf(psf, reduce)
+    replaces = may_replace(Path(output), psf_inputs(shots, light, reduce, request), overwrite)
+    with output_folder(output, overwrite=replaces) as folder:
+        judged = Judged(reconstruct_psf_request(shots, psf, reduce, request, job), None, str(folder))
+        judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run)})
+    return judged
+
+
+def _origin(job: Job | None, run: Path | str, calibration: Path | str | None = None) -> dict[str, Any]:
+    """Return entries of result.json that say where an image comes from: the command and the folders."""
+    folders = {"run": run, "calibration": calibration}
+    made_of = {name: str(Path(folder).absolute()) for name, folder in folders.items() if folder is not None}
+    return {"command": job and job.command, MADE_OF: made_of}
+
+
+# -------- Images of several lines, and one in colour
+
+
+@check_arguments
+def reconstruct_colours(
+    run: Path | str,
+    calibration: Path | str,
+    output: Path | str,
+    chart: ChartPlace | None = None,
+    overwrite: bool = False,
+    job: Job | None = None,
+    **options: Any,
+) -> ColourImage:
+    """Recover the image of every line of a coloured run, and combine them to one image in colour.
+
+    Writes the folder of each line's image, image.exr (linear sRGB and XYZ), image.png, colour.json and report.html.
+
+    Parameters
+    ----------
+    run, calibration
+        Coloured folders of the same lines.
+    output
+        A folder: new or empty, or with an earlier coloured image of the same inputs.
+    chart
+        Place of the chart in the image; the colour matrix is then fitted on it. None: a fixed matrix, fitted on the
+        chart's spectra at the lines.
+    overwrite
+        Whether an earlier image of other inputs may be replaced.
+    job
+        Clock of the work.
+    **options
+        Options of :func:`reconstruct`, for every line. Of a run behind colour filters: ``way``, one of
+        :data:`mitsim.core.spectral_manifests.WAYS`, and ``lam``, of each plane or channel where these are solved one by
+        one. ``page=False`` leaves out pictures and report.html, which :func:`mitsim.report_folder` makes later.
+
+    Raises
+    ------
+    MitsimError
+        For folders of different lines, and as :func:`reconstruct`.
+    """
+    run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
+    page, found = options.pop("page", True), open_lines(run, RUN, MOSAIC)
+    lines = found.filters or read_colours(run, RUN)
+    check_lines(lines, str(run), calibration)
+    kind = _AllAtOnce if found.filters else _OneByOne
+    work = kind(lines, run, calibration, overwrite, job, **options)
+    with output_folder(output, overwrite=work.may_replace(output)) as folder:
+        image = work.solve(folder, chart)
+        image.write(folder, **_origin(job, run, calibration))
+    if page:
+        report_folder(output)
+    return image
+
+
+class _OneByOne:
+    """Solves each line of a run by itself, in a folder of its own."""
+
+    def __init__(
+        self, lines: ColourManifest, run: Path, calibration: Path, overwrite: bool, job: Job, **options: Any
+    ) -> None:
+        self.lines, self.run, self.calibration, self.overwrite = lines, run, calibration, overwrite
+        self.job, self.options = job, options
+
+    def may_replace(self, output: Path) -> bool:
+        """Return True if ``output`` holds an image of the same lines, or one that may be replaced anyway."""
+        return is_coloured(output) and (read_colours(output, IMAGE).names == self.lines.names or self.overwrite)
+
+    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
+        begins = not is_coloured(folder)
+        if begins:
+            begin_image(folder, self.lines)
+        images = {}
+        try:
+            for name in self.lines.names:
+                own = {"overwrite": self.overwrite, "job": self.job.apart(f"{name} "), **self.options}
+                images[name] = reconstruct(self.run / name, self.calibration / name, folder / name, **own)
+        except BaseException:
+            if begins and not any((folder / name).is_dir() for name in self.lines.names):  # refused before any image
+                (folder / COLOUR).unlink()
+            raise
+        solved = {name: judged.reconstruction for name, judged in images.items()}
+        shapes = {each.image.shape for each in solved.values()}
+        if len(shapes) > 1:
+            raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
+        truths = [judged.truth for judged in images.values() if judged.truth is not None]
+        of_lines = {name: judged.summary() for name, judged in images.items()}
+        return ColourImage.of(
+            self.lines,
+            np.stack([each.image for each in solved.values()], axis=-1),
+            _board_of(self.calibration, self.lines),
+            chart,
+            truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
+            qualities={name: judged.quality for name, judged in images.items()},
+            facts={
+                "frames": "one line at a time, a run for each",
+                "solved": "each line by itself",
+                "lambda": ", ".join(f"{name} {each.lam:.3g}" for name, each in solved.items()),
+                "residual of the frames": ", ".join(f"{name} {each.residual:.1e}" for name, each in solved.items()),
+            },
+            warnings=one_paragraph({name: each.status for name, each in solved.items()}),
+            seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
+            output=str(folder),
+            of_lines=of_lines,
+        )
+
+
+class _AllAtOnce:
+    """Solves all lines from the same frames, which were seen through colour filters."""
+
+    def __init__(
+        self,
+        lines: ColourManifest,
+        run: Path,
+        calibration: Path,
+        overwrite: bool,
+        job: Job,
+        way: str = JOINT,
+        lam: Lambda = "auto",
+    ) -> None:
+        check_joint(lam)
+        self.lines, self.calibration, self.overwrite = lines, calibration, overwrite
+        self.way, self.lam = check_way(way), lam
+        self.clock = job.apart("").clock
+        with self.clock.stage("read"):
+            self.mosaic = load_mosaic(run)
+            self.factors = {name: load_calibration(calibration / name) for name in lines.names}
+            for factors in self.factors.values():
+                factors.check_fit(self.mosaic.shots)
+
+    @cached_property
+    def inputs(self) -> dict[str, str | float]:
+        """What the image is made of, by which colour.json recognises it."""
+        calibration = "-".join(factors.fingerprint for factors in self.factors.values())
+        run = self.mosaic.shots.fingerprint
+        return {"run": run, "calibration": calibration, "mosaic": self.way, "lambda": self.lam}
+
+    def may_replace(self, output: Path) -> bool:
+        """Return True if ``output`` holds an image; MitsimError where that is of other inputs and must stay."""
+        if not is_coloured(output):
+            return False
+        read_colours(output, IMAGE)
+        if not self.overwrite:
+            check_same_inputs(output, read_json(output / COLOUR), self.inputs)
+        return True
+
+    @single_threaded_blas()
+    def solve(self, folder: Path, chart: ChartPlace | None) -> ColourImage:
+        lines, shots = self.lines, self.mosaic.shots
+        with self.clock.stage("accumulate"):
+            pairs = [(factors.left, factors.right) for factors in self.factors.values()]
+            camera = MosaicCamera.of(pairs, self.mosaic.weights, self.mosaic.manifest.mosaic)
+            solver, data, noise = Solver(self.way, camera, shots.patterns), 0.0, 0.0
+            for each in shots.pattern_measurements((len(camera.lefts[0]), len(camera.rights[0]))):
+                solver.add(each.frame, each.row, each.column)
+                data += float(np.square(each.frame).sum())
+                noise += float(np.maximum(shots.manifest.digital.variance(each.light, each.shots), 0.0).sum())
+        with self.clock.stage("solve"):
+            solved = solver.images(self.lam)
+        # What the noise of frames and factors leaves of the residual, as a part of the data.
+        explained = 0.0
+        for factors in self.factors.values():
+            if (own := factors.manifest.noise) is not None:
+                sides = (own.left, factors.left), (own.right, factors.right)
+                explained = max(explained, sum(s**2 * side.size / float(np.square(side).sum()) for s, side in sides))
+        unexplained = float(np.sqrt(max(solved.residual**2 - (noise / data if data else 0.0) - explained, 0.0)))
+        board, qualities = _board_of(self.calibration, lines), dict[str, Quality | None].fromkeys(lines.names)
+        truth, steps = self.mosaic.truth(board), solved.joint and solved.joint.iterations
+        if truth is not None:
+            for number, (name, known) in enumerate(self.mosaic.truths.items()):
+                error = float(np.sqrt(np.square(known.standard_error).mean())) * known.board / (board or known.board)
+                qualities[name] = Quality.of(solved.images[number], truth[..., number], error)
+        begin_image(folder, lines, inputs=self.inputs)
+        for name, image in zip(lines.names, solved.images, strict=True):
+            with output_folder(folder / name, overwrite=True) as place:
+                write_frame(place / IMAGE_FILE, {"reflectance": image.astype(np.float32)}, {"lambda": solved.lam})
+                write_bytes(place / PICTURE_FILE, png(image))
+        return ColourImage.of(
+            lines,
+            np.moveaxis(solved.images, 0, -1),
+            board,
+            chart,
+            truth=truth,
+            qualities=qualities,
+            facts={
+                "frames": "all lines at once, behind colour filters",
+                "solved": self.way if steps is None else f"{self.way}, {steps} steps",
+                "lambda": f"{solved.lam:.3g}",
+                "residual of the frames": f"{solved.residual:.1e}, of which {unexplained:.1e} is unexplained",
+            },
+            warnings=self._warnings(solved.joint, unexplained),
+            seconds=self.clock.seconds(),
+            output=str(folder),
+            solution={
+                "mosaic": self.way,
+                "lambda": solved.lam,
+                "steps": steps,
+                "residual": solved.residual,
+                "unexplained": unexplained,
+            },
+            inputs=self.inputs,
+        )
+
+    def _warnings(self, joint: Solution | None, unexplained: float) -> tuple[str, ...]:
+        warnings = []
+        if joint is not None and not joint.ok:
+            warnings.append(
+                f"Not converged: {joint.iterations} steps leave {joint.residual:.1e} of the normal equations; raise "
+                "lambda."
+            )
+        if unexplained > UNEXPLAINED:
+            warnings.append(
+                f"Misfit: {unexplained:.1e} of the measurements are explained by no image of these lines, beyond "
+                "noise; look for depth, light over several surfaces or another camera than was calibrated."
+            )
+        flags = {"The capture": self.mosaic.warnings}
+        flags |= {f"The calibration of {name}": factors.warnings for name, factors in self.factors.items()}
+        flagged = [f"{what} was flagged: {text.rstrip('.')}." for what, texts in flags.items() for text in texts]
+        return (*warnings, *flagged)
+
+
+def one_paragraph(statuses: Mapping[str, Status]) -> tuple[str, ...]:
+    """Combine the ``statuses`` of a run's lines, by name, to one warning; return none where all lines are usable.
+
+    Each verdict has the sentence of the first line with that verdict, and each flag appears once.
+    """
+    flagged = {name: status for name, status in statuses.items() if not status.ok}
+    parts = []
+    for verdict in dict.fromkeys(status.verdict for status in flagged.values()):
+        names = [name for name, status in flagged.items() if status.verdict is verdict]
+        first = flagged[names[0]]
+        alike = len({flagged[name].sentence for name in names}) == 1
+        of_first = "" if alike else f" (so {names[0]}; the table has the others)"
+        parts.append(f"{', '.join(names)}: {first.sentence}{of_first}{'; ' if first.remedy else ''}{first.remedy}.")
+    flags = dict.fromkeys(flag for status in flagged.values() for flag in status.flags)
+    return (" ".join([*parts, *flags]),) if parts else ()
+
+
+def _board_of(calibration: Path, lines: ColourManifest) -> float | None:
+    """Return the reflectance of the board that images are relative to, which all lines must share."""
+    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
+    if len(boards) > 1:
+        raise MitsimError(
+            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
+        )
+    return boards.pop()
+
+
+# -------- Ways from frames behind colour filters to images of the lines
+#
+# *Demosaiced*: every frame becomes three whole frames (colour-demosaicing), each channel is solved, and the channels'
+# images are separated into lines. *Half resolution*: each plane of filters is solved with its own rows of the factors,
+# so that no pixel is interpolated. *Joint*: all planes are solved for all lines (:mod:`mitsim.reconstruct.colour`). A
+# channel or plane that sees several lines has the one separable camera that is nearest to them; only the joint solve
+# knows that each line has its own.
+#
+# Lambda is chosen without a truth: each plane, or channel, chooses its own (:mod:`mitsim.reconstruct.regularisation`).
+# The joint solve takes the geometric mean of the planes' lambdas, because the planes have the same scene and nearly the
+# same noise.
+
+Patterns = tuple[FloatArray, FloatArray]
+Lambda = float | Literal["auto"]
+
+
+@dataclass(frozen=True, eq=False)
+class MosaicCamera:
+    """A camera under a ``mosaic`` of 2 x 2 colour filters, such as ``RGGB``.
+
+    ``lefts`` (lines, m, n) and ``rights`` (lines, m', n') are the factors of each line for pixels without filters, and
+    ``weights`` (4, lines) the responses of the four pixels to each line.
+    """
+
+    lefts: FloatArray
+    rights: FloatArray
+    weights: FloatArray
+    mosaic: str
+
+    @classmethod
+    def of(cls, factors: Sequence[tuple[FloatArray, FloatArray]], weights: FloatArray, mosaic: str) -> MosaicCamera:
+        """Stack the (left, right) ``factors`` of all lines."""
+        lefts, rights = (np.stack(side) for side in zip(*factors, strict=True))
+        return cls(lefts, rights, weights, mosaic)
+
+
+@dataclass(frozen=True, eq=False)
+class LineImages:
+    """Images (lines, n, n') of all lines by one way.
+
+    ``lam`` is the lambda of the joint solve, or the geometric mean of the planes' or channels'. ``residual`` is ||Y -
+    model|| / ||Y|| over all frames, as planes or channels were solved. ``joint`` is the joint solution.
+    """
+
+    images: FloatArray
+    lam: float
+    residual: float
+    joint: Solution | None = None
+
+
+class Solver:
+    """Images of all lines from frames behind a camera's filters, by one of the ways.
+
+    Each plane, or channel of demosaiced frames, is solved by itself. The joint way adds one model of all lines, and
+    needs the planes for lambda alone. Patterns are the columns P_L (n, K) and P_R (n', K').
+    """
+
+    def __init__(self, way: str, camera: MosaicCamera, patterns: Patterns) -> None:
+        self._mosaic = camera.mosaic if check_way(way) == DEMOSAIC else None
+        self._joint = JointMosaic(camera.lefts, camera.rights, camera.weights, *patterns) if way == JOINT else None
+        self._gathered = np.zeros(self._joint.shape if self._joint else ())
+        channels = [camera.mosaic.index(name) for name in "RGB"] if self._mosaic else list(range(len(PLANES)))
+        lines = [*zip(camera.lefts, camera.rights, strict=True)]
+        weights = camera.weights[channels]
+        terms = [
+            best_term([(weight * left, right) for weight, (left, right) in zip(row, lines, strict=True)])
+            for row in weights
+        ]
+        # (channels, lines): the part of each line's image in the image that the one separable camera gives.
+        mixing = np.array(
+            [
+                [
+                    weight * np.vdot(left, term.left) * np.vdot(right, term.right)
+                    for weight, (left, right) in zip(row, lines, strict=True)
+                ]
+                / (np.square(np.linalg.norm(term.left)) * np.square(np.linalg.norm(term.right)))
+                for row, term in zip(weights, terms, strict=True)
+            ]
+        )
+        self._undo = np.linalg.pinv(mixing)
+        sides = [(term.left, term.right) for term in terms]
+        if not self._mosaic:
+            sides = [(left[a::2], right[b::2]) for (left, right), (a, b) in zip(sides, PLANES, strict=True)]
+        self._models = [prepare(left, right, *patterns) for left, right in sides]
+        self._sums = [model.accumulator() for model in self._models]
+
+    def add(self, frame: FloatArray, row: int, column: int) -> None:
+        """Add the (m, m') ``frame`` [electrons/s] that was measured under pattern (``row``, ``column``)."""
+        if self._joint:
+            self._gathered += self._joint.gather(frame, row, column)
+        if self._mosaic:
+            parts = [*np.moveaxis(demosaic(frame, self._mosaic), -1, 0)]
+        else:
+            parts = [frame[a::2, b::2] for a, b in PLANES]
+        for total, part in zip(self._sums, parts, strict=True):
+            total.add(part, row, column)
+
+    def images(self, lam: Lambda, relative: bool = False) -> LineImages:
+        """Solve for the images of all lines.
+
+        Parameters
+        ----------
+        lam, relative
+            Lambda: a number, ``relative`` to the largest sigma^2 where asked for, or ``auto``.
+        """
+        pairs = [*zip(self._models, self._sums, strict=True)]
+        energy = sum(total.energy for total in self._sums)
+        if isinstance(lam, str):
+            lambdas = [automatic_lambda(model.problem(total)) for model, total in pairs]
+        elif self._joint:
+            lambdas = [lam * (self._joint.scale if relative else 1)]
+        else:
+            lambdas = [lam * (model.problem(total).scale if relative else 1) for model, total in pairs]
+        shared = lambdas[0] if len(lambdas) == 1 else _geometric(lambdas)
+        if self._joint is None:
+            found = [model.solve(total, float(own)) for (model, total), own in zip(pairs, lambdas, strict=True)]
+            left = sum(each.residual**2 * total.energy for each, total in zip(found, self._sums, strict=True))
+            images = np.tensordot(self._undo, np.stack([each.image for each in found]), axes=1)
+            return LineImages(images, shared, float(np.sqrt(left / energy)))
+        joint = self._joint.solve(self._gathered, shared)
+        left = energy + float(np.vdot(joint.image, self._joint.normal(joint.image) - 2 * self._gathered))
+        return LineImages(joint.image, shared, float(np.sqrt(max(left, 0.0) / energy)), joint)
+
+
+def demosaic(frame: FloatArray, mosaic: str) -> FloatArray:
+    """Return the (m, m', 3) red, green and blue of a ``frame`` (m, m') behind a ``mosaic`` (Menon and others 2007).
+
+    MitsimError without colour-demosaicing.
+    """
+    check_way(DEMOSAIC)
+    from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
+
+    return np.asarray(demosaicing_CFA_Bayer_Menon2007(frame, mosaic), dtype=np.float64)
+
+
+def _geometric(values: Sequence[float]) -> float:
+    """Return the geometric mean; 0 where one value is 0."""
+    logs = np.log(values) if all(value > 0 for value in values) else -np.inf
+    return float(np.exp(np.mean(logs)))
