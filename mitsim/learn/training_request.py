@@ -45,7 +45,7 @@ class Training:
     device
         of torch, such as ``cpu`` or ``cuda``.
     feature_weight, adversary_weight
-        of the losses of :class:`mitsim.learn.critic.Critic`, beside the logarithm of the squared error.
+        of the losses of :class:`mitsim.learn.methods.Critic`, beside the logarithm of the squared error.
     """
 
     method: str
