@@ -33,7 +33,6 @@ from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28
-"""Largest file: fifty times the largest that `mitsim train` writes for 128 pixels."""
 _SAME_CAMERA = 0.02
 """Relative difference of two calibrations' models above which they belong to two cameras: four times that of two
 sessions of 512 frames, and that of a scene an eighth of a pixel aside."""
@@ -42,13 +41,10 @@ _OTHER_NOISE = 1.5
 _NO_NOISE = 1e-14
 """Part of the frames' energy that counts as noise where there is none: rounding of single precision."""
 _PATTERNS = ("P_L", "P_R")
-"""Tensors of the patterns' factors."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Doubted(Prepared):
-    """Factorised model with the doubts whether the network is trained for the model."""
-
     doubts: tuple[str, ...] = ()
     reads_frames: bool = False
 
@@ -58,17 +54,7 @@ class _Doubted(Prepared):
 
 @dataclass(frozen=True, eq=False)
 class LearnedSolver(Solver):
-    """Trained network as a method of solving; :func:`read_network` reads one.
-
-    Attributes
-    ----------
-    manifest
-        Description of the training.
-    network
-        Network with its trained weights.
-    sides, patterns
-        Factors and patterns of the training.
-    """
+    """Trained network as a method of solving, with the factors and patterns of its training."""
 
     manifest: ModelManifest
     network: Method
@@ -120,20 +106,7 @@ class LearnedSolver(Solver):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """Return the image of the frames.
-
-        Parameters
-        ----------
-        prepared, frames
-            Result of :meth:`init`, and the sum of all frames.
-        lam, **iterative
-            ``auto`` and nothing, because a network has no such options.
-
-        Raises
-        ------
-        MitsimError
-            If frames are missing, there are no more data than unknowns, or the image is not finite.
-        """
+        """Return the image of the frames; raise MitsimError if it is not finite."""
         problem = prepared.problem(frames)
         variance = datum_variance(problem)
         like = next(self.network.parameters())
@@ -170,16 +143,11 @@ class LearnedSolver(Solver):
         )
 
     def denoiser(self) -> Denoiser:
-        """Return the denoiser of a plug-and-play network with the interface of deepinv.
-
-        Raise MitsimError for other methods.
-        """
         if not isinstance(self.network, PlugAndPlay):
             raise MitsimError(f"model {self.name}: has no denoiser; train {PLUG_AND_PLAY}")
         return Denoiser(self.network)
 
     def save(self, path: Path | str) -> None:
-        """Write the file as a whole; raise MitsimError if it cannot be written."""
         tensors = dict(zip((*SIDES, *_PATTERNS), (*self.sides, *self.patterns), strict=True))
         held = {
             "manifest": json_text(self.manifest.model_dump()),
@@ -190,13 +158,7 @@ class LearnedSolver(Solver):
 
 
 def read_network(path: Path | str, device: str) -> LearnedSolver:
-    """Read a file of `mitsim train` for a device of torch.
-
-    Raises
-    ------
-    MitsimError
-        If the file cannot be read, is no such file, or has numbers that are not finite, or if there is no such device.
-    """
+    """Read a file of `mitsim train` for a device of torch; raise MitsimError for any other file."""
     if check_plain(path, "model").st_size > _MOST_BYTES:
         raise MitsimError(f"model {path}: is larger than {_MOST_BYTES >> 20} MiB; give a file of `mitsim train`")
     try:
@@ -231,7 +193,6 @@ def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
 
 
 def on_device(network: Method, device: str) -> Method:
-    """Move a network to a device of torch; raise ArgumentError for a device that is missing or has no numbers."""
     try:
         network.to(device)
         float(network.log_start.detach())
@@ -241,7 +202,6 @@ def on_device(network: Method, device: str) -> Method:
 
 
 def datum_variance(problem: DiagonalProblem) -> float:
-    """Return the noise variance of a datum [(electrons / s)^2], at least that of rounding."""
     return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
 
 
@@ -256,12 +216,10 @@ def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray
 
 
 def relative_noise(problem: DiagonalProblem) -> float:
-    """Return the noise of a datum over the rms of all data."""
     return float(np.sqrt(datum_variance(problem) * problem.data_count / problem.energy))
 
 
 def _difference(ours: Patterns, theirs: Patterns) -> float:
-    """Return ||A - B|| / ||A|| of two Kronecker products."""
     if any(a.shape != b.shape for a, b in zip(ours, theirs, strict=True)):
         return 1.0
     own, other, both = (

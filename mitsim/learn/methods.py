@@ -41,7 +41,6 @@ LEVELS = (1, 2, 4, 6)
 """Channels of each level over those of the first. Each level halves the pixels along an axis. All levels but the last
 take the same arithmetic, and a pixel of the image sees 50 others on either side."""
 WAYS = 8
-"""Ways to turn and mirror a square."""
 
 
 class UNet(nn.Module):
@@ -93,7 +92,6 @@ class UNet(nn.Module):
             return change.flip(axes).to(images.dtype)
 
     def levels(self, images: Tensor) -> list[Tensor]:
-        """Return the channels of each level of the first half, with edges repeated to a whole number of squares."""
         rows, columns = images.shape[-2:]
         whole = self.stacked * 2 ** (len(LEVELS) - 1)
         padded = functional.pad(images, (0, -columns % whole, 0, -rows % whole), mode="replicate")
@@ -113,12 +111,10 @@ def _block(size: int) -> nn.Sequential:
 
 
 def drawn_way(noise: torch.Generator) -> int:
-    """Draw a way to see images."""
     return int(torch.randint(WAYS, (), generator=noise))
 
 
 def has_half(device: torch.device) -> bool:
-    """Return True if a device computes with bfloat16 in hardware."""
     if device.type == "cpu":
         return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", bool)())
     return bool(getattr(torch.get_device_module(device), "is_bf16_supported", bool)())
@@ -153,8 +149,6 @@ class Diagonal:
 
     @classmethod
     def of(cls, prepared: Prepared, like: Tensor) -> Diagonal:
-        """Convert a factorised model to tensors of the device and precision of `like`."""
-
         def slabs(side: Side) -> FloatArray:
             stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), side.accumulated_size))
             for whole, slab in zip(stack, side.slabs, strict=True):
@@ -167,11 +161,9 @@ class Diagonal:
         return cls(v_left, v_right, sigma, (sums[0], sums[1]))
 
     def coefficients(self, images: Tensor) -> Tensor:
-        """Return the coefficients (B, 1, r, r') of images (B, 1, n, n')."""
         return self.left.T @ images @ self.right
 
     def images(self, coefficients: Tensor) -> Tensor:
-        """Apply the adjoint of :meth:`coefficients`."""
         return self.left @ coefficients @ self.right.T
 
     def project(self, frames: Tensor) -> Tensor:
@@ -208,7 +200,6 @@ class Data:
 
     @classmethod
     def of(cls, weights: FloatArray, variance: FloatArray | float, like: Tensor) -> Data:
-        """Convert W (B, r, r') and the variance of its noise to tensors of the device and precision of `like`."""
         deviation = np.sqrt(np.broadcast_to(variance, len(weights)))[:, None, None]
         scaled = torch.as_tensor(weights / deviation)
         return cls(scaled[:, None].to(like), torch.as_tensor(deviation)[:, None].to(like))
@@ -224,7 +215,6 @@ class Binning(Accumulator):
         self.frames = np.zeros((*(side.pattern_count for side in sides), *bins), np.float32)
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        """Add one frame, and return its contribution to W."""
         own = super().add(frame, row, column)
         values = np.asarray(frame)
         pixels = np.outer(*(_bin(np.ones(size)) for size in values.shape))
@@ -233,14 +223,12 @@ class Binning(Accumulator):
 
 
 def _bin(values: FloatArray) -> FloatArray:
-    """Return sums (b, ...) over bins of the first axis, of which the last may have fewer pixels."""
     return np.asarray(np.add.reduceat(values, np.arange(0, len(values), BIN)))
 
 
 # -------- Methods
 
 _GREY = 0.5
-"""Reflectance that networks see as zero."""
 _START = 60.0
 """One over the variance of pictures about grey before the first step: drawn pictures have a deviation of 0.13."""
 _LEAST_ERROR = 1e-5
@@ -257,9 +245,7 @@ class Method(nn.Module):
     """
 
     PASSES, WIDTH = 1, 24
-    """Passes of an image through a network in training, and channels of its first level: 0.97 million weights."""
     reads_frames, holds_camera = False, False
-    """Whether the method reads frames beside their sum, and whether its weights belong to one camera."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         super().__init__()
@@ -267,16 +253,13 @@ class Method(nn.Module):
         self.log_start = nn.Parameter(torch.tensor(math.log(_START)))
 
     def start(self, data: Data, model: Diagonal) -> Tensor:
-        """Return the images (B, 1, n, n'), less grey, nearest to the data and to an even grey."""
         grey = torch.full((len(data.weights), 1, *self.shape), _GREY).to(data.weights)
         return model.nearest(data, grey, torch.exp(self.log_start)) - _GREY
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """Return the images (B, 1, n, n') with networks that see them in one way."""
         raise NotImplementedError
 
     def images(self, data: Data, model: Diagonal) -> Tensor:
-        """Return the mean image over all eight ways, which is 0.06 to 0.08 dB nearer to the truth than one."""
         return torch.stack([self(data, model, way) for way in range(WAYS)]).mean(0)
 
     def loss(self, truths: Tensor, data: Data, model: Diagonal, noise: torch.Generator) -> Tensor:
@@ -295,7 +278,6 @@ class Refined(Method):
         self.network = UNet(1, 1, self.WIDTH)
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """Return the images (B, 1, n, n')."""
         start = self.start(data, model)
         return start + self.network(start, way) + _GREY
 
@@ -313,7 +295,6 @@ class FlatNet(Refined):
         self.left, self.right = (nn.Parameter(torch.eye(size)) for size in shape)
 
     def start(self, data: Data, model: Diagonal) -> Tensor:
-        """Return the first image between the trained matrices."""
         return self.left @ super().start(data, model) @ self.right.T
 
 
@@ -325,7 +306,6 @@ class Unrolled(Method):
     """
 
     STEPS, WIDTH = 3, 16
-    """1.3 million weights in all. Three steps gain most by processor time; eight narrow ones learn more slowly."""
     PASSES = STEPS
     FIRST, LAST = 100.0, 1000.0
     """One over the variance of the first and last network's errors before training: 0.1 and 0.03 of white."""
@@ -336,7 +316,6 @@ class Unrolled(Method):
         self.log_rho = nn.Parameter(torch.linspace(math.log(self.FIRST), math.log(self.LAST), self.STEPS))
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """Return the images (B, 1, n, n')."""
         start = self.start(data, model)
         images = start
         for network, rho in zip(self.networks, torch.exp(self.log_rho), strict=True):
@@ -352,7 +331,6 @@ class PlugAndPlay(Method):
     """
 
     STEPS = 8
-    """Smallest number with which the noise falls smoothly."""
     NOISIEST, CLEANEST = 0.3, 0.01
     """Standard deviations of the noise that the first and last step remove: that of least squares under uniform light,
     and a hundredth of white."""
@@ -366,7 +344,6 @@ class PlugAndPlay(Method):
         return images + self.network(torch.cat([images, deviation.expand_as(images)], 1), way)
 
     def forward(self, data: Data, model: Diagonal, way: int = 0) -> Tensor:
-        """Return the images (B, 1, n, n')."""
         images = self.start(data, model)
         deviations = torch.logspace(math.log10(self.NOISIEST), math.log10(self.CLEANEST), self.STEPS)
         for deviation in deviations.to(images):
@@ -375,7 +352,6 @@ class PlugAndPlay(Method):
         return images + _GREY
 
     def loss(self, truths: Tensor, data: Data, model: Diagonal, noise: torch.Generator) -> Tensor:
-        """Return the loss of noisy truths; the data and the model teach nothing here."""
         low, high = math.log(self.CLEANEST), math.log(self.NOISIEST)
         part = torch.rand((len(truths), 1, 1, 1), generator=noise).to(truths)
         deviation = torch.exp(low + (high - low) * part)
@@ -391,7 +367,6 @@ class Denoiser(nn.Module):
         self.network = network
 
     def forward(self, x: Tensor, sigma: Tensor | float, **_: Any) -> Tensor:
-        """Remove noise of a standard deviation `sigma`, one or (B,), from images (B, 1, n, n') with white at 1."""
         deviation = torch.as_tensor(sigma).to(x).reshape(-1, 1, 1, 1)
         return self.network.denoise(x - _GREY, deviation.expand(len(x), 1, 1, 1)) + _GREY
 
@@ -411,7 +386,6 @@ class Preprocessed(Refined):
         self.of_frames = UNet(1, 1, self.FRAME_WIDTH, self.FRAME_STACKED)
 
     def start(self, data: Data, model: Diagonal) -> Tensor:
-        """Return the first image of the changed frames."""
         frames = data.frames
         assert frames is not None, "this method reads frames"
         scale = frames.mean(dim=(1, 2, 3, 4), keepdim=True)
@@ -436,14 +410,11 @@ CLASSES: dict[str, type[Method]] = {
 # -------- Losses beside the squared error
 
 _FEATURES = 16
-"""Channels of the first level of features."""
 _LEAST_FEATURES = 1e-5
-"""Part of the features' energy below which a difference gains nothing, as for images at 50 dB."""
 _PATCH = (32, 64, 128)
 """Channels of the adversary's layers, half of those of Isola et al. (arXiv 1611.07004), whose pictures have colours. A
 number of the last layer depends on 46 x 46 pixels."""
 _RATE, _BETAS, _SLOPE = 2e-4, (0.5, 0.999), 0.2
-"""Optimiser and layers of the adversary, from Isola et al."""
 
 
 class Critic:
@@ -486,10 +457,8 @@ class Critic:
             (real.mean() + made.mean()).backward()
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the adversary and its optimiser."""
         return {"adversary": self.adversary.state_dict(), "optimiser": self.optimiser.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a state."""
         self.adversary.load_state_dict(state["adversary"])
         self.optimiser.load_state_dict(state["optimiser"])

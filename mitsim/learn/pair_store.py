@@ -48,7 +48,6 @@ FORMAT = 1
 _LIGHTS_KEPT = 32
 """Lights of shards in memory, some 10 MB each: as many as a network's batch meets."""
 Frames = npt.NDArray[np.float32]
-"""(K, m, m') electrons a second."""
 
 
 # -------- Manifests
@@ -179,18 +178,10 @@ class ModelManifest(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class PrintPart:
-    """Light of a white print in one kind of cells, and the optics that forms its frames.
+    """Light (classes, places) of a white print in one kind of cells [electrons/s], and its optics.
 
-    Attributes
-    ----------
-    optics
-        Optics with one layer.
-    light
-        (classes, places) [electrons/s].
-    rows, columns
-        (r,) and (c,) row and column of the picture's pixel that each row and column of cells lies in.
-    lamps
-        True for light of lamps, which has one class and is in every shot.
+    `rows` and `columns` give the picture's pixel of each row and column of cells. Light of lamps has one class and is
+    in every shot.
     """
 
     optics: FrameOptics
@@ -229,7 +220,6 @@ class PrintLight:
         return ExpectedFrames(lights, lighting, seed=0, ambient=lamps)
 
     def write(self, group: h5py.Group) -> None:
-        """Write the light to a group of a file."""
         group.create_dataset("emission", data=self.emission, **PACKED)
         for number, part in enumerate(self.parts):
             place = group.create_group(f"part_{number}", track_order=True)
@@ -246,7 +236,6 @@ class PrintLight:
 
     @classmethod
     def read(cls, group: h5py.Group) -> PrintLight:
-        """Read the light from a group of a file."""
         parts = []
         for name in sorted(name for name in group if name.startswith("part_")):
             place = group[name]
@@ -264,24 +253,7 @@ class PrintLight:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Pair before it is stored.
-
-    Attributes
-    ----------
-    picture
-        (n, n) codes of eight bits.
-    truth
-        (n, n) apparent reflectance.
-    exposure_s
-        Exposure of each shot [s].
-    saturated
-        True if a pixel is expected to reach the full well.
-    warnings
-        Warnings of its light.
-    frames
-        (shots, m, m') expected frames [electrons/s], and the part (m, m') of the lamps; None if the shard's light
-        gives them.
-    """
+    """Pair before it is stored, with frames (shots, m, m') and those of lamps unless the shard's light serves."""
 
     picture: npt.NDArray[np.uint8]
     truth: FloatArray
@@ -292,18 +264,9 @@ class Pair:
 
 
 def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, light: PrintLight | None) -> None:
-    """Write the file of a shard as a whole; raise MitsimError if it cannot be written.
+    """Write the file of a shard as a whole, with the light of its pairs unless each has frames.
 
-    Parameters
-    ----------
-    path, digest
-        The file, and the digest of the store's configuration that identifies the shard.
-    pairs
-        Pairs in order, held one at a time.
-    speckle
-        Contrast of the speckle in a frame.
-    light
-        Light of all the pairs; None if each pair has its frames.
+    `digest` identifies the store's configuration; `speckle` is the contrast in a frame.
     """
     with whole_hdf5(path) as file:
         file.attrs.update({"configuration_sha256": digest, "speckle": speckle})
@@ -329,7 +292,6 @@ def write_shard(path: Path, digest: str, pairs: Iterable[Pair], speckle: float, 
 
 
 def is_shard(path: Path, digest: str, count: int) -> bool:
-    """Return True if a file is a whole shard of `count` pairs of the store with this configuration."""
     try:
         with hdf5_errors(path), _open_shard(path) as file:
             return bool(file.attrs["configuration_sha256"] == digest and len(file["truth"]) == count)
@@ -346,13 +308,7 @@ def _open_shard(path: Path, known: set[object] | None = None) -> AbstractContext
 
 
 class PairStore:
-    """Pairs in a folder, read one at a time.
-
-    Attributes
-    ----------
-    folder, manifest
-        Place and description of the store.
-    """
+    """Pairs in a folder, read one at a time."""
 
     def __init__(self, folder: Path, manifest: PairsManifest) -> None:
         self.folder, self.manifest = folder, manifest
@@ -391,7 +347,6 @@ class PairStore:
         return f"PairStore({len(self)} pairs, {made.frames} frames of {size} under {made.patterns}: {self.folder})"
 
     def summary(self) -> dict[str, Any]:
-        """Return the command line's JSON without seconds."""
         made = self.manifest
         named = ("count", "n", "frames", "patterns", "exposure_s", "idealised", "traced_anew", "seed", "pictures")
         return {
@@ -406,13 +361,11 @@ class PairStore:
 
     @property
     def patterns(self) -> tuple[FloatArray, FloatArray]:
-        """P_L (n, K) and P_R (n, K') as those of a run."""
         family = self.manifest.family
         return family.left.astype(np.float64), family.right.astype(np.float64)
 
     @cached_property
     def indices(self) -> npt.NDArray[np.int64]:
-        """Pattern (i, j) of each frame of a pair, (frames, 2)."""
         return np.array([(shot.row, shot.column) for shot in self.manifest.family.shots if shot.sign != -1])
 
     @check_arguments
@@ -422,12 +375,10 @@ class PairStore:
 
     @check_arguments
     def picture(self, index: int) -> npt.NDArray[np.uint8]:
-        """Return the reflectance (n, n) of a pair's picture in steps of 1/255."""
         return np.asarray(self._rows(index, "picture")["picture"])
 
     @check_arguments
     def exposure_s(self, index: int) -> float:
-        """Return the exposure of a pair's shots [s]."""
         return float(self._rows(index, "exposure_s")["exposure_s"])
 
     @check_arguments

@@ -64,9 +64,7 @@ from mitsim.transport.records import Bundle
 SHARD = 100
 """Most pairs of a shard: an interruption loses a minute, and light is kept once for a hundred pairs."""
 _PICTURE_S = 3e-6
-"""Processor time of a pixel of a drawn picture [s]."""
 _PAIR_BYTES, _FRAME_BYTES = 4, 4
-"""Bytes of a pixel of picture and truth, packed, and of a pixel of a stored frame; measured."""
 _SHADOW_BYTES = 40
 """Bytes of the stored shadow for a pixel of the frame's sides and a pixel of the projector's; measured 27 to 30."""
 _FORMED = 0.5
@@ -74,12 +72,10 @@ _FORMED = 0.5
 (uniform light, 49 dots)."""
 
 Opening = Callable[[Mapping[str, str]], Bench]
-"""Opens the bench with some parameters of the scene."""
 
 # -------- Light of white prints
 
 _STRAIGHT = ("fine", "anchor_residual")
-"""Grids of light from one surface straight to the sensor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +101,6 @@ class WhitePrints:
 
     @classmethod
     def of(cls, light: SampledLight) -> WhitePrints:
-        """Divide the light of a bench with white prints among the pixels of a picture."""
         direct, settings = light, light.plan.settings
         if "glare" in settings.effects:  # which is in no truth
             without = replace(settings, effects=settings.effects - {"glare"})
@@ -121,7 +116,6 @@ class WhitePrints:
         return cls(light.merge(), light.truth, shares, (*light.warnings, *light.unreached))
 
     def truth(self, reflectance: FloatArray) -> FloatArray:
-        """Return the apparent reflectance (n, n) of prints that show a picture (n, n)."""
         return np.asarray(self.white * (self.shares @ reflectance.ravel()).reshape(self.white.shape))
 
     def rendered_light(self, bench: Apparatus, family: PatternFamily) -> PrintLight:
@@ -171,7 +165,6 @@ def picture_axes(light: SampledLight, bundle: Bundle) -> tuple[Labels, Labels]:
 
 
 def electrons_per_joule(bench: Apparatus) -> float:
-    """Return the electrons per second of a pixel in light of 1 W m^-2 on the camera."""
     wavelength = bench.projector.effective_wavelength_nm
     return float(electrons_from_irradiance(1.0, 1.0, bench.sensor, wavelength))
 
@@ -194,7 +187,6 @@ class _Maker:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """Everything that determines the pairs."""
         asked, bench = self._asked, self.bench
         found: dict[str, Any] = plain(
             {
@@ -213,7 +205,6 @@ class _Maker:
         return "" if self._asked.idealised else traced_anew(bench)
 
     def check_pictures(self, shards: Iterable[Shard]) -> None:
-        """Read all files of pictures, because a store is not resumed with other pictures."""
         if isinstance(self._pictures, FolderPictures):
             files = len(self._pictures.files)
             for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:
@@ -241,7 +232,6 @@ class _Maker:
         return {name.partition(".")[2]: repr(value) for name, value in drawn if name.startswith("scene.")}
 
     def _bench_of(self, group: int) -> tuple[Bench, Plan]:
-        """Return a bench, with white prints where one tracing serves all pictures, and its plan."""
         parameters = self._parameters(group)
         if self._open is None or self._open[0] != parameters:
             bench = self._opening(parameters)
@@ -263,7 +253,6 @@ class _Maker:
         return self._white[1]
 
     def write(self, shard: Shard, path: Path, digest: str) -> None:
-        """Write the file of a shard."""
         bench, plan = self._bench_of(shard.group)
         drawn = self._groups[shard.group]
         mask = {name.partition(".")[2]: value for name, value in drawn.items() if name.startswith("mask.")}
@@ -279,10 +268,6 @@ class _Maker:
             write_shard(path, digest, self._pairs(shard, moved, light, kept is None), speckle, kept)
 
     def _pairs(self, shard: Shard, moved: Apparatus, light: PrintLight | None, keep: bool) -> Iterator[Pair]:
-        """Yield the pairs of a shard in the light of white prints, or if None in light traced for each.
-
-        The bench's mask has `moved`; frames are kept in the pairs if `keep` is true.
-        """
         (bench, plan), lighting, sensor = self._bench_of(shard.group), self._family.lighting, moved.sensor
         timing = self._asked.capture.timing
         timing = replace(timing, fraction=self._groups[shard.group].get("exposure_fraction", timing.fraction))
@@ -311,7 +296,6 @@ class _Maker:
             yield Pair(picture, truth, exposure_s, saturated, warnings, frames)
 
     def cost(self, left: Sequence[Shard]) -> Cost:
-        """Predict the cost of the remaining shards."""
         pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)
         of_benches = {tuple(sorted(self._groups[shard.group].items())) for shard in left}
         varied = self._asked.variation is not None and bool(self._asked.variation.scene)
@@ -328,7 +312,6 @@ class _Maker:
         return Cost(seconds, memory, pairs * (pixels * _PAIR_BYTES + frames) + shadow)
 
     def begin(self, configuration: Mapping[str, Any], shards: tuple[Shard, ...]) -> PairsManifest:
-        """Return the manifest of an unfinished store."""
         bench, asked, capture = self.bench, self._asked, self._asked.capture
         lamps = "ambient" in self._plan.settings.effects and not asked.idealised
         taken = capture.ambient_frame == "yes" or (
@@ -359,7 +342,6 @@ class _Maker:
         )
 
     def factors(self) -> Factors:
-        """Return the exact factors of the idealised model."""
         camera = IdealCamera(self.bench, self.bench.geometry.mask)
         sides = camera.calibrated(float(self._white_of(0).light.apparent.board_flux.mean()))
         left, right = (side.astype(np.float32).astype(np.float64) for side in sides)
@@ -374,7 +356,6 @@ class _Maker:
         return Factors(left, right, manifest, status)
 
     def finish(self, store: PairStore) -> PairsManifest:
-        """Return the manifest of a store whose shards are all written."""
         begun, facts = store.manifest, [store.facts(shard) for shard in store.manifest.shards]
         exposure_s = float(np.median(np.concatenate([exposures for exposures, _, _ in facts])))
         saturated = sum(count for _, count, _ in facts)
@@ -395,7 +376,6 @@ class _Maker:
 
 
 def _shards(asked: PairsRequest) -> tuple[Shard, ...]:
-    """Return the files, of which every bench gets an equal part."""
     found, groups = list[Shard](), 1 if asked.variation is None else asked.variation.groups
     ends = [asked.count * (group + 1) // groups for group in range(groups)]
     for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):

@@ -25,9 +25,7 @@ from mitsim.core.seeds import stream
 from mitsim.learn.pair_request import picture_files
 
 Codes = npt.NDArray[np.uint8]
-"""(n, n) reflectance in steps of 1/255."""
 WHITE = 255
-"""Code of reflectance 1."""
 _OVER = 2
 """Points per pixel and axis that a picture is drawn on; four show no difference, because edges are soft."""
 _RADII = 0.015, 0.35
@@ -36,20 +34,14 @@ _POWERS = 1.6, 3.2
 """Power by which the number of leaves falls with their radius, drawn for each picture; natural pictures have about 3
 (Lee, Mumford and Huang, 2001), portraits and pictures of things have fewer small leaves."""
 _COVERED = 2.5
-"""Area of all leaves over that of the picture: one in a dozen points then shows the ground."""
 _MOST_LEAVES = 600
 _SOFT = 0.3, 2.5
 """Width of an edge in pixels, from sharp to out of focus, because a network learned nothing from hard ones."""
 _SHADE, _TEXTURE = 0.25, 0.12
-"""Largest change of brightness over a leaf, and largest rms of its texture, on a scale from black to white."""
 _DARKEST, _BRIGHTEST = (0.03, 0.15), (0.55, 0.95)
-"""Ranges of the darkest and the brightest point of a picture: print has some 0.03 to 0.95."""
 _LETTERS, _STRIPES = 0.2, 0.15
-"""Part of the pictures that have letters, and straight edges."""
 _TAILS = 0.002
-"""Part of a drawn picture that is clipped at its darkest and at its brightest point: single points."""
 _SMALLEST_CROP = 0.5
-"""Smallest side of a crop over that of the whole: crops differ and are still pictures."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +53,6 @@ class DrawnPictures:
     source: ClassVar[str] = "drawn by code: dead leaves with soft edges, shades and 1/f texture, letters, stripes"
 
     def draw(self, number: int, n: int) -> Codes:
-        """Draw a picture of n pixels along each axis."""
         rng = stream(self.seed, "picture", number)
         side = _OVER * n
         texture = pink_noise(side, rng)
@@ -120,7 +111,6 @@ def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generato
 
 
 def _radii(power: float, rng: np.random.Generator) -> FloatArray:
-    """Draw radii over the side, whose density falls by a power, until leaves cover the picture."""
     low, high = (limit ** (1 - power) for limit in _RADII)
     radii = (low + (high - low) * rng.random(_MOST_LEAVES)) ** (1 / (1 - power))
     covered = np.cumsum(math.pi * np.square(radii))
@@ -206,7 +196,6 @@ class FolderPictures:
 
 
 def _shrink(square: FloatArray, n: int) -> FloatArray:
-    """Return the means (n, n) over equal parts of a square of at least n pixels along each axis."""
     size = len(square)
     edges = np.linspace(0, size, n + 1)
     below = np.clip(np.arange(size + 1)[None] - edges[:-1, None], 0, size / n)

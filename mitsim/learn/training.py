@@ -38,9 +38,7 @@ _PART, _MOST = 16, 48
 """One photograph in 16 chooses the best step, and one judges, up to 48 pairs each: their mean PSNR is then known to 0.5
 dB, and its change from step to step much better."""
 _LOOKS = 20
-"""Judgements in a training; one takes a twentieth of the steps between two."""
 _PATIENCE = 6
-"""Judgements without gain after which a training stops: the rate falls over the last two thirds of the cycle."""
 _GAIN_DB = 0.01
 _RISING = 0.15
 """Part of the steps over which the learning rate rises; then it falls as a cosine to 0."""
@@ -50,11 +48,8 @@ _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
 """Memory of torch; memory of a pixel with its gradient for each channel of the first level (76 measured at a width of
 16, 96 at 24); and the part of it in half precision (0.55 measured)."""
 _FRAME_PIXELS = 8
-"""Bins of frames that take the memory of a pixel of an image: half the width, on a quarter of the squares."""
 _LOOK = 0.05
-"""Time of a judgement over that of the steps before it; 0.04 measured of 48 pictures and 225 steps of 4."""
 _UNFINISHED = ".unfinished"
-"""Suffix of the file beside a model's from which a training resumes."""
 
 
 # -------- Pairs
@@ -85,7 +80,6 @@ class Sums:
 
     @classmethod
     def of(cls, store: PairStore, prepared: Prepared, job: Job, keep: bool = False) -> Sums:
-        """Read all pairs of a camera's factorised model, and their binned frames if `keep` is true."""
         count, started = len(store), time.perf_counter()
         truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
         kept: FloatArray | None = None
@@ -144,14 +138,12 @@ class Trainer:
         self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
 
     def rate(self, number: int) -> float:
-        """Return the learning rate of a step."""
         part, rising = (number + 0.5) / self.request.steps, _RISING
         if part < rising:
             return self.request.rate * part / rising
         return self.request.rate * 0.5 * (1 + math.cos(math.pi * (part - rising) / (1 - rising)))
 
     def step(self, number: int) -> float:
-        """Take a step and return its loss."""
         random = stream(self.request.seed, "step", number)
         chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
         truths, data = self.batch(chosen)
@@ -181,7 +173,6 @@ class Trainer:
         return float(loss.detach())
 
     def batch(self, chosen: Any) -> tuple[Tensor, Data]:
-        """Return the truths (B, 1, n, n') and data of the chosen pairs."""
         truths = torch.as_tensor(self.sums.truths[chosen])[:, None].to(self._like)
         data = Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
         if self.sums.frames is None:
@@ -204,7 +195,6 @@ class Trainer:
         return torch.cat([truths[:half], turned]), Data(weights, data.deviation)
 
     def seconds_a_step(self) -> float:
-        """Measure the time of a step, with its part of a judgement, without changing the network."""
         truths, data = self.batch(self.teaching[: self.request.batch])
         self.network.train()
         taken = []
@@ -216,7 +206,6 @@ class Trainer:
         return taken[-1] * (1 + _LOOK)
 
     def judge(self, pairs: Labels) -> float:
-        """Return the mean PSNR [dB] of pairs, given by their numbers."""
         found = []
         self.network.eval()
         with torch.no_grad():
@@ -231,19 +220,7 @@ class Trainer:
 
 @dataclass(eq=False)
 class State:
-    """State of a training, which a file keeps between judgements.
-
-    Attributes
-    ----------
-    step
-        Number of steps taken.
-    curve
-        Step, and mean PSNR [dB] after it of the pairs that choose; the first before any step.
-    best
-        Weights after the best of these steps.
-    network, optimiser, critic
-        Weights, state of AdamW, and state of the critic; the last is empty without a critic.
-    """
+    """State of a training, which a file keeps between judgements; `best` has the weights after the best step."""
 
     step: int
     curve: list[tuple[int, float]]
@@ -254,13 +231,11 @@ class State:
 
     @classmethod
     def first(cls, trainer: Trainer) -> State:
-        """Return the state before any step."""
         state = cls(0, [], {}, {}, {}, {})
         state._judge(trainer)
         return state
 
     def restore(self, trainer: Trainer) -> None:
-        """Set a trainer to this state."""
         trainer.network.load_state_dict(self.network)
         trainer.optimiser.load_state_dict(self.optimiser)
         if trainer.critic:
@@ -290,7 +265,6 @@ class State:
             self.best = self.network
 
     def write(self, path: Path, digest: str) -> None:
-        """Write the state of the training with this digest as a whole."""
         write_tensors(path, {"digest": digest, **vars(self)})
 
     @classmethod
@@ -320,16 +294,10 @@ class Trained:
 
     Attributes
     ----------
-    model
-        Trained network.
     curve
         Step, and mean PSNR [dB] after it of the pairs that choose the best step; the first before any step.
     psnr_before_db, psnr_db
         Mean PSNR of pairs that neither teach nor choose, before the first step and with the best weights.
-    predicted_seconds
-        Predicted time of the training.
-    output
-        File of the network.
     """
 
     model: LearnedSolver
@@ -340,7 +308,6 @@ class Trained:
     output: str
 
     def summary(self) -> dict[str, Any]:
-        """Return the command line's JSON."""
         return {
             "model": self.model.name,
             "weights": sum(values.numel() for values in self.model.network.parameters()),
@@ -362,24 +329,12 @@ def train_network(
 
     Parameters
     ----------
-    store, factors
-        The pairs, and the calibration of their camera with which images will be reconstructed.
-    request
-        Method, steps and seed.
+    factors
+        Calibration with which images will be reconstructed.
     output
         File of the network. The file from which a training resumes lies beside it until the end.
-    job
-        Limits and progress.
-    resume
-        Continue an interrupted training of the same request.
     sums
         Sums of these pairs with these factors if they were read before.
-
-    Raises
-    ------
-    MitsimError
-        If pairs and factors belong to two cameras, pairs are too few, time or memory exceed their limits, another
-        unfinished training lies beside the output, or the loss is not finite.
     """
     job, output = job or Job(), Path(output)
     started = time.perf_counter()
@@ -421,7 +376,6 @@ def train_network(
 
 
 def first_network(request: Training, shape: tuple[int, int]) -> Method:
-    """Return the network before its first step, for images (n, n')."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(integer(request.seed, "weights"))
         return on_device(CLASSES[request.method](shape), request.device)
@@ -445,7 +399,6 @@ def _check(store: PairStore, factors: Factors) -> None:
 
 
 def _memory(store: PairStore, network: Method, request: Training) -> Cost:
-    """Return the memory of all sums, and of a batch in the network."""
     pixels = network.shape[0] * network.shape[1] * network.PASSES
     kept = 2 * network.shape[0] * network.shape[1]
     if network.reads_frames:

@@ -29,7 +29,6 @@ from mitsim.transport.records import Bundle, CellGrid, aligned_grid
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
 """Range of a camera with a usual filter; a shadow's fringes hardly move over a band of 23 nm."""
 _MOST_ROWS = 2**12
-"""A class that lights all these anchors times cells is a matrix of 128 MiB."""
 
 
 class Grid:
@@ -57,8 +56,6 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridRow:
-    """Row of the table of grids: `formed` tells whether the grid has light under some settings and physics."""
-
     name: str
     key: str
     bundle: Callable[[Grids], Bundle]
@@ -238,7 +235,6 @@ class LightEstimate:
 
     @property
     def totals(self) -> FloatArray:
-        """Mean light (rows,) over the sensor, except for pixels that are traced apart [W m^-2]."""
         return np.asarray(reduce(add, (self.light[grid].sum(axis=1) for grid in MEAN_GRIDS)), dtype=np.float64)
 
 

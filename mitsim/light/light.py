@@ -120,7 +120,6 @@ class SampledLight:
 
     @property
     def lost(self) -> float:
-        """Part of the light from beyond all cells, which is in no frame."""
         outside = sum(group.outside for group in self.groups)
         return outside / sum(group.received for group in self.groups) if outside else 0.0
 
@@ -199,7 +198,6 @@ class SampledLight:
 
     @cached_property
     def apparent(self) -> Truth:
-        """Image that a perfect reconstruction of this light shows."""
         return self.known_truth or trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
 
     @property

@@ -28,13 +28,10 @@ _FOLLOWED_BYTES = 200e6
 _ENTRY_BYTES = 45.0
 """Entry of a sparse matrix (12), its sum and its part in frames; measured 32 to 45."""
 _PATH_SAMPLE_BYTES = 500.0
-"""Light of a path in one or two cells; measured."""
 _PATH_BYTES, _PART_BYTES = 200.0, 75.0
 """Light of a path shared among more cells: two paths (74 each), and each cell's part, sorted (64)."""
 _TERM_BYTES = 3 * 16.0
-"""Pixel and cell of a term: both sides in the shadow, stacked, and selected."""
 _EXPOSED = 7
-"""Double-precision arrays for each exposed frame, with the chunk before, which is written meanwhile."""
 _EXPOSING_S, _WRITING_S = 2e-8, 8e-9
 """Time of a pixel on two processors, and the wait at the end; 49 frames of 512 x 512."""
 _BYTES_PER_PIXEL = 8
@@ -48,13 +45,11 @@ def frames_at_once(pixels: int) -> int:
 
 
 def frame_seconds(bench: Apparatus, shots: int) -> dict[str, float]:
-    """Return the times of exposing and of writing shots."""
     pixels = shots * math.prod(bench.geometry.frame_shape)
     return {"sensor": pixels * _EXPOSING_S, "write": pixels * _WRITING_S}
 
 
 def frames_bytes(classes: int, shots: int, pixels: float) -> float:
-    """Return the memory of frames while they are formed with probes, exposed and written."""
     formed = frames_in_memory(classes, shots, pixels) * (pixels + GROUPS * (PROBES + 1))
     return 8.0 * pixels * (formed + _EXPOSED * frames_at_once(round(pixels**2)) * pixels)
 
@@ -97,7 +92,6 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
 
 
 def path_sample_bytes(settings: Settings) -> float:
-    """Return the memory of a path's light; sharp pixels have four cells of two layers at most."""
     parts = min(len(settings.depths), 2) * (4 if settings.sharp else 1)
     return max(_PATH_SAMPLE_BYTES, _PATH_BYTES + parts * _PART_BYTES)
 
@@ -107,11 +101,8 @@ def path_sample_bytes(settings: Settings) -> float:
 _MEANS_S, _TURNED_S = 8e-8, 5e-7
 """Time of a cell of a shadow without diffraction, of a straight and of a turned mask (benchmarks/masks.py)."""
 _POINT_S, _TERM_S = 9e-9, 8e-11
-"""Time of a point where waves are squared, and of a term of the field there."""
 _AROUND = 2.0
-"""Cells of turned light over those of its turned square."""
 _HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8
-"""8-byte numbers for each cell: of 8 kept shadows with spectra, in work, and for points."""
 _FINER = (4 / 3, 2)
 _MOST_BYTES = 2.0**32
 """Memory for more cells than the fewest: twice as many for 320 pixels along an axis, 4 / 3 for 512."""
@@ -151,7 +142,6 @@ def largest_terms_bytes(geometry: CameraGeometry, cells: int) -> float:
 
 
 def first_shadow(bench: Apparatus, switches: Mapping[str, bool]) -> Cost:
-    """Return the cost of the first shadow that a plan draws."""
     geometry = bench.geometry
     waves = geometry.diffracts and switches.get("diffraction") is not False
     if not geometry.is_drawn(waves):
@@ -161,5 +151,4 @@ def first_shadow(bench: Apparatus, switches: Mapping[str, bool]) -> Cost:
 
 
 def raster_bytes(geometry: CameraGeometry, spectrum: Spectrum | None) -> float:
-    """Return the memory of shadows on rasters."""
     return 8.0 * (_HELD + _AT_WORK) * cells_a_side(geometry, spectrum) ** 2 + _BLOCK_BYTES

@@ -55,12 +55,10 @@ class Tracers(Grids):
 
     @property
     def spread(self) -> DirectTracer:
-        """Direct light to random points of the sensor."""
         return self._direct(1, spread=True)
 
     @cached_property
     def anchored(self) -> DirectTracer | None:
-        """Direct light to every anchor, except for occluded pixels."""
         settings = self.settings
         return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
 
@@ -73,7 +71,6 @@ class Tracers(Grids):
 
     @cached_property
     def sharp(self) -> AimedTracer | None:
-        """Direct light of the sharp pixels to their anchors."""
         sharp = self.settings.sharp
         return AimedTracer(self.setup, sharp.anchors, np.array(sharp.pixels)) if sharp else None
 
@@ -106,7 +103,6 @@ class Tracers(Grids):
 
     @cached_property
     def glare(self) -> CombinedTracer | None:
-        """Light that the projector's lens scatters."""
         scattered = replace(self.setup, projector=self.setup.projector.scattered)
         if scattered.projector.share == 0:
             return None
@@ -285,4 +281,3 @@ def table_of(*rows: Pass) -> Mapping[str, Pass]:
 
 PASSES = table_of(*_ROWS)
 EVEN = frozenset(row.name for row in PASSES.values() if row.even)
-"""Passes of direct light."""

@@ -28,7 +28,6 @@ from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples
 
 _FEWEST_AT_ONCE = 2**18
-"""130 MB: tracing so many paths takes far longer than the launch."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,6 @@ class TracedPass:
         return int(self.row.whole(self.predicted))
 
     def trace(self, seed: int, first: int, samples: int, accumulator: DeviceAccumulator | None = None) -> PathSamples:
-        """Return the light of some samples that the `accumulator` does not add up."""
         if accumulator is None:
             return self.tracer.trace(seed, first, samples)
         assert isinstance(self.tracer, DirectTracer | IndirectTracer), "the others have none"
@@ -69,7 +67,6 @@ class Simulation(Tracers):
         return max(min(max(most, _FEWEST_AT_ONCE), PATHS_AT_ONCE), paths_per_sample)
 
     def follow(self, seed: int, samples: int) -> PathSamples:
-        """Return light of :attr:`indirect` and :attr:`from_camera`."""
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
         return PathSamples.join([tracer.trace(seed, 0, samples) for tracer in tracers])
 
@@ -132,7 +129,6 @@ class Simulation(Tracers):
         return light - bundle.repeat(bundle.average(light, self.mean_weights(bundle.anchors)))
 
     def flux(self, mean: PathSamples, samples: int) -> FloatArray:
-        """Return the irradiance (n^2,) of each pixel's direct light from its `mean` over the sensor."""
         value = mean.value * (mean.kind == DIRECT) / samples
         return np.asarray(np.bincount(mean.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
@@ -166,7 +162,6 @@ class Simulation(Tracers):
     def of_lamps(
         self, groups: Sequence[LightEstimate], first: int, bands: slice = slice(None)
     ) -> list[AccumulatedLight]:
-        """Return lamps' light, of all bands or some, with its optics."""
         return [
             AccumulatedLight(grid.optics, tuple(_rows(group[name], row, row + 1) for group in groups))
             for row, grids in list(enumerate(self.by_band, first))[bands]

@@ -21,16 +21,13 @@ from mitsim.light.settings import Settings
 from mitsim.transport.direct import FluxTracer, IntArray
 
 _FINEST = 1e-4
-"""80 dB, more than a sensor with a full well reaches."""
 _BOARD_PART = 0.5
 _RATE = 2.0
 """Power of the samples with which a pixel's variance falls: 1 for random points, 2 about an edge, 3 over smooth
 light."""
 _ANYWHERE = 0.01
-"""Part of the mean variance expected of every pixel, because the prediction may have missed it."""
 _AIM = 0.98
 _DOUBLINGS, _AT_ONCE = 8, 4
-"""Doublings of samples to compare, and in one round. Points are even at powers of 2."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,6 @@ from mitsim.core.job import compiled_kernels
 from mitsim.transport.records import Bundle, CellAxis, Sightings
 
 MOST_PLACES = 2**26
-"""Places of all rows and lines: 0.5 GB."""
 _UNIT_BITS = 30
 """Power of two of units in a bright path's light: rounding moves a path's by 5e-10 of it at most, and a place holds
 2^34 times as much."""
@@ -57,12 +56,10 @@ class Lit:
 
     @property
     def inside(self) -> int:
-        """Number of sums with a place; light outside has the last ones."""
         return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
 
     @cached_property
     def layout(self) -> sparse.csr_array:
-        """Number of the sum at each place (rows + lamps, size)."""
         # All places fit 32 bits, in which matrices take half the time.
         numbers = self.numbers[: self.inside]
         places = (numbers // np.uint32(self.rows)).astype(np.int32)
@@ -138,7 +135,6 @@ class DeviceAccumulator:
         return self._place(seen, layer, cells, anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
-        """Return the places that accumulate light, with their parts as :meth:`Bundle.accumulate` splits it."""
         passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
         rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
@@ -183,7 +179,6 @@ class DeviceAccumulator:
     def add(
         self, lights: Sequence[mi.Float], pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool | bool = True
     ) -> None:
-        """Add light [W m^-2] of each line at its :meth:`place`."""
         for line, light in enumerate(lights):
             units = light * dr.opaque(mi.Float, 1 / self._unit)
             fits = (units >= 0) & (units < 2.0**_MOST_BITS)
@@ -195,7 +190,6 @@ class DeviceAccumulator:
             dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, lit, mode=dr.ReduceMode.Direct)
 
     def fetch(self) -> list[DeviceSums]:
-        """Return the sums of each line on the host, and empty them."""
         lines = range(self.lines)
         lit = dr.compress(reduce(or_, (self._of_line(line) != 0 for line in lines)))
         units = [self._of_line(line, lit) for line in lines]
@@ -208,8 +202,6 @@ class DeviceAccumulator:
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:
-    """Sums of one line on the host, in units."""
-
     accumulator: DeviceAccumulator
     lit: Lit
     units: npt.NDArray[np.uint64]
@@ -228,7 +220,6 @@ class DeviceSums:
         return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
 
     def beyond(self, samples: int = 1) -> FloatArray:
-        """Return light (rows, anchors, anchors) from beyond all cells per sample [W m^-2]."""
         lit, accumulator = self.lit, self.accumulator
         rows, anchors = accumulator._rows, accumulator._bundle.anchors
         # Its last one counts what is no light.

@@ -59,17 +59,14 @@ class SensorPoints:
 
     @property
     def positions(self) -> FloatArray:
-        """Positions (anchors,) along an axis [mm]."""
         return anchor_positions(self.anchors, self.half_width)
 
     def of(self, lane: mi.UInt32, paths: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Return the path of each lane, and the row and column of its anchor."""
         count, anchors = dr.opaque(mi.UInt32, paths), dr.opaque(mi.UInt32, self.anchors)
         anchor = lane // count
         return lane % count, anchor // anchors, anchor % anchors
 
     def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
-        """Return anchors, or random points, in the camera's frame."""
         spread = dr.opaque(mi.Bool, self.spread)
         return self.place(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
 
@@ -115,7 +112,6 @@ class Reception:
     way: Way
 
     def solid_angle(self, local: mi.Point3f) -> mi.Float:
-        """Return the solid angle at P for each area of the sensor, cos^3 / z^2 of the apparent point [sr/mm^2]."""
         row, column = rows_columns(local.x, local.y)
         inverse = self.way.inverse_depth
         squared = 1 + dr.square(self.way.row - row * inverse) + dr.square(self.way.column - column * inverse)
@@ -127,8 +123,6 @@ class Reception:
 
 @dataclass(frozen=True, eq=False)
 class OpticalSetup:
-    """Scene with its camera and its projector; `geometry` may replace the camera's own."""
-
     scene: mi.Scene
     camera: mi.Sensor
     projector: ProjectorOptics
@@ -158,7 +152,6 @@ class OpticalSetup:
         return self.received(si, toward, self.way(si, local, active))
 
     def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
-        """Return the ways from surface points to sensor points."""
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
@@ -189,7 +182,6 @@ class OpticalSetup:
 
     @staticmethod
     def received(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, way: Way) -> Reception:
-        """Return the light that comes to the sensor by a way."""
         si.wi = si.to_local(way.direction)
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
         geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
@@ -220,8 +212,6 @@ def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = N
 
 @dataclass
 class Landing:
-    """Points (x, y) of the camera's frame [mm], the cosine there, the way's length [mm], and whether light arrives."""
-
     x: mi.Float
     y: mi.Float
     cosine: mi.Float
@@ -276,8 +266,6 @@ class Connection:
 
 @dataclass
 class LensHit:
-    """Ray that met the lens: radiance, pdf [1/sr] of a :class:`Connection` along it, pixel, and success."""
-
     radiance: mi.Spectrum
     pdf: mi.Float
     pixel: mi.UInt32
@@ -285,8 +273,6 @@ class LensHit:
 
 
 class ProjectorConnector:
-    """Connections to one projector; prepared once."""
-
     def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self.emitter = projector, projector.emitter
         if not projector.ideal:
@@ -294,7 +280,6 @@ class ProjectorConnector:
             self._pixel_at_unit = projector.pixel_size()
 
     def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
-        """Draw a point of the lens in the projector's frame."""
         if self.projector.aperture == 0:
             return mi.Point3f(0)
         disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
@@ -365,7 +350,6 @@ class ProjectorConnector:
 # connects the sensor itself to either. Of a projector such light is a beam's (:mod:`mitsim.transport.specular`).
 
 _SENSOR_POINTS = 129
-"""Points along each side of the sensor, with its edges: a hole lights more than a 128th of it."""
 _LAMP_POINTS = 2**10
 
 

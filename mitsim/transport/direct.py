@@ -123,7 +123,6 @@ class FluxTracer:
     paths_per_launch = PATHS_PER_LAUNCH
 
     def __init__(self, setup: OpticalSetup, glossy: bool = False) -> None:
-        """Prepare the tracer, which samples turns too if surfaces are `glossy`."""
         self._setup, self._glossy = setup, glossy
         self._sensor = SensorPoints(setup.geometry.half_width, spread=True)
 
@@ -220,22 +219,14 @@ _NEAR, _SELDOM = 6, 16
 """Lobe widths beyond which a fortieth of a GGX lobe lies (1 / (1 + 6^2)): of these pairs of pixel and anchor one in so
 many is connected, and stands for all."""
 _AXES = 64
-"""Rays that measure a pixel's axes: three would do for a plane, but print or bumps may hide some."""
 _FEWEST = 6
-"""Fewest axes, because three numbers along each direction are fitted."""
 _SHARP_AXIS = 100.0
-"""Density [1/sr] of a turn above which it gives an axis. Aiming at fainter lobes costs the rest of a pixel's light more
-than it gains (varnish that takes a twentieth: 1 to 3.7 times connections)."""
 _SEED = 20
-"""Seed of the axes' rays, which affect only the speed."""
 _ROUND = 1e-6
-"""Relative determinant below which a folded pixel has no inverse."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Aims:
-    """Position in each pixel of light for a sensor point u: centre + slope (u - u0)."""
-
     centre: FloatArray
     slope: FloatArray
     scale: FloatArray
@@ -244,8 +235,6 @@ class _Aims:
 
 @dataclass
 class _Axis:
-    """Rays along a lobe's axis in the sensor's plane (x, y), and the lobe's radius there [mm], if known."""
-
     x: mi.Float
     y: mi.Float
     width: mi.Float

@@ -51,7 +51,6 @@ _SELDOM = 0.125
 """Chance to go on for a path whose last turn before the sensor belongs to the projector's side; earlier turns leave
 some 0.02 % of indirect light here."""
 _MARGIN = 1e-4
-"""Part of a cell that paths avoid at its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
 
 class FromCameraTracer(FollowingTracer):
@@ -60,7 +59,6 @@ class FromCameraTracer(FollowingTracer):
     of_projector: ClassVar[bool] = True
 
     def __init__(self, setup: OpticalSetup, grid: CellGrid, paths: Paths, points: SensorPoints | None = None) -> None:
-        """Prepare paths, one for each cell, from points of the sensor or its centre."""
         super().__init__(setup, paths, points)
         self.grid, self.connector = grid, ProjectorConnector(setup.projector)
 
@@ -69,7 +67,6 @@ class FromCameraTracer(FollowingTracer):
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
-        """Return wavelengths of each path, and weights of :func:`mitsim.transport.connect.sample_wavelengths`."""
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
@@ -158,7 +155,6 @@ class CameraPaths(PathIntegrator[State]):
         self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
     def path_samples(self) -> list[PathSamples]:
-        """Return the light of every path on the host."""
         kept = self.follow(self.paths).sightings
         dr.eval(kept, self.anchor)
         return [PathSamples.fetch(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
@@ -189,7 +185,6 @@ class CameraPaths(PathIntegrator[State]):
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
 
     def _is_foreign(self, paths: State) -> mi.Bool:
-        """Return True for light of the lens that neither beams nor the projector's side find."""
         return paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
 
     def _hit_lamp(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
@@ -305,7 +300,6 @@ class CameraPaths(PathIntegrator[State]):
             self._keep(paths, "indirect", active & (order > 1), light, pixel)
 
     def _part(self, paths: State, kept: mi.Float) -> mi.Float:
-        """Return the part of the projector's light that its own side leaves to the paths."""
         return 1 - (1 - paths.part) * kept if self.rules.steep else paths.part
 
     def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
@@ -315,7 +309,6 @@ class CameraPaths(PathIntegrator[State]):
         self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))
 
     def _join(self, paths: State, kind: str, seen: Sightings) -> None:
-        """Keep one connection of a kind, or an earlier one, which then stands for both."""
         paths.sightings[kind] = paths.sightings[kind].joined_by(seen, paths.rng.next_float32())
 
 
@@ -393,7 +386,6 @@ class LampTracer(FromCameraTracer):
     def wavelengths(
         self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
     ) -> tuple[mi.Color0f, mi.UnpolarizedSpectrum]:
-        """Return wavelengths of each path, and the count of light at them."""
         place = sobol_point(shuffle(sample, shared), shared).x
         counts = mi.Float(self.counted.response.counts.astype(np.float32))
         steps = len(self.counted.response.counts) - 1

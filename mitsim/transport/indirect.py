@@ -39,7 +39,6 @@ from mitsim.transport.plugins.base import sobol_point, streams
 from mitsim.transport.records import PathSamples, Sightings
 
 _ROOMS = (4**2, 12**2)
-"""Room for anchors of a path: few values, because each is a kernel that takes 0.4 s to compile."""
 
 
 class IndirectTracer(FollowingTracer):
@@ -153,7 +152,6 @@ class ProjectorPaths(PathIntegrator[PathState]):
         drawn: dict[str, mi.Float],
         at: tuple[Held, mi.UInt32],
     ) -> None:
-        """Keep light by a way, or that of an earlier connection, which then stands for both; numbers `drawn` decide."""
         reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
         caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)
@@ -168,7 +166,6 @@ class ProjectorPaths(PathIntegrator[PathState]):
                 self.connections.save(held, kind, number, joined)
 
     def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        """Return the light on the host, without indirect light in an accumulator."""
         paths = self.follow(self.paths)
         if accumulator is None:
             return self.connections.fetch(paths.sightings, tuple(paths.sightings))
@@ -190,8 +187,6 @@ Held = dict[str, Any]
 
 
 class _OneConnection:
-    """Paths that are connected to one point: an anchor, the sensor's centre, or a random point."""
-
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._anchor, self._sensor = emission.anchor, points.at(*emission.anchor, emission.rng)
 
@@ -222,11 +217,6 @@ class _OneConnection:
 
 
 class _AnchorConnections(_OneConnection):
-    """Paths that are connected to one anchor after the other.
-
-    Each anchor's light is what it would be alone: the same random numbers choose which connection is kept.
-    """
-
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._points, self._pixel = points, emission.pixel
         self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
@@ -295,9 +285,7 @@ SIDE = 4
 """Pixels along an axis of a block: fewer than the 7 of usual shifting dots, whose classes then differ."""
 MEMBERS = SIDE**2
 _MOST = 8
-"""Most paths of a pixel in a sample, because a short pilot may take a single path for noise."""
 _SCALES = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
-"""Scales of the counts to try, because whole numbers fit one better than another."""
 
 
 def blocks_of(pixels: int) -> int:
@@ -305,7 +293,6 @@ def blocks_of(pixels: int) -> int:
 
 
 def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) -> FloatArray:
-    """Return the sums of squares (blocks, blocks) of light by the block of its pixel."""
     row, column = np.divmod(pixel, pixels)
     count = blocks_of(pixels)
     place = row // SIDE * count + column // SIDE
@@ -326,7 +313,6 @@ def adaptive_counts(moments: FloatArray) -> npt.NDArray[np.int64]:
 
 
 def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[float, float]:
-    """Return variance and paths of a sample with `repeats`, each over those without."""
     total = float(moments.sum())
     return float((moments / repeats).sum()) / total if total else 1.0, float(repeats.mean())
 
@@ -356,13 +342,11 @@ class AdaptiveSamples:
         return int(dr.width(self.unit))
 
     def at(self, index: mi.UInt32, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Return unit, number of its own sample, and weight of an entry in a sample."""
         unit, turn, count = (dr.gather(mi.UInt32, each, index) for each in (self.unit, self.turn, self.count))
         return unit, sample * count + turn, dr.rcp(mi.Float(count))
 
 
 def by_pixel(repeats: Sequence[int], pixels: int) -> npt.NDArray[np.int64]:
-    """Return repeats (pixels^2,) of each pixel from those of the blocks."""
     count = blocks_of(pixels)
     whole = np.kron(np.reshape(repeats, (count, count)), np.ones((SIDE, SIDE), dtype=np.int64))
     return np.ascontiguousarray(whole[:pixels, :pixels]).ravel()

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
 PATHS_PER_LAUNCH = 2**22
-"""Paths of one kernel: 0.4 GB at some 100 bytes each, and much work for a launch's fixed cost."""
 _SHARP = 1.0
 """Density [1/sr] of a turn above which its light is followed from the camera: three times a matt surface's 0.32, so
 that connections keep all matt light."""
@@ -40,7 +39,6 @@ _STEEP = 64.0
 """Factor of a later turn's shading normal above which light is followed from the camera: 0.02 % of cookie_bag's
 indirect light, in which ten of seventeen million paths made half of the variance."""
 _MIRRORS = 16
-"""Mirrors that a path meets without Russian roulette: as many as specular chains may have."""
 _LONGEST = 0.999
 """Largest chance to go on, so that paths end even where nothing is absorbed.
 
@@ -48,17 +46,13 @@ In a closed room of reflectance rho the light of a path grows by rho / chance a 
 finite only while rho^2 < chance. A chance of 0.95 lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
 ANY = 2**31
-"""More surfaces than any path meets; one more fits 32 bits."""
 _NOTED = 32
-"""Traces after which Dr.Jit's history of kernels, 10 MB of text, is read, which waits for the last of them."""
 _LEAST_CHANCE = 1e-6
-"""Least divisor of throughput, because paths of chance 0 are computed too."""
 
 
 def launches(
     paths_per_sample: int, first: int, samples: int, at_once: int = PATHS_PER_LAUNCH
 ) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
-    """Yield (sample, lane) of the paths of one kernel at a time."""
     total, start = paths_per_sample * samples, paths_per_sample * first
     for done in range(0, total, at_once):
         index = dr.arange(mi.UInt64, min(at_once, total - done)) + dr.opaque(mi.UInt64, start + done)
@@ -69,8 +63,6 @@ def launches(
 
 @dataclass(frozen=True, eq=False)
 class InFlight:
-    """Samples of one kernel: seed, sample number, and index of the path in the sample."""
-
     seed: mi.UInt32
     sample: mi.UInt32
     index: mi.UInt32
@@ -193,7 +185,6 @@ class FollowingTracer(Tracer):
         return self.projector.by_line
 
     def of_orders(self, fewest: int, most: int) -> Self:
-        """Return a tracer that keeps light of some orders; one kernel serves all of them."""
         again = copy(self)
         again.orders = fewest, most
         return again
@@ -234,8 +225,6 @@ State = TypeVar("State", bound=PathState)
 
 @dataclass
 class Turn:
-    """Turn at a vertex: the sample of its BSDF, whether it passes the surface, and whether a mirror makes it."""
-
     sample: mi.BSDFSample3f
     passing: mi.Bool
     delta: mi.Bool
@@ -251,9 +240,8 @@ class PathIntegrator(ABC, Generic[State]):
     IMPORTANCE: ClassVar[bool]
 
     first_turn: mi.Point2f | None = None
-    """Point that draws the first turn instead of a random one."""
     reach: int = 1
-    """Return the least number of surfaces that still turn the light of a path that goes on."""
+    """Least number of surfaces that still turn the light of a path that goes on."""
 
     def __init__(self, tracer: FollowingTracer) -> None:
         self.rules, self.setup, self.by_line = tracer.paths, tracer.setup, tracer.by_line
@@ -273,7 +261,6 @@ class PathIntegrator(ABC, Generic[State]):
         return dr.while_loop((paths,), lambda paths: paths.active, further)[0]  # type: ignore[no-any-return]
 
     def vertex(self, paths: State, first: bool) -> None:
-        """Take all paths over their next vertex."""
         # ---- Surface interaction: to the first one rays of neighbours go side by side, in half the time of others
         si = self.scene.ray_intersect(paths.ray, mi.RayFlags.All, first, paths.active)
 
@@ -289,7 +276,6 @@ class PathIntegrator(ABC, Generic[State]):
             self.scatter(paths, si, first)
 
     def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Turn paths by the BSDFs of their vertices, and end some of them."""
         # ---- BSDF sample; the connection may have looked at the surface from elsewhere
         toward, rules = -paths.ray.d, self.rules
         si.wi = si.to_local(toward)

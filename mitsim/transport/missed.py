@@ -50,7 +50,6 @@ _CUBE, _CUBES = 5e-3, 2**20
 """Side of cubes over the scene's distance, 2 mm at 400, and their codes. A surface that crosses a cube counts with the
 area of its square (at 45 degrees 0.94 of that in the mean)."""
 _GRAZING = 1e-3
-"""Least cosine that divides light on a surface."""
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
 
@@ -115,8 +114,6 @@ def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, Flo
 
 @dataclass
 class _Turned:
-    """Rays that mirrors have turned, where they met surfaces, with flux [W m^-2 mm^2]."""
-
     place: mi.Vector3f
     direction: mi.Vector3f
     mirror: mi.UInt32
@@ -126,8 +123,6 @@ class _Turned:
 
 @dataclass(frozen=True, eq=False)
 class _Landed:
-    """Rays in the order of cubes of space, with the first of each cube and the cubes' side [mm]."""
-
     first: mi.UInt32
     side: mi.Float
     rays: _Turned
@@ -174,8 +169,6 @@ def _cube(place: mi.Point3f, side: mi.Float) -> mi.UInt32:
 
 
 class _MissedTracer(FromCameraTracer):
-    """Light that no connection finds, as indirect light, and over a mirror and a lobe, as direct light."""
-
     landed: _Landed | None
 
     def _paths(self, flight: InFlight) -> _MissedPaths:
@@ -235,7 +228,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
 
 
 def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
-    """Return the indices of shapes that reflect or bend light into single directions."""
     polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     shapes = enumerate(scene.shapes())
     return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
@@ -251,13 +243,9 @@ def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
 _POINTS, _NEAREST = 512, 1e-4
 """Points about each spot, which measure its light to some 5 %, and the angle from its middle where they begin."""
 _MOST_BALLS = 2**12
-"""Balls to examine, evenly chosen of more: two million points, some 0.5 s."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
-"""Angle between points about a spot, evenly spread at any number."""
 _FEWEST_MET = 3.0
-"""Meetings of all small highlights below which the pilot may see none, one time in twenty."""
 _ON_BALL = 1e-2
-"""Distance, in radii, within which a ray has met its target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +267,6 @@ class Highlights:
     moments: FloatArray
 
     def unmet(self, rays: float) -> Highlights:
-        """Return those that so many rays of every pixel meet less than once each, and a few times together; or none."""
         seldom = np.square(self.irradiance) * rays < self.moments
         total, moment = float(self.irradiance[seldom].sum()), float(self.moments[seldom].sum())
         if total**2 * rays >= _FEWEST_MET * moment:
@@ -357,7 +344,6 @@ def _directions_about(normal: FloatArray, angle: FloatArray, turned: FloatArray)
 def _radiance_toward(
     scene: mi.Scene, origin: FloatArray, aimed: FloatArray, eye: FloatArray, radius: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the light (k,) of sharp lobes toward the eye [1/sr], 0 where blocked, and cosines."""
     to = aimed - origin
     ray = mi.Ray3f(
         mi.Point3f(origin.tolist()), mi.Vector3f(*device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
@@ -391,9 +377,7 @@ _SHARP, _LEAST_SHARP = 100.0, 10.0
 0.03). Where a part of them is, that part of it, but no less than the second (roughness 0.02 and a twentieth of the
 light). Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections meet broader ones."""
 _PLENTY = 2**12
-"""Rays met on the sensor that measure the light of a few pixels to a few percent; fewer need a second run."""
 _CONNECTIONS = 2**18
-"""Connections that measure all other light, some 0.1 s: the light is bounded, so a percent of it stays open."""
 _SEARCHING = 2**20
 """Connections that search faint lobes, some 0.1 s: varnish of roughness 0.005 that reflects a twentieth, on a ball of
 100 mm at 390, is met eleven times, and sampled twice."""
@@ -407,7 +391,6 @@ _BROAD, _WELL_MET = 2.0, 256.0
 """Radius of all lobes on the sensor's plane, over its half-width, beyond which none is searched, and hits of
 connections that then measure their light to 6 % (compact_disc: 2000, where a quarter of all rays meets 24)."""
 _SHARPEST = 0.1
-"""Part of the light over lobes sharper than the reported width."""
 
 
 # ---- Light over sharp lobes, and what it is found from
@@ -507,7 +490,6 @@ def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
 
 
 def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
-    """Return the numbers of chosen pixels (side^2,) and of all that touch one."""
     return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
 
@@ -526,8 +508,6 @@ class _LobeLight:
 
 @dataclass
 class _SensorHits:
-    """Estimates x of points met on the sensor, x I, and density q of one, drawn by x; and sharp turns."""
-
     mean: mi.Float
     moment: mi.Float
     density: mi.Float
@@ -544,8 +524,6 @@ class _SensorHits:
 
 
 class _Connections(DirectTracer):
-    """Direct light over sharp lobes alone, or all other."""
-
     _over_sharp: bool
     _least: mi.Float
     _own_least: mi.Float
@@ -570,8 +548,6 @@ class _Connections(DirectTracer):
 
 
 class _Lobes:
-    """Rays of the projector that sharp lobes, by least density [1/sr] of each pixel, send to the sensor."""
-
     def __init__(self, setup: OpticalSetup) -> None:
         self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
 

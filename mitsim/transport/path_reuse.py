@@ -49,11 +49,8 @@ _STEP, _TURN = 5, 16
 """Members of a block take the points of their common sequence in turn. Each sample begins five members on, and sixteen
 samples one more, which spreads each pixel's points over the sequence."""
 _PATHS_PER_LAUNCH = 2**20
-"""Paths of one kernel: their pairs take 256 bytes a path."""
 _MOST_COMPARED = 32
-"""Shapes to compare each second point with: each comparison is an instruction of the kernel."""
 _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
-"""Parameters of a diffuse material, and of no other."""
 
 
 class PathReuseTracer(IndirectTracer):
@@ -69,20 +66,17 @@ class PathReuseTracer(IndirectTracer):
         return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
     def shares(self) -> bool:
-        """Return True if the paths can be shared."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
         several = self.points.count > 1 or not lines or mi.is_polarized
         return self.paths.interreflection and not several and not self.setup.passage.open
 
     @property
     def lines(self) -> int:
-        """Separated lines; 1 without."""
         lines = self.projector.lines
         return len(lines.shares) if lines is not None and mi.is_spectral else 1
 
     @cached_property
     def diffuse(self) -> frozenset[int]:
-        """Indices of shapes whose material is diffuse and nothing else: no bumps, no coat."""
         shapes = enumerate(self.setup.scene.shapes())
         return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
@@ -183,7 +177,6 @@ class ReusedPaths(ProjectorPaths):
         self.scatter(paths, si, True)
 
     def _second_vertex(self) -> None:
-        """Meet the second surface, its way to the sensor, and each path's turn: of unit light where it is shared."""
         paths = self.paths
         self.second_ray = mi.Ray3f(paths.ray)
         self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
@@ -280,7 +273,6 @@ class ReusedPaths(ProjectorPaths):
         return sent, whole, same_side
 
     def _pair_light(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
-        """Compute the light of each pixel by each second point of its block, straight to the sensor and further on."""
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
         dr.eval(whole, same_side)
@@ -302,7 +294,6 @@ class ReusedPaths(ProjectorPaths):
 
     @property
     def sends(self) -> int:
-        """Numbers for what a pixel sends to a second point: one for each line, or for all."""
         return self.tracer.lines
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:

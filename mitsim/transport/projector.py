@@ -26,15 +26,10 @@ from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.base import Numbers, channels, device_vectors, host_values, turn_and_origin
 
 _WAVELENGTH_SETS = 8
-"""Sets of four wavelengths: 15 nm apart, finer than measured spectra."""
 _FAR = 1000.0
-"""Depth of the fitted points [mm], large beside the emitter's place, so that float32 coordinates do not matter."""
 _PROBES = 24
-"""Points along an axis of the fit: 24^2 reduce float32's 6e-8 of the canvas to 3e-9."""
 _FIRST_REACH = 0.02
-"""Tan-angle of the first points: inside the picture of a projector of more than 2.3 degrees."""
 _PROBE_STEP = 1e-2
-"""Tan-angle between the two points that measure a pixel's size."""
 
 
 @dataclass(frozen=True)
@@ -88,18 +83,15 @@ class ProjectorOptics:
 
     @property
     def ideal(self) -> bool:
-        """Pinhole with sharp pixels."""
         return self.aperture == 0 and self.blur == 0
 
     def canvas_point(
         self, row: Numbers, column: Numbers, number: Callable[[float], Numbers] = float
     ) -> tuple[Numbers, Numbers]:
-        """Return canvas coordinates (u, v), 0..1, of a point of the window in pixels."""
         rows, columns, first_row, first_column = map(number, (*self.canvas, self.first_row, self.first_column))
         return (column + first_column) / columns, (row + first_row) / rows
 
     def pixel_at(self, uv: mi.Point2f) -> mi.UInt32:
-        """Return the window's pixel (row-major) nearest to canvas point ``uv``."""
         n = _opaque(self.n)
         row, column = (
             dr.clip(dr.floor(place * _opaque(count) - _opaque(part)) - _opaque(first), 0, n - 1)
@@ -138,7 +130,6 @@ class CanvasMap:
 
     @classmethod
     def of(cls, emitter: mi.Emitter) -> CanvasMap:
-        """Fit the map of an emitter in float64."""
         turn, origin = turn_and_origin(mi.traverse(emitter)["to_world"])
         reach = _FIRST_REACH
         for _ in range(2):  # first near the axis, to learn the field of view, then over all of it
@@ -158,7 +149,6 @@ class CanvasMap:
         return x[0] * u + x[1], y[0] * v + y[1]
 
     def pixel_area(self, canvas: Sequence[int]) -> float:
-        """Return the area of a pixel on the plane at unit distance [mm^2]."""
         return float(abs(self.x[0] * self.y[0]) / (canvas[0] * canvas[1]))
 
 
@@ -169,7 +159,6 @@ class ProjectorRays:
         self.projector, self._map = projector, projector.canvas_map
 
     def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
-        """Return a ray through a point of each pixel (column, row), and random points of the lens and of the spot."""
         projector = self.projector
         n = dr.opaque(mi.UInt32, projector.n)
         row, column = mi.Float(pixel // n) + jitter.y, mi.Float(pixel % n) + jitter.x
@@ -210,7 +199,6 @@ class ProjectorRays:
 
 
 def _opaque(value: float) -> mi.Float:
-    """Convert a number to data of a kernel."""
     return dr.opaque(mi.Float, float(value))
 
 
@@ -263,7 +251,6 @@ class PinholeRays:
             self.power *= line_wavelengths(projector.lines)[1]
 
     def directions(self, points: FloatArray) -> FloatArray:
-        """Return unit directions (k, 3) through window points (row, column) (k, 2)."""
         world = self._local(points) @ self._map.turn.T
         return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
 

@@ -27,7 +27,6 @@ IntArray = npt.NDArray[np.int64]
 AMBIENT, DIRECT, INDIRECT = 0, 1, 2
 """Kinds of light: of lamps, of the projector over one surface that is no mirror, and over several."""
 _COUNTED = 4
-"""Places for each entry up to which entries are counted by place; beyond, sorting is faster."""
 
 
 # -------- Light of connections in the renderer
@@ -73,7 +72,6 @@ class Sightings:
 
 
 def check_finite(light: npt.NDArray[Any]) -> None:
-    """Raise MitsimError for NaN or infinite light."""
     if not np.isfinite(light).all():
         raise MitsimError("the scene reflects NaN or infinite light toward the camera; check its materials")
 
@@ -164,18 +162,15 @@ class PathSamples:
         return cls(index, index, index, number, number, number, number, np.zeros(0, dtype=np.int16))
 
     def average(self, weights: FloatArray) -> PathSamples:
-        """Return the mean over all anchors, with ``weights`` (anchors,) along rows and columns."""
         first = np.zeros_like(self.pixel)
         value = self.value * weights[self.anchor_row] * weights[self.anchor_column]
         return replace(self, anchor_row=first, anchor_column=first, value=value)
 
     def by_lane(self, ranges: IntArray) -> list[PathSamples]:
-        """Return the entries of each range of lanes (parts, 2)."""
         assert self.lane is not None, "as it was fetched"
         return [self.where(slice(*part)) for part in np.searchsorted(self.lane, ranges).tolist()]
 
     def where(self, chosen: npt.NDArray[np.bool_] | slice) -> PathSamples:
-        """Return the chosen entries; consecutive ones are not copied."""
         lines = None if self.lines is None else self.lines[:, chosen]
         return PathSamples(**{name: getattr(self, name)[chosen] for name in _ARRAYS}, lines=lines)
 
@@ -259,14 +254,12 @@ class Bundle:
         return np.concatenate([place for place, _ in parts]), values, np.tile(path_samples.pixel, len(parts))
 
     def outside(self, path_samples: PathSamples) -> float:
-        """Return the light from beyond all cells [W m^-2]."""
         return float(path_samples.value[~self._inside(path_samples)].sum())
 
     def _inside(self, path_samples: PathSamples) -> npt.NDArray[np.bool_]:
         return self.grid.rows.holds(path_samples.row) & self.grid.columns.holds(path_samples.column)
 
     def repeat(self, light: sparse.csr_array) -> sparse.csr_array:
-        """Return light of one anchor as if every anchor saw it."""
         entries = light.tocoo()
         height, width = self.cells
         layer, place = np.divmod(entries.col.astype(np.int64), height * width)
@@ -310,7 +303,6 @@ class Bundle:
 
 
 def _index_type(*shape: int) -> type[np.int32] | type[np.int64]:
-    """Return 32-bit indices where they suffice, because they sort twice as fast."""
     return np.int32 if max(shape) < 2**31 else np.int64
 
 
@@ -336,13 +328,11 @@ class CellAxis:
         return np.asarray((tau >= self.start) & (tau < self.start + self.count * self.size))
 
     def part(self, first: float, last: float) -> CellAxis:
-        """Return the cells from one tan-angle to another, and one more on each side."""
         low = max(int(self.cell(np.array(first))) - 1, 0)
         high = min(int(self.cell(np.array(last))) + 1, self.count - 1)
         return CellAxis(self.start + low * self.size, self.size, high - low + 1)
 
     def cell(self, tau: FloatArray) -> npt.NDArray[np.int64]:
-        """Return the nearest cell of each tan-angle."""
         return np.clip(np.floor((tau - self.start) / self.size).astype(np.int64), 0, self.count - 1)
 
 

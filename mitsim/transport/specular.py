@@ -33,36 +33,28 @@ _UNIT = 2**24
 _DIVISIONS = 2**14
 """Most parts along a square of the first grid: a rim in a pixel of 300 sensor pixels is found to a 20th of one."""
 _DEEPER = 2**4
-"""How much finer that is than squares whose light may land anywhere are divided: those are omitted and counted."""
 _MOST = 2**16
 """Squares of one size beyond which none is divided: a wire of 0.15 mm reaches it, in 5 processor seconds."""
 _AT_ONCE = 2**18
-"""Squares computed together, some hundreds of MB."""
 _COARSE = 128
 """Fewest coarse beams along the window: a mirror of a hundredth of the window is found."""
 _TURNED, _MIRRORS = 256, 16
-"""Rays along the window that find where mirrors send its light, and mirrors that a ray may meet."""
 _ACROSS_SENSOR = 128
 """Rays across a sensor in the projector's direct light: a hole that lights a 128th of it is found."""
 _TOLERANCE = 0.02
 """Largest departure from a bilinear map, in sensor pixels: twice float32's error at the sensor."""
 _SHADES = 0.01
-"""Largest relative departure of the light left."""
 _SMALL = 2.0
 """Sensor pixels below which whole beams are not divided."""
 _PAINT = 0.5
-"""The limit for beams that an edge of paint cuts, which are kept whole."""
 _RIM = 1 / 16
 """The limit for beams that a rim cuts, whose inner part is represented by points: 1.5 % of a pixel along a straight
 rim; each halving doubles the beams."""
 _THIN, _MANY = 0.25, 8.0
 """Sensor pixels across, and ratio of length, of squares that are thinned out: half a pixel wide at most."""
 _STRAIGHT = 0.1
-"""Departure from a bilinear map, over the light's extent, below which corners measure its width."""
 _SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
-"""Part of a square for each of its 3 x 3 nodes (trapezoidal rule)."""
 _MARGIN = 0.02
-"""Sine by which the field stop is widened when squares are omitted: 1 degree, more than a square's rays curve."""
 
 
 @keep_scenes()
@@ -145,8 +137,6 @@ def _ranges(first: IntArray, last: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """State of lattice points of one chain: whether a ray arrived, and where, how, how bright."""
-
     valid: Mask
     sensor: FloatArray
     tangent: FloatArray
@@ -264,7 +254,6 @@ def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
 
 
 def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
-    """Return corners (q, 2, 2) of squares that represent `factor` (q,) squares along a way (q, 2)."""
     wide = np.flatnonzero(factor > 1)
     if not len(wide):
         return corners
@@ -281,14 +270,11 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Beams without extent, and the number (k,) of the square of each."""
-
     beams: Beams
     number: IntArray
 
     @property
     def variance(self) -> float:
-        """Return the variance of their flux, as if each square were all or nothing."""
         return float(np.square(np.bincount(self.number, self.beams.flux)).sum()) if len(self.number) else 0.0
 
     def take(self, chosen: Mask) -> _Points:
@@ -332,7 +318,6 @@ def _extent(nodes: _Nodes) -> FloatArray:
 
 
 def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:
-    """Return the distance (q, 2) of rays by place [mm] and by sine; the previous one if one ray arrived."""
     sizes = np.stack([_size(*_box(nodes.valid, values)) for values in (nodes.sensor, _sines(nodes))], axis=1)
     return np.asarray(np.where(sizes > 0, sizes, before))
 
@@ -360,7 +345,6 @@ def _sines(nodes: _Nodes) -> FloatArray:
 
 
 def _departure(values: FloatArray) -> FloatArray:
-    """Return the largest distance (q,) of values (q, 3, 3, k) from the bilinear map of their corners."""
     blend = np.array([[1, 0], [0.5, 0.5], [0, 1]])
     flat = np.einsum("ia,jb,qabk->qijk", blend, blend, values[:, ::2, ::2])
     return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
@@ -394,18 +378,14 @@ _ACROSS_BALL = 0.25
 _ACROSS_FACE = 1 / 3
 """Step in heights of a flat facet, whose inscribed circle contains a point of any such grid."""
 _ACROSS_SMOOTH = 1.0
-"""Step in heights of a smooth mesh's faces, whose normals are continuous."""
 _SPOT_MARGIN = 1.5
 """Radius of a spot in the window over that at the axis: perspective stretches by 1 / cos^2, 1.3 at 30 degrees."""
 _BOXES_AT_ONCE = 2**20
 _MOST_SPOTS = 2**21
-"""Spots of all mirrors, some 300 MB; larger meshes lose some."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """Pieces of mirrors: centre (k, 3), radius (k,), and the step (k,) of rays that finds them [mm]."""
-
     centre: FloatArray
     radius: FloatArray
     step: FloatArray

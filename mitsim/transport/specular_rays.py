@@ -29,17 +29,13 @@ Mask = npt.NDArray[np.bool_]
 _FAINTEST = 1e-5
 """Part of its light at which a ray ends, after three or four reflections of glass: a hundredth of accuracy 1e-3."""
 _AGREEMENT = 1e-4
-"""Largest distance of our direction to Mitsuba's: float32 agrees to some 1e-6, another law of bending does not."""
 _OFFSET = 1e-4
 """Start of a ray off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon."""
 _GRAZING = 0.02
-"""Least cosine for this distance, lest a grazing ray start centimetres away."""
 _CHAIN = np.uint64(0x9E3779B97F4A7C15)
-"""Multiplier of a chain's number, 2^64 over the golden ratio, which scatters neighbouring sequences (Knuth)."""
 
 
 def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
-    """Return the materials of a scene with a part of one of the kinds (``mi.BSDFFlags``)."""
     materials: list[mi.BSDF] = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
@@ -284,14 +280,11 @@ def _rows_columns(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Points and normals (k, 3) where rays met surfaces, geometric and for shading."""
-
     point: FloatArray
     geometric: FloatArray
     normal: FloatArray
 
     def put(self, chosen: IntArray, other: Hits) -> None:
-        """Replace chosen hits where the others are finite."""
         good = np.isfinite(other.point).all(axis=1) & np.isfinite(other.normal).all(axis=1)
         for name in vars(self):
             getattr(self, name)[chosen[good]] = getattr(other, name)[good]
@@ -302,8 +295,6 @@ class _Surface(Protocol):
 
 
 class ExactHits:
-    """Spheres, cylinders and smooth meshes among some shapes."""
-
     def __init__(self, shapes: Sequence[mi.Shape]) -> None:
         self._surfaces: dict[int, _Surface] = {}
         for shape in shapes:
@@ -312,7 +303,6 @@ class ExactHits:
                 self._surfaces[_number(shape)] = surface
 
     def refine(self, origin: FloatArray, direction: FloatArray, hits: Hits, shape: IntArray, face: IntArray) -> None:
-        """Replace hits on the known surfaces, by the registry numbers of shapes and their faces."""
         for number in np.intersect1d(shape, list(self._surfaces)) if self._surfaces else ():
             mine = np.flatnonzero(shape == number)
             old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
@@ -396,16 +386,12 @@ def _edges(triangles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 # -------- Balls of glass, whose light comes from close to their rim
 
 _ACROSS = 2**10
-"""Rays across a ball of glass: their light turns by a third of a degree from ray to ray, half a sensor at 400 mm."""
 _TO_RIM = 0.25
-"""Step of the finer grid near a rim over the distance to it."""
 _TOO_CLOSE = 1 / 64
 """Distance to the rim, in radii, within which light is counted but not traced: for glass of index 1.5 it is 4 % of the
 returned light, and 98 % of the squares."""
 _FINEST = 2**10
-"""Lattice points of the finest step, below which squares would be divided ten times more."""
 _PIECE, _MOST_PIECES = 4.0, 2**10
-"""Steps along each piece of an arc, and most pieces; boxes about long ones are mostly empty."""
 Boxes = tuple[FloatArray, FloatArray, FloatArray]
 """Corners (k, 2) of boxes in the window, and the step (k,) of rays that finds their content [lattice points]."""
 
@@ -449,8 +435,6 @@ def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Bo
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """Plane through a projector, a ball's centre and a sensor."""
-
     origin: FloatArray
     axes: tuple[FloatArray, FloatArray, FloatArray]
     distance: float

@@ -30,12 +30,10 @@ _LOOSE = 1500 * 2.0**-24
 up to 6e-8 D^2 / r wrong, 1e-3 mm of a radius r of 6 mm at a distance D of 300. Its rays are Mitsuba's, which start
 along the normal: along a grazing ray the distance is longer than the way through a rod of 4 mm."""
 _GRAZING = 0.02
-"""Least cosine for this distance, lest a grazing ray skip centimetres."""
 State = TypeVar("State", bound=tuple[object, ...])
 
 
 def lets_through(material: mi.BSDF) -> bool:
-    """Return True if a material transmits light, bent, scattered or straight."""
     return bool(int(material.flags()) & (int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null)))
 
 
@@ -59,13 +57,11 @@ class Arrival:
     active: mi.Bool
 
     def turn(self, number: mi.Float, point: mi.Point2f) -> mi.BSDFSample3f:
-        """Sample the next direction as the surfaces scatter."""
         self.si.wi = self.si.to_local(-self.direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         return self.si.bsdf().sample(context, self.si, number, point, self.active)[0]
 
     def density(self, local: mi.Vector3f) -> mi.Float:
-        """Return the density of a turn to local directions [1/sr]."""
         self.si.wi = self.si.to_local(-self.direction)
         return self.si.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), self.si, local, self.active)
 
@@ -156,11 +152,9 @@ class Passage:
 
     @staticmethod
     def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """Return the part of the light that the surface lets straight on."""
         return mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, active))
 
     def through(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Passed:
-        """Return light of a unit direction after it passes surfaces."""
         passed = Passed(mi.Vector3f(direction), self.straight(si, active), mi.Float(1))
         if self.panes:
             context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -186,7 +180,6 @@ class Passage:
         return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null) | bent
 
     def clear(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
-        """Return the distance from the surface at which a ray starts [mm]."""
         slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
         clear = mi.Float(CLEAR)
         if self._instanced:
@@ -205,7 +198,6 @@ class Passage:
         return self.onward(si, direction) if self.transmits else si.spawn_ray(direction)
 
     def leaving_to(self, si: mi.SurfaceInteraction3f, target: mi.Point3f) -> mi.Ray3f:
-        """Return the ray of :meth:`leaving` that ends short of a target."""
         ray = si.spawn_ray_to(target)
         if self.transmits:
             direction = dr.normalize(target - si.p)
@@ -235,13 +227,9 @@ def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
 _STEPS = 8
 """Corrections of a ray's direction: each squares the error, so that four bring 100 mm to float32's rounding."""
 _CLOSE = 5e-4
-"""Miss at which correction ends: three times float32's rounding at 400 mm; it moves a shadow by 3 nm."""
 _MET = 0.02
-"""Miss up to which a ray has met its target [mm]: rays that a pane's edge stops end far beyond."""
 _LARGEST_STEP = 0.3
-"""Largest correction of a direction [rad], lest a wrong one at an edge leave the scene."""
 _MOST_FACES = 1000
-"""Triangles of a mesh to examine: boxes and sheets have a few."""
 _FLAT = 1e-4
 """Sine below which two normals count as one: meshes are written with five digits."""
 
@@ -303,8 +291,6 @@ class RefractedWay:
 
 @dataclass
 class _Ray:
-    """Ray under way: the last surface that it left, and its derivatives with two turns of its start."""
-
     active: mi.Bool
     place: mi.Point3f
     direction: mi.Vector3f
@@ -318,7 +304,6 @@ class _Ray:
     eta: mi.Float
 
     def move_crossing(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """Move its crossing with the plane of a normal at a distance."""
         moves = []
         for place, direction in ((self.place_a, self.direction_a), (self.place_b, self.direction_b)):
             at = place + direction * distance
@@ -396,7 +381,6 @@ class _Search:
         return dr.dot(self.target - ray.place, self.facing) / dr.dot(ray.direction, self.facing)
 
     def advance(self, ray: _Ray) -> _Ray:
-        """Advance a ray beyond the next surface; an opaque surface stops its light, not the search."""
         origin = ray.place + ray.direction * ray.clear
         onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
         met = self.passage.next_surface(onward, ray.active)
@@ -431,11 +415,8 @@ class _Search:
 _OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
 """Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see."""
 _POINTS, _FEWEST = 2**16, 8
-"""Points of each surface to examine, and how many make a contact: a ball that rests on a pane makes none."""
 _PARALLEL = 0.999
-"""Cosine between normals of two surfaces in contact; crossing cards come close, and hide nothing there."""
 _MOST = 16
-"""Surfaces to examine; contacts of further ones are not found."""
 
 
 @dataclass(frozen=True)
@@ -447,7 +428,6 @@ class Contact:
     least: float
 
     def words(self, estimator: str) -> tuple[str, str]:
-        """Describe the contact, and what an estimator allows."""
         rule = (
             f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave "
             "a gap of air, or take one surface with the material of both"

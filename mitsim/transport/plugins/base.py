@@ -19,7 +19,6 @@ from mitsim.core.arrays import FloatArray
 
 
 def numbers(text: str) -> list[float]:
-    """Parse a list in a scene file, with commas or blanks; raise ValueError for anything but numbers."""
     return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
 
 
@@ -80,29 +79,24 @@ def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
 # -------- Coordinates
 
 Numbers: TypeAlias = "mi.Float | FloatArray"
-"""Numbers of this room's formulas: the renderer's, or NumPy's."""
 RIGID = 1e-4
 """Largest :func:`rigidity_error` of a rigid transform: matrices of five digits pass, a scale of 1.0001 does not."""
 
 
 def rows_columns(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
-    """Convert x and y of the camera's frame to index coordinates."""
     return -y, -x
 
 
 def x_y(row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
-    """Convert index coordinates to x and y of the camera's frame."""
     return -column, -row
 
 
 def turn_and_origin(transform: mi.AffineTransform4f) -> tuple[FloatArray, FloatArray]:
-    """Return the linear part (3, 3) and origin (3,) [mm] of a transform, in double precision."""
     matrix = np.array(transform.matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
     return matrix[:3, :3], matrix[:3, 3]
 
 
 def rigidity_error(turn: FloatArray) -> float:
-    """Return the largest entry of R^T R - 1."""
     return float(np.abs(turn.T @ turn - np.eye(3)).max())
 
 
@@ -116,7 +110,6 @@ def rigidity_error(turn: FloatArray) -> float:
 # unbiased. The other dimensions are plain random numbers.
 
 _SEQUENCE_BITS = 20
-"""Bits of a sample's number that count in the second dimension: 2^20 samples are more than a pass takes."""
 
 
 def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
@@ -183,5 +176,4 @@ def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
 
 
 def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
-    """Split weighted light by line, or return all in one."""
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]

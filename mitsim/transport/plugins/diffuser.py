@@ -21,13 +21,9 @@ from mitsim.core.seeds import integer, stream
 from mitsim.transport.plugins.base import host_values, vectors
 
 _THICKNESS_MM = 1.0
-"""Thickness of the sheet, which moves tilted light only."""
 _CLEAR_MM = 0.05
-"""Start of a refracted ray, beyond the face that it leaves and before the next one."""
 _RAYS_AT_ONCE = 2**22
-"""0.3 GiB of rays and their surface interactions."""
 _VERTICES = 12
-"""Vertices for each correlation length: interpolated normals are then wrong by 0.3 % of the slope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +74,6 @@ class Diffuser:
     distance_mm: float = 8.0
 
     def scene(self) -> mi.Scene:
-        """Return flat face and relief of Mitsuba's smooth dielectric."""
         glass = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}
         side, top = self.relief.side_mm, self.distance_mm + _THICKNESS_MM
         # Wider than the relief by what tilted light needs.

@@ -70,18 +70,14 @@ CATALOGUE = MappingProxyType(
 )
 """Sellmeier's B_1, C_1 [um^2], B_2, C_2, ... of glasses, with their sources."""
 _LINE_D, _LINE_F, _LINE_C = 0.58756, 0.48613, 0.65627
-"""Fraunhofer's lines [um]."""
 _PAIRS = 4
 _VISIBLE = 360.0, 830.0
 _CHECKED_WAVELENGTHS = 48
 _MOST_INDEX = 5.0
-"""Above germanium's 4."""
 Length = TypeVar("Length", float, Any)
 
 
 class GlassModel(BaseModel):
-    """Checked parameters, of the module's table."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     glass: str | None = None
@@ -92,7 +88,6 @@ class GlassModel(BaseModel):
 
     @classmethod
     def build(cls, **values: object) -> GlassModel:
-        """Build from loose values; raise MitsimError in one line."""
         model = validate(cls, values, PLUGIN)
         given = [name for name in ("glass", "sellmeier", "index") if getattr(model, name) is not None]
         if len(given) > 1:
@@ -152,8 +147,6 @@ def tune(scene: mi.Scene, wavelength_nm: float) -> None:
 
 
 def plugin_class() -> type:
-    """Return the plugin for the variant in use."""
-
     class DispersiveGlass(bsdf_class()):  # type: ignore[misc]
         name = PLUGIN
 

@@ -75,7 +75,6 @@ from mitsim.transport.plugins.base import bsdf_class, numbers
 
 PLUGIN = "mitsim_grating"
 _ORDERS = 16
-"""Highest order: a compact disc sends visible light to 4 at most; each costs a lobe in every evaluation."""
 _ROUNDING = 1e-6
 
 Part = Annotated[float, Field(ge=0, le=1)]
@@ -84,8 +83,6 @@ Share = Annotated[float, Field(ge=0, le=1e9)]
 
 
 class GratingModel(BaseModel):
-    """Checked parameters, of the module's table."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     pitch: float = Field(1600.0, ge=1, le=1e9, description="groove period [nm]")
@@ -102,7 +99,6 @@ class GratingModel(BaseModel):
 
     @classmethod
     def build(cls, **values: object) -> GratingModel:
-        """Build from loose values; raise MitsimError in one line."""
         model = validate(cls, values, PLUGIN)
         total = sum(model.orders.values()) + model.diffuse
         if total > 1 + _ROUNDING:
@@ -153,8 +149,6 @@ def _numbers(name: str, value: Any) -> object:
 
 
 def plugin_class() -> type:
-    """Return the plugin for the variant in use."""
-
     class Grating(bsdf_class()):  # type: ignore[misc]
         name = PLUGIN
 

@@ -203,7 +203,6 @@ def plugin_class() -> type:
             return middle + (sample - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
 
         def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
-            """Return tan-angles t from sensor points u [mm] to open places of the mask, and the open part."""
             geometry = self.geometry
             stop, side = geometry.tan_half_fov, self._feature
             # What the field stop shows of the mask, in features from the mask's first corner.
@@ -217,7 +216,6 @@ def plugin_class() -> type:
             return t, part
 
         def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
-            """Return where rays cross the tilted mask, moved at random for its blur by the bits of a sample."""
             distance, flaws = self.geometry.mask_distance, self._flaws
             if any(flaws.tilt_mrad):
                 tilt = mi.Vector2f(*x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
@@ -289,7 +287,6 @@ class OpenAxis:
         self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
 
     def open_within(self, low: mi.Float, width: float) -> _Seen:
-        """Return what is open from ``low`` on over a width."""
         # From the feature that holds its start: the width of a narrow view keeps its digits.
         start = mi.UInt32(dr.clip(low, 0, self._size))
         within = low - mi.Float(start)
@@ -308,8 +305,6 @@ class OpenAxis:
 
 @dataclass
 class _Seen:
-    """Axis from the range's start: the feature there, the distance inside, and what is open before and within."""
-
     places: mi.UInt32
     start: mi.UInt32
     within: mi.Float
@@ -318,7 +313,6 @@ class _Seen:
     length: mi.Float
 
     def draw(self, number: mi.Float) -> mi.Float:
-        """Return the distance from the range's start, in features, of an open place for a number in [0, 1)."""
         place = self.skipped + number * self.length
         whole = mi.UInt32(place)
         feature = dr.gather(mi.UInt32, self.places, dr.minimum(self.before + whole, dr.width(self.places) - 1))
