@@ -130,12 +130,6 @@ class PairsManifest(BaseModel):
             raise ValueError(f"shards do not hold pairs 0 to {self.count - 1}, each once; make or copy them again")
         return self
 
-    @property
-    def mask(self) -> Any:
-        """The mask, by name."""
-        geometry = self.camera.get("geometry", {})
-        return geometry.get("mask_plate", geometry.get("mask"))
-
     @cached_property
     def family(self) -> PatternFamily:
         """The patterns."""
