@@ -563,7 +563,7 @@ SIZES = {
     "core": (22, 3820),
     "devices": (14, 2497),
     "exchange": (10, 1825),
-    "learn": (15, 1827),
+    "learn": (10, 1706),
     "light": (12, 1984),
     "metrics": (1, 81),
     "mitsim": (1, 104),

@@ -1,6 +1,6 @@
-"""A trained network with what it was trained for: its file in, a solver out that images are asked by.
+"""A trained network as a method of solving, and its file.
 
-The file is what `torch.load` reads with `weights_only`: tensors, and a text of JSON. Nothing in it is run.
+`torch.load` reads the file with `weights_only`: tensors, and a text of JSON. Nothing in the file is executed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from mitsim.core.configuration import validate
 from mitsim.core.errors import ArgumentError, MitsimError, cut, reason_of
 from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
-from mitsim.learn.diagonal import Binning, Data, Diagonal
-from mitsim.learn.methods import CLASSES, Denoiser, Method, PlugAndPlay
-from mitsim.learn.model_manifest import ModelManifest
+from mitsim.learn.methods import CLASSES, Binning, Data, Denoiser, Diagonal, Method, PlugAndPlay
+from mitsim.learn.pair_store import ModelManifest
 from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
@@ -34,41 +33,28 @@ from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28
-"""Of a file: 256 MiB, fifty times the largest that `mitsim train` writes for 128 pixels."""
 _SAME_CAMERA = 0.02
-"""Relative difference of two calibrations' models above which they are of two cameras: four times that of two sessions
-of 512 frames; a scene an eighth of a pixel aside has as much."""
+"""Relative difference of two calibrations' models above which they belong to two cameras: four times that of two
+sessions of 512 frames, and that of a scene an eighth of a pixel aside."""
 _OTHER_NOISE = 1.5
-"""Factor by which noise may lie outside of what was trained with: that of half an exposure is 1.4."""
+"""Factor by which the noise may lie outside the range of the training; half an exposure gives 1.4."""
 _NO_NOISE = 1e-14
 """Part of the frames' energy that counts as noise where there is none: rounding of single precision."""
+_PATTERNS = ("P_L", "P_R")
 
 
 @dataclass(frozen=True, eq=False)
 class _Doubted(Prepared):
-    """A factorised model, with ``doubts`` on whether a network knows it, and whether this ``reads_frames``."""
-
     doubts: tuple[str, ...] = ()
     reads_frames: bool = False
 
     def accumulator(self) -> Accumulator:
-        """An empty sum to add frames to."""
         return Binning(self) if self.reads_frames else Accumulator(self)
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedSolver(Solver):
-    """A trained network as a method of solving; :func:`read_network` reads one.
-
-    Attributes
-    ----------
-    manifest
-        what it was trained for.
-    network
-        in the state of its file.
-    sides, patterns
-        factors and patterns that it was trained with.
-    """
+    """Trained network as a method of solving, with the factors and patterns of its training."""
 
     manifest: ModelManifest
     network: Method
@@ -86,65 +72,41 @@ class LearnedSolver(Solver):
         return f"{self.manifest.method} {digest.hexdigest()[:12]}"
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """The ``camera``'s model under ``patterns``, factorised, with doubts where it is not what the network knows.
+        """Factorise the camera's model, with doubts where it differs from the model of the training.
 
-        MitsimError for images of another size, other patterns, and another camera where the weights stand for one.
+        Raise MitsimError for images of another size, other patterns, and another camera where the weights belong to
+        one.
         """
         shape = camera.left.shape[1], camera.right.shape[1]
         if shape != self.network.shape:
+            (own_rows, own_columns), (rows, columns) = self.network.shape, shape
             raise MitsimError(
-                f"model {self.name}: makes images of {_size(self.network.shape)} pixels, but calibration {camera.name} "
-                f"has {_size(shape)}; train one for it"
+                f"model {self.name}: makes images of {own_rows} x {own_columns} pixels, but calibration {camera.name} "
+                f"has {rows} x {columns}; train one for it"
             )
         if not all(np.array_equal(own, other) for own, other in zip(self.patterns, patterns, strict=True)):
             raise MitsimError(
                 f"model {self.name}: was trained under the patterns {cut(self.manifest.patterns)}, and these are "
                 "others; capture those, or train one for these"
             )
-        other = self._other_camera(camera)
-        if other and self.network.holds_camera:
-            raise MitsimError(
-                f"model {self.name}: was trained for another camera ({other}), and its weights stand for that one; "
-                f"train one for calibration {camera.name}, or {UNROLLED} or {REFINED}, which serve others, flagged"
-            )
-        return _Doubted(
-            **vars(SOLVERS[TIKHONOV].init(camera, patterns)),
-            doubts=self._doubts(camera, other),
-            reads_frames=self.network.reads_frames,
-        )
-
-    def _other_camera(self, camera: Factors) -> str:
-        """By which names a ``camera`` is another than that of the pairs; empty where it is the same."""
-        ours, theirs = self.manifest.camera, camera.manifest.camera
-        others = [name for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]
-        return f"{', '.join(map(cut, others))} differ" if others else ""
-
-    def _doubts(self, camera: Factors, other: str) -> tuple[str, ...]:
-        """Sentences on what a ``camera`` differs in from that of the pairs, the names of an ``other`` one first."""
-        if other:
-            return (f"The network was trained for another camera: {other}.",)
-        difference = _difference(self.sides, camera.sides)
-        if difference > _SAME_CAMERA:
-            return (f"The network was trained with a calibration that differs by {difference:.1%}.",)
-        return ()
+        doubts, (ours, theirs) = list[str](), (self.manifest.camera, camera.manifest.camera)
+        if names := [cut(name) for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]:
+            other = f"{', '.join(names)} differ"
+            if self.network.holds_camera:
+                raise MitsimError(
+                    f"model {self.name}: was trained for another camera ({other}), and its weights stand for that one; "
+                    f"train one for calibration {camera.name}, or {UNROLLED} or {REFINED}, which serve others, flagged"
+                )
+            doubts.append(f"The network was trained for another camera: {other}.")
+        elif (difference := _difference(self.sides, camera.sides)) > _SAME_CAMERA:
+            doubts.append(f"The network was trained with a calibration that differs by {difference:.1%}.")
+        whole = SOLVERS[TIKHONOV].init(camera, patterns)
+        return _Doubted(**vars(whole), doubts=tuple(doubts), reads_frames=self.network.reads_frames)
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``.
-
-        Parameters
-        ----------
-        prepared, frames
-            what :meth:`init` gives, and all frames, added up.
-        lam, **iterative
-            ``auto`` and nothing: a network has none.
-
-        Raises
-        ------
-        MitsimError
-            for missing frames, no more data than unknowns, and an image that is not finite.
-        """
+        """Return the image of the frames; raise MitsimError if it is not finite."""
         problem = prepared.problem(frames)
         variance = datum_variance(problem)
         like = next(self.network.parameters())
@@ -165,7 +127,7 @@ class LearnedSolver(Solver):
                 f"The network was trained with noise of {low:.1e} to {high:.1e} of the light, and here it is "
                 f"{relative:.1e}."
             )
-        if beyond > UNEXPLAINED:  # within the model's range as outside of it
+        if beyond > UNEXPLAINED:
             flags.append(f"The image does not give the frames: {beyond:.1e} of them, beyond noise, are others.")
         return Solution(
             image=image,
@@ -181,46 +143,22 @@ class LearnedSolver(Solver):
         )
 
     def denoiser(self) -> Denoiser:
-        """What a plug-and-play network takes noise away by, for programs that call one as deepinv does. MitsimError of
-        other methods."""
         if not isinstance(self.network, PlugAndPlay):
             raise MitsimError(f"model {self.name}: has no denoiser; train {PLUG_AND_PLAY}")
         return Denoiser(self.network)
 
     def save(self, path: Path | str) -> None:
-        """Write the file ``path``, whole or not at all. MitsimError when it cannot be written."""
-        tensors = {
-            **dict(zip(SIDES, self.sides, strict=True)),
-            **dict(zip(_PATTERNS, self.patterns, strict=True)),
-        }
-        state = {name: values.cpu() for name, values in self.network.state_dict().items()}
+        tensors = dict(zip((*SIDES, *_PATTERNS), (*self.sides, *self.patterns), strict=True))
         held = {
             "manifest": json_text(self.manifest.model_dump()),
             "tensors": {name: torch.as_tensor(np.asarray(values, np.float64)) for name, values in tensors.items()},
-            "weights": state,
+            "weights": {name: values.cpu() for name, values in self.network.state_dict().items()},
         }
         write_tensors(path, held)
 
 
-_PATTERNS = ("P_L", "P_R")
-"""Tensors of the patterns' factors."""
-
-
 def read_network(path: Path | str, device: str) -> LearnedSolver:
-    """The network in a file of `mitsim train`.
-
-    Parameters
-    ----------
-    path
-        of the file.
-    device
-        of torch that it is to work on.
-
-    Raises
-    ------
-    MitsimError
-        for a file that cannot be read, is none of these, or has numbers that are not finite, and another device.
-    """
+    """Read a file of `mitsim train` for a device of torch; raise MitsimError for any other file."""
     if check_plain(path, "model").st_size > _MOST_BYTES:
         raise MitsimError(f"model {path}: is larger than {_MOST_BYTES >> 20} MiB; give a file of `mitsim train`")
     try:
@@ -234,7 +172,7 @@ def read_network(path: Path | str, device: str) -> LearnedSolver:
         finite = all(bool(values.isfinite().all()) for values in network.state_dict().values())
     except MitsimError:
         raise
-    except Exception as error:  # torch.load raises of all kinds
+    except Exception as error:  # torch.load raises errors of many classes
         raise MitsimError(
             f"model {path}: is no file of `mitsim train` ({cut(reason_of(error), 200)}); train one"
         ) from error
@@ -244,8 +182,10 @@ def read_network(path: Path | str, device: str) -> LearnedSolver:
 
 
 def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
-    """Write what is ``held`` to the file ``path``, for ``torch.load`` with ``weights_only``, whole or not at all.
-    MitsimError when it cannot be written: of a full disk torch itself says so in pages."""
+    """Write a file for ``torch.load`` as a whole; raise MitsimError if it cannot be written.
+
+    The buffer exists because torch reports a full disk with pages of text.
+    """
     buffer = BytesIO()
     torch.save(held, buffer)
     with whole_file(path) as part:
@@ -253,30 +193,22 @@ def write_tensors(path: Path | str, held: dict[str, Any]) -> None:
 
 
 def on_device(network: Method, device: str) -> Method:
-    """A ``network`` on a ``device`` of torch; ArgumentError for one that there is not, or that holds no numbers."""
     try:
         network.to(device)
         float(network.log_start.detach())
-    except (RuntimeError, AssertionError) as error:  # of torch: no device, none built in, and `meta`
+    except (RuntimeError, AssertionError) as error:  # torch: unknown device, none built in, and `meta`
         raise ArgumentError("device", f"{device!r}: cannot be used ({cut(reason_of(error))}); use cpu") from error
     return network
 
 
 def datum_variance(problem: DiagonalProblem) -> float:
-    """Noise variance of a datum of a ``problem`` [(electrons / s)^2], at least rounding's."""
     return max(noise_variance(problem), _NO_NOISE * problem.energy / problem.data_count)
 
 
 def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray) -> tuple[float, float]:
-    """Energy of the frames within the model's range that an image does not give, and the part of all energy that it
-    leaves beyond noise, rms.
+    """Return the energy of the frames, within the model's range, that an image (n, n') does not reproduce.
 
-    Parameters
-    ----------
-    prepared, problem
-        the model, and the data of the frames.
-    image
-        (n, n').
+    The second number is the rms part of the whole energy that is unexplained beyond the noise.
     """
     missed = float(np.square(problem.projected - problem.sigma * prepared.coefficients(image)).sum())
     beyond = max(missed - datum_variance(problem) * prepared.rank, 0.0)
@@ -284,12 +216,10 @@ def beyond_noise(prepared: Prepared, problem: DiagonalProblem, image: FloatArray
 
 
 def relative_noise(problem: DiagonalProblem) -> float:
-    """Noise of a datum of a ``problem`` over the rms of all data."""
     return float(np.sqrt(datum_variance(problem) * problem.data_count / problem.energy))
 
 
 def _difference(ours: Patterns, theirs: Patterns) -> float:
-    """||A - B|| / ||A|| of the models of two pairs of factors, as of Kronecker products."""
     if any(a.shape != b.shape for a, b in zip(ours, theirs, strict=True)):
         return 1.0
     own, other, both = (
@@ -297,7 +227,3 @@ def _difference(ours: Patterns, theirs: Patterns) -> float:
         for first, second in ((ours, ours), (theirs, theirs), (ours, theirs))
     )
     return float(np.sqrt(max(own + other - 2 * both, 0.0) / own))
-
-
-def _size(shape: tuple[int, int]) -> str:
-    return f"{shape[0]} x {shape[1]}"

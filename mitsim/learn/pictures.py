@@ -1,8 +1,8 @@
-"""Pictures to put on a sheet: a seed, or a folder of the user's, in; square pictures of eight bits out.
+"""Square pictures of eight bits for a sheet, drawn from a seed or cut from a folder of files.
 
-Drawn ones teach what natural pictures are: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes
-follow a power law, with soft edges, shades and a texture of 1/f amplitude; on some lie lines of letters, on some
-stripes and straight edges. A picture depends on the seed and its number alone. None is a photograph.
+Drawn pictures have the statistics of natural ones: leaves that hide each other (the dead leaves of Matheron, 1968),
+whose sizes follow a power law, with soft edges, shades and a texture of 1/f amplitude; some have lines of letters, and
+some stripes. A picture depends on the seed and its number alone. None is a photograph.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,67 +25,34 @@ from mitsim.core.seeds import stream
 from mitsim.learn.pair_request import picture_files
 
 Codes = npt.NDArray[np.uint8]
-"""(n, n) reflectance in steps of 1/255."""
 WHITE = 255
-"""Code of reflectance 1: what eight bits hold."""
 _OVER = 2
-"""Points a pixel and axis that a picture is drawn on: with soft edges enough (no difference is seen at 4)."""
+"""Points per pixel and axis that a picture is drawn on; four show no difference, because edges are soft."""
 _RADII = 0.015, 0.35
-"""Smallest and largest leaf, as parts of the side: two pixels of 128, and a third of the picture."""
+"""Smallest and largest leaf over the side: two pixels of 128, and a third of the picture."""
 _POWERS = 1.6, 3.2
-"""Power that the number of leaves falls with their radius by, drawn for each picture; natural pictures have about 3
+"""Power by which the number of leaves falls with their radius, drawn for each picture; natural pictures have about 3
 (Lee, Mumford and Huang, 2001), portraits and pictures of things have fewer small leaves."""
 _COVERED = 2.5
-"""Area of all leaves over that of the picture: one in a dozen points then shows the ground."""
 _MOST_LEAVES = 600
-"""Of a picture: more hide each other."""
 _SOFT = 0.3, 2.5
-"""Width of an edge in pixels, from sharp to out of focus; hard ones taught a network nothing."""
+"""Width of an edge in pixels, from sharp to out of focus, because a network learned nothing from hard ones."""
 _SHADE, _TEXTURE = 0.25, 0.12
-"""Largest change of brightness over a leaf, and largest rms of its texture, of a scale from black to white."""
 _DARKEST, _BRIGHTEST = (0.03, 0.15), (0.55, 0.95)
-"""What the darkest and the brightest point of a picture may be: print has some 0.03 to 0.95."""
 _LETTERS, _STRIPES = 0.2, 0.15
-"""Part of the pictures that have letters, and straight edges; chosen: as many as among pictures of everyday things."""
 _TAILS = 0.002
-"""Part of a drawn picture that is darker than its darkest, or brighter than its brightest: single points."""
-
-
-class Pictures(Protocol):
-    """Where pictures come from."""
-
-    @property
-    def source(self) -> str:
-        """What a store says that they are."""
-        ...
-
-    @property
-    def photographs(self) -> tuple[int, ...]:
-        """Return which photograph each file shows; () if every picture is drawn for itself."""
-        ...
-
-    def draw(self, number: int, n: int) -> Codes:
-        """Picture ``number`` of ``n`` pixels a side."""
-        ...
-
-
-# -------- Drawn by code
+_SMALLEST_CROP = 0.5
 
 
 @dataclass(frozen=True)
 class DrawnPictures:
-    """Pictures that are drawn from a ``seed``."""
+    """Pictures drawn from a seed."""
 
     seed: int
     photographs: ClassVar[tuple[int, ...]] = ()
-
-    @property
-    def source(self) -> str:
-        """What a store says that they are."""
-        return "drawn by code: dead leaves with soft edges, shades and 1/f texture, letters, stripes"
+    source: ClassVar[str] = "drawn by code: dead leaves with soft edges, shades and 1/f texture, letters, stripes"
 
     def draw(self, number: int, n: int) -> Codes:
-        """Picture ``number`` of ``n`` pixels a side."""
         rng = stream(self.seed, "picture", number)
         side = _OVER * n
         texture = pink_noise(side, rng)
@@ -104,15 +71,7 @@ class DrawnPictures:
 
 
 def pink_noise(side: int, rng: np.random.Generator) -> FloatArray:
-    """(side, side) periodic noise of mean 0 and rms 1 whose amplitude falls as one over the frequency.
-
-    Parameters
-    ----------
-    side
-        points along an axis.
-    rng
-        where it is drawn from.
-    """
+    """Draw periodic noise (side, side) of mean 0 and rms 1 whose amplitude falls as one over the frequency."""
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = np.inf
     noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((side, side))) / frequency, (side, side))
@@ -120,14 +79,12 @@ def pink_noise(side: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _ground(side: int, rng: np.random.Generator) -> FloatArray:
-    """A shade from one corner to another."""
     line = np.linspace(-0.5, 0.5, side)
     slopes = rng.uniform(-0.4, 0.4, 2)
     return np.asarray(rng.uniform(0.3, 0.7) + slopes[0] * line[:, None] + slopes[1] * line[None])
 
 
 def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generator) -> None:
-    """Leaves, the last on top, each in a box of its own."""
     side = len(canvas)
     power, roughness = rng.uniform(*_POWERS), rng.uniform(0.0, _TEXTURE)
     soft = _OVER * math.exp(rng.uniform(math.log(_SOFT[0]), math.log(_SOFT[1])))
@@ -135,7 +92,7 @@ def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generato
     for radius in radii:
         middle = rng.uniform(0, side, 2)
         shape, turn = rng.uniform(0.4, 1.0), rng.uniform(0, math.pi)
-        boxed = rng.random() < 0.35  # of rectangles; the others are ellipses
+        boxed = rng.random() < 0.35  # rectangles; the others are ellipses
         grey, slopes = rng.random(), rng.uniform(-_SHADE, _SHADE, 2) / (2 * radius)
         reach = radius * (math.sqrt(2) if boxed else 1.0) + soft
         (top, bottom), (left, right) = (
@@ -154,7 +111,6 @@ def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generato
 
 
 def _radii(power: float, rng: np.random.Generator) -> FloatArray:
-    """Radii of leaves as parts of the side, whose density falls by a ``power``, until they cover the picture."""
     low, high = (limit ** (1 - power) for limit in _RADII)
     radii = (low + (high - low) * rng.random(_MOST_LEAVES)) ** (1 / (1 - power))
     covered = np.cumsum(math.pi * np.square(radii))
@@ -162,7 +118,6 @@ def _radii(power: float, rng: np.random.Generator) -> FloatArray:
 
 
 def _lay_letters(canvas: FloatArray, rng: np.random.Generator) -> None:
-    """Lines of letters, in a part of the picture or all of it."""
     from PIL import Image, ImageDraw, ImageFont  # here: most pictures need none
 
     side = len(canvas)
@@ -178,7 +133,6 @@ def _lay_letters(canvas: FloatArray, rng: np.random.Generator) -> None:
 
 
 def _lay_stripes(canvas: FloatArray, rng: np.random.Generator) -> None:
-    """Stripes of one direction and width within a box, with edges a point wide."""
     side = len(canvas)
     top, left = (int(at) for at in rng.uniform(0, 0.5 * side, 2))
     box = canvas[top : top + int(rng.uniform(0.2, 0.5) * side), left : left + int(rng.uniform(0.2, 0.5) * side)]
@@ -194,17 +148,12 @@ def _codes(reflectance: FloatArray) -> Codes:
     return np.rint(WHITE * reflectance).astype(np.uint8)
 
 
-# -------- Of a folder
-
-_SMALLEST_CROP = 0.5
-"""Least side of a crop over that of the whole: so small that crops differ, so large that they are still pictures."""
-
-
 @dataclass(frozen=True)
 class FolderPictures:
-    """Grey pictures of the files in a ``folder``, in the order of their names; ``seed`` is of the crops.
+    """Grey pictures of the files in a folder, in the order of their names.
 
-    As many pictures as files are their middle squares; further ones are squares drawn from them, turned and mirrored.
+    The first pictures are the middle squares of the files; further ones are squares drawn from them, turned and
+    mirrored.
     """
 
     folder: Path
@@ -212,12 +161,11 @@ class FolderPictures:
 
     @cached_property
     def files(self) -> tuple[Path, ...]:
-        """The folder's pictures. MitsimError where there are none."""
         return picture_files(self.folder)
 
     @cached_property
     def source(self) -> str:
-        """What a store says that they are."""
+        """Number, folder and digest of the files, which a store states."""
         digest = hashlib.sha256()
         for path in self.files:
             digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())
@@ -225,15 +173,12 @@ class FolderPictures:
 
     @cached_property
     def photographs(self) -> tuple[int, ...]:
-        """Return the number of the first file that holds the same bytes as each file."""
+        """Number of the first file that holds the same bytes as each file."""
         digests = [hashlib.sha256(path.read_bytes()).digest() for path in self.files]
         return tuple(map(digests.index, digests))
 
     def draw(self, number: int, n: int) -> Codes:
-        """Picture ``number`` of ``n`` pixels a side.
-
-        MitsimError for a file that cannot be read, or has fewer pixels.
-        """
+        """Cut a picture of n pixels along each axis; raise MitsimError for a file that is unreadable or smaller."""
         path = self.files[number % len(self.files)]
         grey = read_reflectance(path)
         whole = min(grey.shape)
@@ -251,13 +196,8 @@ class FolderPictures:
 
 
 def _shrink(square: FloatArray, n: int) -> FloatArray:
-    """(n, n) means over equal parts of a ``square`` of at least ``n`` pixels a side."""
-    weights = _parts(len(square), n)
-    return np.asarray(weights @ square @ weights.T)
-
-
-def _parts(size: int, n: int) -> FloatArray:
-    """(n, size) part that each of ``size`` pixels has in each of ``n`` equal pieces of their line; rows sum to 1."""
+    size = len(square)
     edges = np.linspace(0, size, n + 1)
     below = np.clip(np.arange(size + 1)[None] - edges[:-1, None], 0, size / n)
-    return np.asarray(np.diff(below, axis=1) * n / size)
+    weights = np.diff(below, axis=1) * n / size
+    return np.asarray(weights @ square @ weights.T)

@@ -1,8 +1,8 @@
-"""A store of pairs and its camera's factors in, a trained network out: batches, steps, judgement, and going on later.
+"""Train a network on a store of pairs: sums of frames, batches, steps, judgement, and resumption.
 
-What frames say of an image is their sum W (:mod:`mitsim.learn.diagonal`), so the frames are read once, and a step takes
-as long under 49 patterns as under one. Every step draws from random streams of its own number, so a training that was
-cut short goes on bit-equal, at the same number of threads.
+What frames measure of an image is their sum W (:mod:`mitsim.learn.methods`). Frames are therefore read once, and a step
+takes as long under 49 patterns as under one. Every step draws from random streams of its own number, so that an
+interrupted training continues bit-equal at the same number of threads.
 """
 
 from __future__ import annotations
@@ -25,13 +25,9 @@ from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
-from mitsim.learn.critic import Critic
-from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, on_device, relative_noise, write_tensors
-from mitsim.learn.methods import CLASSES, Method, decibels
-from mitsim.learn.model_manifest import ModelManifest
-from mitsim.learn.networks import drawn_way, has_half
-from mitsim.learn.pair_store import PairStore
+from mitsim.learn.methods import BIN, CLASSES, Binning, Critic, Data, Diagonal, Method, decibels, drawn_way, has_half
+from mitsim.learn.pair_store import ModelManifest, PairStore
 from mitsim.learn.training_request import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
@@ -39,27 +35,21 @@ from mitsim.reconstruct.solver import Prepared
 from mitsim.reconstruct.solvers import SOLVERS
 
 _PART, _MOST = 16, 48
-"""One photograph in so many chooses the best step, and one gives the stated PSNR, up to so many pairs each: their mean
-PSNR is then known to 0.5 dB, and its change from step to step much better."""
+"""One photograph in 16 chooses the best step, and one judges, up to 48 pairs each: their mean PSNR is then known to 0.5
+dB, and its change from step to step much better."""
 _LOOKS = 20
-"""Times that the training is judged; a look takes a twentieth of the steps between two."""
 _PATIENCE = 6
-"""Looks without a better one after which it stops: the rate falls over the last two thirds of the cycle."""
 _GAIN_DB = 0.01
-"""What counts as better."""
 _RISING = 0.15
 """Part of the steps over which the learning rate rises; then it falls as a cosine to 0."""
 _DECAY, _BETAS, _LONGEST_GRADIENT = 1e-4, (0.9, 0.99), 1.0
-"""Of AdamW; and the norm to which gradients are cut, which keeps the first steps from running away."""
+"""Options of AdamW, and the norm to which gradients are cut, because the first steps would diverge otherwise."""
 _BASE_BYTES, _CHANNEL_BYTES, _HALF = 6e8, 100.0, 0.6
-"""Memory of torch; of a pixel that goes through a network with its gradient, a channel of the first level (76 measured
-at a width of 16, 96 at 24); and the part of it where half precision is used (0.55 measured)."""
+"""Memory of torch; memory of a pixel with its gradient for each channel of the first level (76 measured at a width of
+16, 96 at 24); and the part of it in half precision (0.55 measured)."""
 _FRAME_PIXELS = 8
-"""Bins of frames that take as much as a pixel of an image: half the width, on a quarter of the squares."""
 _LOOK = 0.05
-"""What a look adds to the steps before it; 0.04 measured of 48 pictures and 225 steps of 4."""
 _UNFINISHED = ".unfinished"
-"""Ending of the file beside a model's that a training goes on from."""
 
 
 # -------- Pairs
@@ -67,18 +57,18 @@ _UNFINISHED = ".unfinished"
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """What the frames of all pairs add up to.
+    """Sums of the frames of all pairs.
 
     Attributes
     ----------
     truths, weights, variances
-        (N, n, n'), (N, r, r') W, and (N,) of a datum's noise.
+        (N, n, n'), (N, r, r') W, and (N,) noise variance of a datum.
     noise
-        least and largest noise of a datum over its rms.
+        Smallest and largest noise of a datum over its rms.
     frames
-        (N, K, K', b, b') the frames, binned; None: for methods that read none.
+        (N, K, K', b, b') binned frames; None for methods that read none.
     photographs
-        (N,) number of the photograph that each pair shows; None: each its own.
+        (N,) number of the photograph that each pair shows; None if all differ.
     """
 
     truths: FloatArray
@@ -90,17 +80,6 @@ class Sums:
 
     @classmethod
     def of(cls, store: PairStore, prepared: Prepared, job: Job, keep: bool = False) -> Sums:
-        """Read all pairs.
-
-        Parameters
-        ----------
-        store, prepared
-            the pairs, and the model of their camera.
-        keep
-            whether frames are kept.
-        job
-            whose limits the time must keep, and who is told how far it is.
-        """
         count, started = len(store), time.perf_counter()
         truths, weights, variances, noise = [], [], np.empty(count), np.empty(count)
         kept: FloatArray | None = None
@@ -127,14 +106,8 @@ class Sums:
 def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
     """Return the numbers of the pairs that teach, that choose the best step, and that give the stated PSNR.
 
-    All pairs of a photograph go the same way, because a network that has learned one crop knows much of the next.
-
-    Parameters
-    ----------
-    photographs
-        (N,) number of the photograph that each pair shows; three at least.
-    seed
-        which photographs go which way.
+    `photographs` (N,) names the photograph of each pair. All pairs of a photograph belong to one part, because a
+    network that has learned one crop knows much of the next.
     """
     names = stream(seed, "judging").permutation(np.unique(photographs))
     count = min(max(len(names) // _PART, 1), _MOST)
@@ -148,15 +121,7 @@ def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, La
 
 @dataclass(eq=False)
 class Trainer:
-    """A network while it is trained.
-
-    Attributes
-    ----------
-    request, prepared, sums
-        how, and on what.
-    network
-        that is trained.
-    """
+    """Network in training."""
 
     request: Training
     prepared: Prepared
@@ -173,14 +138,12 @@ class Trainer:
         self.teaching, self.choosing, self.judging = part_photographs(photographs, self.request.seed)
 
     def rate(self, number: int) -> float:
-        """Learning rate of step ``number``."""
         part, rising = (number + 0.5) / self.request.steps, _RISING
         if part < rising:
             return self.request.rate * part / rising
         return self.request.rate * 0.5 * (1 + math.cos(math.pi * (part - rising) / (1 - rising)))
 
     def step(self, number: int) -> float:
-        """Take step ``number`` of all; what it made smaller."""
         random = stream(self.request.seed, "step", number)
         chosen = self.teaching[random.integers(len(self.teaching), size=self.request.batch)]
         truths, data = self.batch(chosen)
@@ -198,7 +161,6 @@ class Trainer:
         return loss
 
     def _gradients(self, truths: Tensor, data: Data, noise: torch.Generator) -> float:
-        """Leave the gradients of what a step makes smaller with the weights; return it."""
         self.optimiser.zero_grad()
         if self.critic is None:
             loss = self.network.loss(truths, data, self.model, noise)
@@ -211,7 +173,6 @@ class Trainer:
         return float(loss.detach())
 
     def batch(self, chosen: Any) -> tuple[Tensor, Data]:
-        """Truths (B, 1, n, n') and data of the pairs that are ``chosen``."""
         truths = torch.as_tensor(self.sums.truths[chosen])[:, None].to(self._like)
         data = Data.of(self.sums.weights[chosen], self.sums.variances[chosen], self._like)
         if self.sums.frames is None:
@@ -219,8 +180,10 @@ class Trainer:
         return truths, replace(data, frames=torch.as_tensor(self.sums.frames[chosen]).to(self._like))
 
     def _turn(self, truths: Tensor, data: Data, random: np.random.Generator) -> tuple[Tensor, Data]:
-        """The second half of a batch with turned pictures, and with what the frames held beside them: a store then
-        teaches as eight times as many pictures."""
+        """Turn the second half of a batch, with the data that its frames would give.
+
+        A store then teaches as eight times as many pictures.
+        """
         half = len(truths) // 2
         ways = [axis for axis in (-2, -1) if random.random() < 0.5]
         turned = truths[half:].flip(ways)
@@ -232,11 +195,10 @@ class Trainer:
         return torch.cat([truths[:half], turned]), Data(weights, data.deviation)
 
     def seconds_a_step(self) -> float:
-        """Seconds that a step takes, by one that changes nothing; with its part of a look."""
         truths, data = self.batch(self.teaching[: self.request.batch])
         self.network.train()
         taken = []
-        for _ in range(2):  # the first makes what later ones find
+        for _ in range(2):  # the first fills caches
             started = time.perf_counter()
             self._gradients(truths, data, torch.Generator().manual_seed(0))
             taken.append(time.perf_counter() - started)
@@ -244,7 +206,6 @@ class Trainer:
         return taken[-1] * (1 + _LOOK)
 
     def judge(self, pairs: Labels) -> float:
-        """Mean PSNR [dB] of some ``pairs``, by their numbers."""
         found = []
         self.network.eval()
         with torch.no_grad():
@@ -259,21 +220,7 @@ class Trainer:
 
 @dataclass(eq=False)
 class State:
-    """Where a training is.
-
-    Attributes
-    ----------
-    step
-        steps that are done.
-    curve
-        step, and mean PSNR [dB] of the pairs that choose after it; the first before any step.
-    best
-        weights after the best of these.
-    network, optimiser
-        weights, and what AdamW knows of them.
-    critic
-        the same of an adversary; empty where there is none.
-    """
+    """State of a training, which a file keeps between judgements; `best` has the weights after the best step."""
 
     step: int
     curve: list[tuple[int, float]]
@@ -284,93 +231,73 @@ class State:
 
     @classmethod
     def first(cls, trainer: Trainer) -> State:
-        """Before any step of a ``trainer``."""
-        weights = _copy(trainer.network)
-        curve = [(0, trainer.judge(trainer.choosing))]
-        return cls(0, curve, weights, weights, trainer.optimiser.state_dict(), _critic(trainer))
+        state = cls(0, [], {}, {}, {}, {})
+        state._judge(trainer)
+        return state
 
     def restore(self, trainer: Trainer) -> None:
-        """Put a ``trainer`` there."""
         trainer.network.load_state_dict(self.network)
         trainer.optimiser.load_state_dict(self.optimiser)
         if trainer.critic:
             trainer.critic.restore(self.critic)
 
     def is_over(self, steps: int) -> bool:
-        """Whether all ``steps`` are done, or the last looks brought nothing."""
+        """Return True if all steps are taken, or if the last judgements show no gain."""
         psnr = [value for _, value in self.curve]
         return self.step >= steps or max(psnr[:-_PATIENCE], default=-math.inf) > max(psnr[-_PATIENCE:]) - _GAIN_DB
 
     def go_on(self, trainer: Trainer, job: Job) -> None:
-        """Take the steps of a ``trainer`` up to its next look; ``job`` is told how far it is. MitsimError where numbers
-        run away."""
+        """Take the steps up to the next judgement; raise MitsimError if the loss is not finite."""
         steps = trainer.request.steps
         for number in range(self.step, min(self.step + max(steps // _LOOKS, 1), steps)):
             if not math.isfinite(trainer.step(number)):
                 raise MitsimError(f"training: its numbers ran away at step {number}; give a smaller rate")
             self.step = number + 1
             job.progress("train", self.step / steps)
-        self.curve.append((self.step, trainer.judge(trainer.choosing)))
+        self._judge(trainer)
         job.progress(f"train, {self.curve[-1][1]:.2f} dB", self.step / steps)
+
+    def _judge(self, trainer: Trainer) -> None:
+        self.curve.append((self.step, trainer.judge(trainer.choosing)))
         self.network, self.optimiser = _copy(trainer.network), trainer.optimiser.state_dict()
-        self.critic = _critic(trainer)
+        self.critic = trainer.critic.state() if trainer.critic else {}
         if self.curve[-1][1] >= max(value for _, value in self.curve):
             self.best = self.network
 
+    def write(self, path: Path, digest: str) -> None:
+        write_tensors(path, {"digest": digest, **vars(self)})
 
-@dataclass(frozen=True)
-class Unfinished:
-    """The file at ``path`` that an interrupted training goes on from; ``digest`` tells which one it is."""
-
-    path: Path
-    digest: str
-
-    def write(self, state: State) -> None:
-        """Keep a ``state``, whole or not at all."""
-        write_tensors(self.path, {"digest": self.digest, **vars(state)})
-
-    def read(self) -> State:
-        """The state that was kept; MitsimError where it is of another training, or cannot be read."""
+    @classmethod
+    def read(cls, path: Path, digest: str) -> State:
+        """Read a state; raise MitsimError if it cannot be read or belongs to another training."""
         try:
-            held = torch.load(self.path, map_location="cpu", weights_only=True)
+            held = torch.load(path, map_location="cpu", weights_only=True)
             own = held.pop("digest")
-            state = State(**held)
-        except Exception as error:  # torch.load raises of all kinds
-            raise MitsimError(f"{self.path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
-        if own != self.digest:
+            state = cls(**held)
+        except Exception as error:  # torch.load raises errors of many classes
+            raise MitsimError(f"{path}: cannot be read ({cut(reason_of(error), 200)}); remove it") from error
+        if own != digest:
             raise MitsimError(
-                f"{self.path}: is of a training of other pairs, factors or options, or of numbers of other precision "
+                f"{path}: is of a training of other pairs, factors or options, or of numbers of other precision "
                 "on another processor; give those, or remove it"
             )
         return state
 
 
-def _critic(trainer: Trainer) -> dict[str, Any]:
-    """State of what judges the images of a ``trainer`` beside their squared error."""
-    return trainer.critic.state() if trainer.critic else {}
-
-
 def _copy(network: Method) -> dict[str, Tensor]:
-    """The weights of a ``network`` as they are now."""
     return {name: values.detach().cpu().clone() for name, values in network.state_dict().items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A trained network, and how it came to be.
+    """Result of a training.
 
     Attributes
     ----------
-    model
-        the network.
     curve
-        step, and mean PSNR [dB] of the pairs that choose the best step after it; the first before any step.
+        Step, and mean PSNR [dB] after it of the pairs that choose the best step; the first before any step.
     psnr_before_db, psnr_db
-        mean PSNR of pairs that neither teach nor choose, before the first step and by the best weights.
-    predicted_seconds
-        of it all.
-    output
-        its file.
+        Mean PSNR of pairs that neither teach nor choose, before the first step and with the best weights.
     """
 
     model: LearnedSolver
@@ -381,7 +308,6 @@ class Trained:
     output: str
 
     def summary(self) -> dict[str, Any]:
-        """What the command line's JSON says of it."""
         return {
             "model": self.model.name,
             "weights": sum(values.numel() for values in self.model.network.parameters()),
@@ -403,24 +329,12 @@ def train_network(
 
     Parameters
     ----------
-    store, factors
-        the pairs, and the calibration of their camera that images will be made with.
-    request
-        the method, steps and seed.
+    factors
+        Calibration with which images will be reconstructed.
     output
-        the file; what a training goes on from stands beside it until it is over.
-    job
-        its limits, and who is told how far it is.
-    resume
-        whether to go on where an interrupted training of the same request stopped.
+        File of the network. The file from which a training resumes lies beside it until the end.
     sums
-        what the frames of these pairs add up to with these factors, where they were read before.
-
-    Raises
-    ------
-    MitsimError
-        for pairs and factors of two cameras, too few pairs, more time or memory than is allowed, another unfinished
-        training beside the output, or numbers that run away.
+        Sums of these pairs with these factors if they were read before.
     """
     job, output = job or Job(), Path(output)
     started = time.perf_counter()
@@ -433,9 +347,10 @@ def train_network(
     trainer, first = Trainer(request, prepared, sums, network), _copy(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
     half = has_half(trainer.model.sigma.device)
-    digest = _digest(request.model_dump(), factors.fingerprint, about, half)
-    unfinished = Unfinished(Path(f"{output}{_UNFINISHED}"), digest)
-    state = unfinished.read() if resume and unfinished.path.is_file() else State.first(trainer)
+    parts = request.model_dump(), factors.fingerprint, about, half
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    unfinished = Path(f"{output}{_UNFINISHED}")
+    state = State.read(unfinished, digest) if resume and unfinished.is_file() else State.first(trainer)
     state.restore(trainer)
     with job.clock.stage("train"):
         predicted = time.perf_counter() - started + trainer.seconds_a_step() * (request.steps - state.step)
@@ -443,7 +358,7 @@ def train_network(
         job.clock.predict({"train": predicted})
         while not state.is_over(request.steps):
             state.go_on(trainer, job)
-            unfinished.write(state)
+            state.write(unfinished, digest)
     network.load_state_dict(first)
     before = trainer.judge(trainer.judging)
     network.load_state_dict(state.best)
@@ -456,25 +371,17 @@ def train_network(
     )  # fmt: skip
     model = LearnedSolver(manifest, network.eval(), factors.sides, store.patterns)
     model.save(output)
-    unfinished.path.unlink(missing_ok=True)
+    unfinished.unlink(missing_ok=True)
     return Trained(model, tuple(state.curve), before, after, predicted, str(output))
 
 
 def first_network(request: Training, shape: tuple[int, int]) -> Method:
-    """The network before its first step.
-
-    Parameters
-    ----------
-    request, shape
-        the method, its seed and device, and (n, n') of its images. MitsimError for a device that there is not.
-    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(integer(request.seed, "weights"))
         return on_device(CLASSES[request.method](shape), request.device)
 
 
 def _check(store: PairStore, factors: Factors) -> None:
-    """MitsimError where a ``store`` has too few pairs, or the ``factors`` are of another camera."""
     if len(store) < FEWEST_PAIRS:
         raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
     if (count := len(np.unique(store.photographs))) < FEWEST_PHOTOGRAPHS:
@@ -492,7 +399,6 @@ def _check(store: PairStore, factors: Factors) -> None:
 
 
 def _memory(store: PairStore, network: Method, request: Training) -> Cost:
-    """Memory that training takes: sums of all pairs of a ``store``, and what a ``network`` keeps of a batch."""
     pixels = network.shape[0] * network.shape[1] * network.PASSES
     kept = 2 * network.shape[0] * network.shape[1]
     if network.reads_frames:
@@ -501,7 +407,3 @@ def _memory(store: PairStore, network: Method, request: Training) -> Cost:
     sums = 4.0 * len(store) * kept
     a_pixel = _CHANNEL_BYTES * network.WIDTH * (_HALF if has_half(next(network.parameters()).device) else 1.0)
     return Cost(memory_bytes=_BASE_BYTES + sums + a_pixel * request.batch * pixels)
-
-
-def _digest(*parts: object) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -1,7 +1,6 @@
-"""The grids that light of a bench is accumulated in, and one estimate of it: a sparse matrix by grid.
+"""Grids that accumulate the light of a bench, and one estimate of the light: a sparse matrix for each grid.
 
-A grid has cells, anchors and layers, and the optics that form frames of the light in it. :data:`GRIDS` is the table of
-them, in the order in which their frames are added up.
+A grid has cells, anchors and layers, and the optics that form frames. Frames are added in the order of :data:`GRIDS`.
 """
 
 from __future__ import annotations
@@ -28,26 +27,12 @@ from mitsim.optics.shadow import Places
 from mitsim.transport.records import Bundle, CellGrid, aligned_grid
 
 _AMBIENT_NM, _AMBIENT_BANDS = (400.0, 700.0), 13
-"""Ambient light: a flat spectrum of photons over what a camera with a usual filter sees, in bands of 23 nm, over which
-a shadow's fringes hardly move."""
+"""Range of a camera with a usual filter; a shadow's fringes hardly move over a band of 23 nm."""
 _MOST_ROWS = 2**12
-"""Rows of anchors times cells of sharp light: a class that lights them all is a matrix of 128 MiB."""
 
 
 class Grid:
-    """Cells that light is accumulated in, and the optics that form its frames; the optics are prepared on first use.
-
-    Parameters
-    ----------
-    bundle
-        cells, anchors and layers.
-    geometry
-        the camera.
-    spectrum
-        light whose diffraction is simulated; None: the mask's shadow is geometric.
-    places
-        rows and columns whose frames are formed; None: all.
-    """
+    """Cells that accumulate light, with optics for a spectrum (None: a geometric shadow) and some places."""
 
     def __init__(
         self, bundle: Bundle, geometry: CameraGeometry, spectrum: Spectrum | None, places: Places | None = None
@@ -56,17 +41,14 @@ class Grid:
 
     @property
     def key(self) -> tuple[Bundle, CameraGeometry, Spectrum | None, Places | None]:
-        """Equal for grids that form the same light alike."""
         return self.bundle, self._geometry, self._spectrum, self._places
 
     @property
     def of_mean(self) -> Grid:
-        """The same cells for what the sensor sees on average: with one anchor."""
         return Grid(replace(self.bundle, anchors=1), *self.key[1:])
 
     @cached_property
     def optics(self) -> FrameOptics:
-        """From light in these cells to frames."""
         bundle = self.bundle
         parts = bundle.rows, bundle.columns, bundle.depths, bundle.anchors
         return FrameOptics(self._geometry, *parts, self._spectrum, self._places)
@@ -74,22 +56,6 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridRow:
-    """One grid.
-
-    Attributes
-    ----------
-    name
-        of the grid.
-    key
-        in files of light.
-    bundle
-        its cells, anchors and layers.
-    formed
-        whether it holds light under some settings and physics.
-    lamps
-        whether it holds light of lamps too.
-    """
-
     name: str
     key: str
     bundle: Callable[[Grids], Bundle]
@@ -98,26 +64,16 @@ class GridRow:
 
 
 class Grids:
-    """What light of a bench with settings is accumulated in; optics are prepared when they are first asked for.
+    """Grids of a bench with settings.
 
     Parameters
     ----------
-    bench, settings
-        what is simulated, and how finely.
     pixels
-        cells a side of the projector's window, instead of one a pixel.
+        Cells along an axis of the projector's window, if not one for each pixel.
     one_line
-        whether diffraction is that of the light's mean wavelength alone: for what hardly hangs on it, in a third of the
-        time, and a mask that is drawn on a raster in a third of the cells.
+        Use the light's mean wavelength alone for diffraction: a third of the time where diffraction matters little.
     places
-        rows and columns whose frames are formed; None: all.
-
-    Attributes
-    ----------
-    physics
-        what is simulated of the bench.
-    grids
-        by name, as :data:`GRIDS` has them.
+        Rows and columns whose frames are formed; None for all.
     """
 
     def __init__(
@@ -146,13 +102,11 @@ class Grids:
 
     @cached_property
     def ambient(self) -> Mapping[str, Grid]:
-        """Grids of all light of lamps, by name."""
         counted_lamps = self._counted_lamps
         return self._of_lamps(counted_lamps.whole if counted_lamps else _bands(*_AMBIENT_NM, _AMBIENT_BANDS))
 
     @cached_property
     def by_band(self) -> tuple[Mapping[str, Grid], ...]:
-        """Of each row of lamps' light, such grids."""
         bands = self._counted_lamps.spectra if self._counted_lamps else ()
         return tuple(map(self._of_lamps, bands)) or (self.ambient,)
 
@@ -160,32 +114,21 @@ class Grids:
         return {row.name: self._grid(row, light) for row in GRIDS.values() if row.lamps}
 
     def _grid(self, row: GridRow, light: Spectrum | None = None) -> Grid:
-        """``light`` None: the projector's. All light diffracts or none."""
         spectrum = self.physics.spectrum
         return Grid(row.bundle(self), self.physics.geometry, (light or spectrum) if spectrum else None, self.places)
 
     @property
     def reach(self) -> float:
-        """Largest tan-angle, from the sensor's centre, of what its edge sees at the light's depth."""
+        """Largest tan-angle from the sensor's centre that the sensor's edge sees at the light's depth."""
         return self.physics.geometry.reach(self.settings.depth)
 
     def cells(self, subdivision: int = 1, width: int = 1, reach: float | None = None) -> CellGrid:
-        """Cells as far as the sensor's edge sees through the field stop, or to ``reach`` if that is farther.
-
-        The same for any number of anchors and layers, so that their light can be compared.
-
-        Parameters
-        ----------
-        subdivision, width
-            cells a side of a pixel, or pixels a side of a cell.
-        reach
-            tan-angle from the sensor's centre.
-        """
+        """Return the cells that the sensor's edge sees through the field stop, or to the tan-angle `reach`."""
         depth, farthest = self.settings.depth, max(self.reach, reach or 0.0)
         return aligned_grid(*self.bench.windows_at(depth), -(-self._pixels // width), subdivision, farthest)
 
     def mean_weights(self, anchors: int) -> FloatArray:
-        """(anchors,) weight of each of so many ``anchors`` in the mean over the sensor."""
+        """Return the weight (anchors,) of each anchor in the mean over the sensor."""
         edges = self.physics.geometry.pixel_edges
         positions = anchor_positions(anchors, self.physics.geometry.half_width)
         return np.asarray(anchor_weights(positions, (edges[:-1] + edges[1:]) / 2).mean(axis=0))
@@ -206,7 +149,6 @@ def _coarse(made: Grids, anchors: int) -> Bundle:
 
 
 def _wide(made: Grids) -> Bundle:
-    """Coarse cells, or cells of several pixels in one layer."""
     settings, width = made.settings, made.settings.followed_width
     if width == 1:
         return _coarse(made, settings.followed_anchors)
@@ -215,7 +157,6 @@ def _wide(made: Grids) -> Bundle:
 
 
 def _sharp(made: Grids) -> Bundle:
-    """The sharp pixels' part of the fine cells, or of coarser ones where the anchors are too many."""
     settings, sharp = made.settings, made.settings.sharp
     if sharp is None:
         return Bundle(made.aim, 1, (settings.depth,), lamps=made.lamp_rows)
@@ -246,11 +187,9 @@ _ROWS = (
     GridRow("indirect", "smooth", lambda made: _coarse(made, 1), lambda settings, physics: physics.interreflection),
 )  # fmt: skip
 GRIDS: Mapping[str, GridRow] = MappingProxyType({row.name: row for row in _ROWS})
-"""The grids by name."""
 
 
 def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
-    """Equal photons in ``count`` bands between two wavelengths, each taken at its centre."""
     edges = np.linspace(low_nm, high_nm, count + 1)
     return Spectrum((edges[:-1] + edges[1:]) / 2, np.full(count, 1 / count))
 
@@ -258,24 +197,19 @@ def _bands(low_nm: float, high_nm: float, count: int) -> Spectrum:
 # -------- One estimate of the light
 
 MEAN_GRIDS = ("fine", "indirect")
-"""Grids of what the sensor sees on average."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightEstimate:
-    """Light by grid (:data:`mitsim.light.grids.GRIDS`), (classes + 1, places) each, the last row ambient light
-    [W m^-2], or one of the last for each band of its wavelengths.
+    """Light by grid, (classes + 1, places) each [W m^-2]; the last row, or one for each band, is ambient light.
 
     Attributes
     ----------
-    light
-        by the name of the grid; of all grids.
     received, outside
-        all light, a mean over the sensor without its mask, and what of it came from beyond all cells: it is in no
-        frame [W m^-2].
+        Mean of all light over the sensor without its mask, and the part beyond all cells, which is in no frame [W
+        m^-2].
     flux
-        (n^2,) irradiance of each projector pixel's direct light on the sensor, its mean, without the mask [W m^-2];
-        None where no pass told it.
+        (n^2,) mean irradiance of each projector pixel's direct light without the mask [W m^-2], if measured.
     """
 
     light: Mapping[str, sparse.csr_array]
@@ -293,22 +227,18 @@ class LightEstimate:
         return LightEstimate(*(_divide(getattr(self, each.name), count) for each in fields(self)))
 
     def with_light(self, light: Mapping[str, sparse.csr_array]) -> LightEstimate:
-        """The same with other ``light`` in some grids."""
         return replace(self, light={**self.light, **light})
 
     @property
     def rows(self) -> int:
-        """Classes, and rows of ambient light."""
         return int(self.light[MEAN_GRIDS[0]].shape[0])
 
     @property
     def totals(self) -> FloatArray:
-        """(rows,) light of each row, a mean over the sensor, but for pixels that are traced apart [W m^-2]."""
         return np.asarray(reduce(add, (self.light[grid].sum(axis=1) for grid in MEAN_GRIDS)), dtype=np.float64)
 
 
 def _sum(one: Any, other: Any) -> Any:
-    """Of numbers, matrices, or several of them; a matrix to which nothing is added is not copied."""
     if one is None or other is None:
         return one if other is None else other
     if isinstance(one, Mapping):
@@ -319,7 +249,6 @@ def _sum(one: Any, other: Any) -> Any:
 
 
 def _divide(light: Any, count: float) -> Any:
-    """Numbers or matrices over ``count``; SciPy would copy where a matrix has its light, which lines may share."""
     if light is None:
         return None
     if isinstance(light, Mapping):

@@ -1,4 +1,4 @@
-"""Light of a scene: from a bench and an accuracy to sampled light, its frames and their error."""
+"""Light of a scene: sampled to an accuracy, with its frames and their error."""
 
 from __future__ import annotations
 
@@ -30,37 +30,32 @@ from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames
 
 Target = Callable[[ExpectedFrames], float]
-"""The relative Monte Carlo error to stop at, from the frames seen so far."""
+"""Relative Monte Carlo error at which sampling stops, from the frames so far."""
 _TOLD, _OF_HEAVY = 1.2, 0.55
-"""Bound over error beyond which a few heavy paths make most of either, so that both tell little of the light: four
-groups of many paths have 1.04 to 1.3, 1.15 in the middle. A heavy path counts for less among more of them, so the bound
-then falls with their number to the power 0.8 to 0.93 in place of 0.5 (cookie_bag, seeds 2 and 4): less than its power
-of 0.55 is missing."""
+"""Ratio of bound and error beyond which a few heavy paths dominate both (1.04 to 1.3 for four groups of many paths).
+The bound then falls with the paths to the power 0.8 to 0.93 instead of 0.5 (cookie_bag, seeds 2 and 4)."""
 _VIEW_SAMPLES = 64
-"""Samples a cell of a picture to look at: below the step of eight bits."""
 _LOST = 0.1
-"""Part of the accuracy that light beyond all cells may have: it falls on one edge of the sensor, so a hundredth of the
-pixels may have it, and their frames are then off by ten times as much."""
+"""Part of the accuracy that light beyond all cells may take. A hundredth of the pixels may have all of it, and be wrong
+by ten times as much."""
 _BY_CHANCE = 1.5
-"""Ratio of the variance over 49 shots to that over 16 of them which four groups of equal shots exceed by chance in one
-of fifty (20000 trials: 1.37 in one of twenty, 1.57 in one of a hundred)."""
+"""Ratio of variances over 49 and 16 shots that four groups of equal shots exceed once in fifty (20000 trials)."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How light is sampled.
+    """Options of sampling.
 
     Attributes
     ----------
     purpose
-        names the random streams: light for two purposes shares none.
+        Name of the random streams: lights for two purposes share none.
     by_pixel
-        keep the light of every projector pixel apart, for any family; else by the lighting's classes, which is faster.
+        Keep the light of every projector pixel apart, for any family; by the lighting's classes is faster.
     target
-        error to stop at, where the plan's own is not wanted.
+        Error at which to stop, instead of the plan's.
     excess
-        from lights of all lines, by how much the error of frames that are made of them together exceeds theirs, as a
-        ratio; None: they are frames of their own.
+        Returns the ratio of the error of frames made of all lines to that of the lines' frames.
     """
 
     purpose: str = "scene"
@@ -71,17 +66,7 @@ class Sampling:
 
 @dataclass(frozen=True, eq=False)
 class FrameCheck:
-    """What a look at the error of frames found, for who forms them.
-
-    Attributes
-    ----------
-    groups, simulation
-        that it was a look at.
-    rows
-        class of each row of theirs.
-    probed
-        of its :class:`ExpectedFrames`.
-    """
+    """Result of a check of the frames' error, for reuse when frames are formed."""
 
     groups: tuple[LightEstimate, ...]
     simulation: Simulation
@@ -89,15 +74,7 @@ class FrameCheck:
     probed: FloatArray
 
     def at(self, light: SampledLight, rows: Labels, classes: int) -> FloatArray | None:
-        """``probed`` where it is of a ``light`` whose rows belong to these of so many classes; else None.
-
-        Parameters
-        ----------
-        light
-            whose frames are to be formed.
-        rows, classes
-            class of each of its rows, and their number.
-        """
+        """Return ``probed`` if it belongs to a light whose rows belong to these classes; else None."""
         same = light.groups is self.groups and light.simulation is self.simulation and len(self.probed) == classes
         return self.probed if same and np.array_equal(rows, self.rows) else None
 
@@ -109,30 +86,18 @@ class SampledLight:
     Attributes
     ----------
     groups
-        independent estimates.
-    simulation
-        what was simulated; it turns light into frames.
-    plan, seed
-        what it was traced for, and the root of its random streams.
+        Independent estimates.
     labels
-        (n^2,) row of each projector pixel: its class, or the pixel itself when any family is to be formed.
-    flux
-        (n^2,) irradiance that each pixel's direct light casts on the sensor without the mask, mean over the sensor.
-    flux_error
-        (n^2,) its standard error, from the spread of the groups.
-    paths
-        connections and paths traced.
+        (n^2,) row of each projector pixel: its class, or the pixel itself if any family is to be formed.
+    flux, flux_error
+        (n^2,) irradiance of each pixel's direct light without the mask, mean over the sensor, and its standard error.
     sampling_error
-        relative Monte Carlo error of the frames that were checked; ``reached`` tells whether it met the target.
+        Relative Monte Carlo error of the checked frames; ``reached`` tells whether it met the target.
     samples
-        of each group, by the name of the pass; empty where nobody kept them.
-    looked
-        what the last look at its error found.
-    known_truth
-        :attr:`apparent`, where it was traced with that of other lines.
+        Samples of each group by pass; empty if not kept.
     restated
-        factor of the Monte Carlo error over that by the differences of the groups. Sampling stops where these happen to
-        be small; so what an earlier look predicted, whose differences did not end it, counts as much where it is more.
+        Factor of the Monte Carlo error over that from the groups' differences. Sampling stops where these happen to be
+        small; therefore a larger error that an earlier check predicted counts too.
     """
 
     groups: tuple[LightEstimate, ...]
@@ -155,13 +120,11 @@ class SampledLight:
 
     @property
     def lost(self) -> float:
-        """Part of the light that came from beyond all cells and is in no frame."""
         outside = sum(group.outside for group in self.groups)
         return outside / sum(group.received for group in self.groups) if outside else 0.0
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why what is made of it is flagged: by its plan, and for light that is known to be missing."""
         if self.lost <= _LOST * self.plan.accuracy:
             return self.plan.warnings
         return (
@@ -172,42 +135,25 @@ class SampledLight:
 
     @property
     def unreached(self) -> tuple[str, ...]:
-        """That sampling stopped before the accuracy was reached, if it did."""
         if self.reached:
             return ()
         return (f"sampling stopped at {self.sampling_error:.1e}; the accuracy {self.plan.accuracy:g} was not reached",)
 
     @property
     def error_bound(self) -> float:
-        """What the relative error of the frames that the light was traced for is below at 95 %: by sampling, and by
-        all that its plan left out or made coarse."""
+        """Upper limit (95 %) of the frames' relative error from sampling and from the plan's omissions."""
         target = self.plan.sampling_target
         sampling = max(self.sampling_error, target) if self.reached else self.sampling_error
         return self.plan.total(Estimate(self.sampling_error, sampling)).bound
 
     @property
     def bench(self) -> Apparatus:
-        """Where it shines."""
         return self.simulation.bench
 
     def frames(self, lighting: Lighting, seed: int, leaking: bool = True) -> ExpectedFrames:
-        """Expected frames of some shots.
+        """Return the expected frames of some shots; raise ValueError if they split a class of the light.
 
-        Light by pixel serves every family; light by class only families that never split one of its classes.
-
-        Parameters
-        ----------
-        lighting
-            the shots.
-        seed
-            of the probes that tell their error.
-        leaking
-            whether black pixels leak, as :func:`mitsim.light.simulation.expected_of` takes it.
-
-        Raises
-        ------
-        ValueError
-            for shots that split a class of the light.
+        `seed` is that of the probes that measure the error.
         """
         rows = self.rows_of(lighting)
         probed = self.looked.at(self, rows, lighting.weights.shape[1]) if self.looked and seed == self.seed else None
@@ -215,7 +161,6 @@ class SampledLight:
 
     @check_arguments
     def rows_of(self, lighting: Lighting) -> Labels:
-        """(rows,) class of ``lighting`` that each row of the light belongs to; ValueError as :meth:`frames`."""
         rows = np.zeros(int(self.labels.max()) + 1, dtype=np.int64)
         rows[self.labels] = lighting.labels
         if not np.array_equal(rows[self.labels], lighting.labels):
@@ -223,7 +168,6 @@ class SampledLight:
         return rows
 
     def summary(self) -> dict[str, Any]:
-        """What the command line reports, but for the file's name."""
         return {
             "n": self.bench.n,
             "shape": list(self.bench.geometry.frame_shape),
@@ -240,30 +184,25 @@ class SampledLight:
 
     @check_arguments
     def behind(self, bench: Apparatus) -> SampledLight:
-        """The same light before the camera of another ``bench``, of which only the mask may differ: light is traced up
-        to it."""
+        """Return the same light before the camera of another bench, of which only the mask may differ."""
         return replace(self, simulation=Simulation(bench, self.simulation.settings))
 
     @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:
-        """Contrast of speckle in frames of a ``family`` (None: of a white picture); 0 where it is left out."""
+        """Return the contrast of speckle in frames of a family (None for a white picture); 0 if speckle is off."""
         return self.bench.speckle(family) if self.simulation.physics.speckle else 0.0
 
     def merge(self) -> SampledLight:
-        """The same light as one group: frames come without a variance, and faster."""
+        """Return the light as one group, whose frames form faster but have no variance."""
         return replace(self, groups=(reduce(add, self.groups) / len(self.groups),))
 
     @cached_property
     def apparent(self) -> Truth:
-        """What a perfect image of this light would show, with its standard error; traced on its own."""
         return self.known_truth or trace_truth(self.bench, self.plan.settings, self.seed, self.flux_error)
 
     @property
     def truth(self) -> FloatArray:
-        """(n, n) apparent reflectance: each projector pixel's flux toward the camera over that of the board.
-
-        The board is the session's: one of reflectance 0.99 counts as 1.
-        """
+        """Apparent reflectance (n, n), relative to the session's board: a board of reflectance 0.99 counts as 1."""
         return self.apparent.reflectance
 
 
@@ -278,22 +217,9 @@ def trace_light(
     sampling: Sampling | None = None,
     progress: Progress = silent,
 ) -> SampledLight:
-    """Trace until the Monte Carlo error of the frames meets its target, or the limit of 2^32 paths.
+    """Trace until the Monte Carlo error of the lighting's frames meets its target, or to 2^32 paths.
 
-    Each group gets the same number of samples; after each round a look at all shots, or a few, tells the error.
-
-    Parameters
-    ----------
-    bench, plan
-        what is traced.
-    lighting
-        whose frames are to meet the target.
-    seed
-        root of the random streams.
-    sampling
-        target, accumulation and streams.
-    progress
-        is called with how near the target is.
+    Each group gets the same samples. After each round the error of all shots, or of a few, is checked.
     """
     (light,) = trace_lines(bench, (bench,), plan, lighting, seed, sampling, progress)
     return light
@@ -309,17 +235,9 @@ def trace_lines(
     sampling: Sampling | None = None,
     progress: Progress = silent,
 ) -> list[SampledLight]:
-    """Light of each line of a projector, from paths that all lines share; as :func:`trace_light`, until the frames of
-    every line meet the target.
+    """Trace each line's light from shared paths until the frames of every line meet the target.
 
-    Parameters
-    ----------
-    bench
-        what is traced: its lines, or light that is not told apart.
-    benches
-        the same with each of its lines alone; ``bench`` itself where light is not told apart.
-    plan, lighting, seed, sampling, progress
-        as for :func:`trace_light`.
+    `benches` has the bench with each line alone, or `bench` itself if lines are not separated.
     """
     sampling = sampling or Sampling()
     simulation = Simulation(bench, plan.settings)
@@ -367,17 +285,7 @@ def trace_lines(
 
 @single_threaded_blas()
 def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "scene") -> SampledLight:
-    """The paths of a light, traced again and accumulated by another ``simulation``, as far as it has their tracers.
-
-    Parameters
-    ----------
-    light
-        with its samples.
-    simulation
-        of the same scene.
-    purpose
-        of the light, which names its random streams.
-    """
+    """Trace the paths of a light again and accumulate them by another simulation of the same scene."""
     groups = Group.all_of(simulation, light.labels, light.seed, purpose)
     trace_groups(groups, light.samples)
     estimates = tuple(group.light() for group in groups)
@@ -385,12 +293,10 @@ def traced_again(light: SampledLight, simulation: Simulation, purpose: str = "sc
 
 
 def _report(progress: Progress, reached: float, part: float) -> None:
-    """Tell ``progress`` that a ``part`` of a round is traced, which is to bring what was ``reached`` to the whole."""
     progress("transport", reached + (1 - reached) * part)
 
 
 def _line_of(groups: Sequence[Group], line: int, simulation: Simulation, plan: Plan, seed: int) -> SampledLight:
-    """What groups know of the light of a ``line``, whose frames a ``simulation`` forms; its error is not known yet."""
     estimates = tuple(group.light(line) for group in groups)
     flux = _flux(estimates, np.zeros(simulation.bench.n**2))
     return SampledLight(
@@ -409,7 +315,6 @@ def _line_of(groups: Sequence[Group], line: int, simulation: Simulation, plan: P
 
 
 def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArray]:
-    """Of each estimate; none, in an array ``like`` that, where no pass tells it."""
     return [np.zeros_like(like) if each.flux is None else each.flux for each in estimates]
 
 
@@ -418,9 +323,6 @@ def _flux(estimates: Sequence[LightEstimate], like: FloatArray) -> list[FloatArr
 
 @dataclass(frozen=True)
 class _Check:
-    """A ``light`` with the Monte Carlo error of the frames, what that is below at 95 %, and the variance that each part
-    of the light brings, by the name of the pass, up to one factor."""
-
     light: SampledLight
     bound: float
     variances: Mapping[str, float]
@@ -431,7 +333,6 @@ Parts = Mapping[str, Sequence[LightEstimate]]
 
 
 def _parts(groups: Sequence[Group], line: int) -> Parts:
-    """Those of a ``line`` in ``groups``."""
     return {name: [group.part(name, line) for group in groups] for name in groups[0].done}
 
 
@@ -443,9 +344,10 @@ def _checks(
     enough: float,
     predicted: Mapping[int, float],
 ) -> dict[int, _Check]:
-    """What :func:`_check` finds of the light of each line and its ``parts``, by its number: of the noisiest first, and
-    of the others when its bound is ``enough``, as long as theirs are; else all are traced on whatever theirs is. No
-    error counts without what the look before has ``predicted``."""
+    """Check the noisiest line first, and the others once its bound meets `enough`.
+
+    No error counts for less than the previous check predicted.
+    """
     noise = [float(np.square(light.flux_error).sum() / (np.square(light.flux).sum() or 1.0)) for light in lines]
     checks = {}
     for line in sorted(range(len(lines)), key=lambda line: -noise[line]):
@@ -456,17 +358,6 @@ def _checks(
 
 
 def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool, predicted: float) -> _Check:
-    """A look at the frames of a light.
-
-    Parameters
-    ----------
-    light, parts, lighting
-        whose frames of which shots.
-    followed
-        whether it is light over several surfaces.
-    predicted
-        error by the look before; where it is larger, the error is the root mean square of both.
-    """
     shots, classes = lighting.weights.shape
     whole = tells_all(classes, shots, light.bench.geometry.frame_side)
     seen = lighting if whole else _some(lighting, MOST_CHECKED if followed else CHECKED_SHOTS)
@@ -490,22 +381,20 @@ def _check(light: SampledLight, parts: Parts, lighting: Lighting, followed: bool
 
 
 def _excess(seen: float, error: float, target: float) -> float:
-    """By how much the next round is to lower what is ``seen`` of an ``error`` to come to the ``target``, as a ratio."""
+    """Return the ratio by which the next round must lower the error to meet the target."""
     return min(seen / target, max(_TOLD * error / target, math.pow(seen / target, _OF_HEAVY)))
 
 
 def _some(lighting: Lighting, count: int) -> Lighting:
-    """So many shots of a ``lighting``, evenly spread."""
     shots = len(lighting.weights)
     return lighting.shots(np.unique(np.linspace(0, shots - 1, min(shots, count)).astype(int)))
 
 
 def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) -> tuple[float, float]:
-    """How much larger the error of all shots of a ``lighting``, and its bound, are than those of the shots
-    ``check_arguments``.
+    """Return how much the error of all shots, and its bound, exceed those of the checked shots.
 
-    By what the groups of the ``light`` differ in the total light of each shot: a heavy path that no checked shot sees
-    shows there, without forming a frame. What may be chance counts as 1.
+    The groups' differences in total light show a heavy path that no checked shot sees. Growth within chance counts as
+    1.
     """
     rows = np.zeros(int(light.labels.max()) + 1, dtype=np.int64)
     rows[light.labels] = lighting.labels
@@ -526,17 +415,7 @@ def _error_growth(light: SampledLight, lighting: Lighting, checked: Lighting) ->
 
 
 def pinhole_view(bench: Apparatus, board_reflectance: float, seed: int) -> FloatArray:
-    """(rows, columns) apparent reflectance seen from the sensor's centre under uniform light, for people to look at.
-
-    Direct light, two cells a side of a projector pixel; 0 where the projector does not light the board.
-
-    Parameters
-    ----------
-    bench, seed
-        what is looked at, and the root of the random streams.
-    board_reflectance
-        of the board that counts as 1.
-    """
+    """Return the apparent reflectance (rows, columns) of direct light seen from the sensor's centre, for a preview."""
     settings = Settings(depth=bench.geometry.scene_distance)
 
     def view(which: Apparatus) -> FloatArray:

@@ -1,9 +1,7 @@
-"""Light by projector pixel in, an HDF5 file out, of which NumPy and SciPy form the frame of any pattern; and back.
+"""Light by projector pixel in an HDF5 file, from which NumPy and SciPy form the frame of any pattern.
 
-A frame is dense: through a mask each projector pixel lights most of the sensor. What is sparse is the light before the
-mask, from each projector pixel to the directions and depths at which it is seen. The file holds that as sparse
-matrices, and the mask's shadow as pairs of dense factors. docs/exchange.md has the layout, and the lines that make a
-frame of it. Beside them it keeps the plan and what else a bench needs to expose the light again.
+Frames are dense, but light before the mask is sparse. The file has sparse matrices for the light, dense factors for the
+mask's shadow, and the plan for exposing the light again. docs/exchange.md has the layout.
 """
 
 from __future__ import annotations
@@ -34,30 +32,18 @@ if TYPE_CHECKING:
 
 
 LAYOUT, LAYOUT_OF_TWO_SIDES = 1, 2
-"""Numbers of the layouts that are written here: attribute `mitsim_transport` of the file. The second has anchors'
-weights for columns too, where these do not lie as rows do."""
+"""The second version has separate weights of anchors for columns."""
 _KEPT = "kept"
-"""Group of what only mitsim reads."""
 _COPIES = 4
-"""Bytes of memory that a byte of the file takes: numbers of 32 bits become such of 64, and rows are joined."""
+"""Bytes of memory for a byte of the file, because numbers are widened and rows joined."""
 _SPECULAR_BYTES = 2**31
-"""Frames of light over mirrors that are formed at once, one a projector pixel."""
+"""Memory of frames of light over mirrors, one for each projector pixel."""
 
 
 def write_light(path: Path, light: SampledLight) -> None:
-    """Write a light to one file, whole or not at all.
+    """Write light by projector pixel to one file as a whole.
 
-    Parameters
-    ----------
-    path
-        of the file, which is replaced.
-    light
-        by projector pixel.
-
-    Raises
-    ------
-    MitsimError
-        for light by class, for too many projector pixels that shine over mirrors, and a file that cannot be written.
+    Raise MitsimError for light by class, too many projector pixels with light over mirrors, or an unwritable file.
     """
     count = light.bench.n**2
     if not np.array_equal(light.labels, np.arange(count)):
@@ -81,7 +67,6 @@ def write_light(path: Path, light: SampledLight) -> None:
 
 
 def _keep(group: h5py.Group, light: SampledLight) -> None:
-    """What a bench needs to expose a ``light`` again, in a ``group``."""
     facts = {name: getattr(light, name) for name in ("paths", "reached", "restated")}
     group.attrs.update({**facts, "samples": json.dumps(dict(light.samples))})
     for name in ("flux", "flux_error"):
@@ -96,19 +81,9 @@ def _keep(group: h5py.Group, light: SampledLight) -> None:
 
 
 def read_light(path: Path, bench: Apparatus) -> SampledLight:
-    """The light of a file that :func:`write_light` made, to single precision.
+    """Read a file of :func:`write_light`, to single precision, for the bench on which the light was traced.
 
-    Parameters
-    ----------
-    path
-        of the file.
-    bench
-        that the light was traced on.
-
-    Raises
-    ------
-    MitsimError
-        for a file that cannot be read or is none of light, and light of another bench or version of mitsim.
+    Raise MitsimError for an unreadable or other file, and for light of another bench or version of mitsim.
     """
     with hdf5_errors(path), checked_hdf5(path, lambda _: _COPIES) as file:
         if _KEPT not in file:
@@ -136,17 +111,6 @@ def read_light(path: Path, bench: Apparatus) -> SampledLight:
 
 
 def _groups_of(light: h5py.Group, lamps: h5py.Group, name: str, size: int, count: int) -> list[sparse.csr_array]:
-    """The light of each group in the cells of a grid.
-
-    Parameters
-    ----------
-    light, lamps
-        of the projector's pixels and of lamps, each by grid, where there is any.
-    name, size
-        of the grid, and its cells.
-    count
-        projector pixels.
-    """
     key, rows = GRIDS[name].key, (count, 1)
     parts = [
         _read_matrix(place[key], (GROUPS * each, size)) if key in place else sparse.csr_array((GROUPS * each, size))
@@ -161,7 +125,6 @@ def _groups_of(light: h5py.Group, lamps: h5py.Group, name: str, size: int, count
 
 
 def _read_matrix(group: h5py.Group, shape: tuple[int, int]) -> sparse.csr_array:
-    """The matrix of that ``shape`` in a ``group``; ValueError for another, or a damaged one."""
     stored = tuple(group.attrs["shape"].tolist())
     if stored != shape:
         raise ValueError(f"{group.name} is {stored}, and the plan has {shape}")
@@ -173,7 +136,6 @@ def _read_matrix(group: h5py.Group, shape: tuple[int, int]) -> sparse.csr_array:
 
 
 def _numbers(values: h5py.Dataset, shape: tuple[int, ...]) -> FloatArray:
-    """Finite numbers of that ``shape``; ValueError for others."""
     found = np.asarray(values[:], dtype=np.float64)
     if found.shape != shape or not np.isfinite(found).all():
         raise ValueError(f"{values.name} holds other than {shape} finite numbers")
@@ -181,7 +143,6 @@ def _numbers(values: h5py.Dataset, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _facts(light: SampledLight) -> dict[str, Any]:
-    """Attributes of the file."""
     bench, plan, devices = light.bench, light.plan, light.bench.devices
     rows, columns = bench.geometry.frame_shape
     joule = electrons_from_irradiance(1.0, 1.0, devices.sensor, devices.projector.effective_wavelength_nm)
@@ -207,7 +168,6 @@ def _facts(light: SampledLight) -> dict[str, Any]:
 
 
 def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
-    """A sparse ``matrix`` as its three arrays, and its shape, in a ``group``."""
     group.attrs["shape"] = matrix.shape
     parts = {"data": np.float32, "indices": np.int64 if matrix.shape[1] > 2**31 else np.int32, "indptr": np.int64}
     for name, kind in parts.items():
@@ -215,7 +175,6 @@ def _write_matrix(group: h5py.Group, matrix: sparse.csr_array) -> None:
 
 
 def _write_shadow(group: h5py.Group, grid: Grid) -> None:
-    """What makes frames of light in the cells of a ``grid``."""
     bundle, geometry, spectrum, _ = grid.key
     layers = [shadow_terms(geometry, bundle.rows, bundle.columns, depth, spectrum) for depth in bundle.depths]
     for side, name in enumerate(("left", "right")):
@@ -234,7 +193,6 @@ def _write_shadow(group: h5py.Group, grid: Grid) -> None:
 
 
 def _ambient(light: SampledLight) -> FloatArray:
-    """(groups, m, m') irradiance of lamps by each group of a ``light``."""
     frames = np.zeros((len(light.groups), *light.bench.geometry.frame_shape))
     for accumulated in light.simulation.with_optics(light.groups, light.bench.n**2)[1]:
         for frame, group in zip(frames, accumulated.groups, strict=True):
@@ -244,7 +202,6 @@ def _ambient(light: SampledLight) -> FloatArray:
 
 
 def _specular(path: Path, light: SampledLight) -> sparse.csr_array | None:
-    """(n^2, m m') irradiance of each projector pixel over mirrors alone; None without such light."""
     if not light.simulation.physics.mirrors:
         return None
     (rows, columns), count = light.bench.geometry.frame_shape, light.bench.n**2

@@ -1,7 +1,6 @@
-"""The passes that light is traced in, one row each: what traces it, where its light is accumulated, its cost.
+"""Passes in which light is traced: for each its tracer, the grid of its light, and its cost.
 
-:data:`PASSES` is read by all that enumerates light: tracing, accumulation, rounds of sampling, costs, pilot, plans and
-files. A new pass is a row here, and its tracer.
+Everything that enumerates light reads :data:`PASSES`. A new pass is a row here, and its tracer.
 """
 
 from __future__ import annotations
@@ -28,61 +27,54 @@ from mitsim.transport.path_reuse import PathReuseTracer
 # -------- What traces
 
 FromCamera = FromCameraTracer | CombinedTracer
-"""What follows light from the camera's side."""
 PassTracer = DirectTracer | IndirectTracer | FromCamera
-"""What traces a pass."""
 
 
 class Tracers(Grids):
-    """What is traced of a bench with settings; its parameters are those of :class:`mitsim.light.grids.Grids`.
+    """Tracers of a bench with settings.
 
     Attributes
     ----------
     divides
-        whether light that shading normals make heavy is divided between both sides, as it is in a run; of the camera's
-        part a short look would meet a few paths, or none.
+        Divide light that shading normals make heavy between both sides. Off for a short pilot, which would meet few
+        paths of the camera's part.
     """
 
     divides = True
 
     @cached_property
     def setup(self) -> OpticalSetup:
-        """What light is traced in."""
         return replace(self.bench.setup, projector=self.physics.projector, geometry=self.physics.geometry)
 
     # ---- Direct light
 
     @cached_property
     def direct(self) -> DirectTracer:
-        """Follows direct light from the projector to the sensor's centre, or to all of it where anchors are used."""
+        """Direct light to the sensor's centre, or to all of the sensor where anchors are used."""
         return self._direct(1, spread=self.settings.anchors > 1)
 
     @property
     def spread(self) -> DirectTracer:
-        """Follows direct light to random points of the sensor."""
         return self._direct(1, spread=True)
 
     @cached_property
     def anchored(self) -> DirectTracer | None:
-        """The same to every anchor, but for occluded pixels."""
         settings = self.settings
         return self._direct(settings.anchors, settings.with_own_anchors) if settings.anchors > 1 else None
 
     @cached_property
     def anchored_occluded(self) -> DirectTracer | None:
-        """Follows direct light of occluded pixels to anchors of their own; none where there are none."""
+        """Direct light of occluded pixels to anchors of their own."""
         settings = self.settings
         others = np.setdiff1d(np.arange(self.bench.n**2), settings.with_own_anchors)
         return self._direct(settings.occluded_anchors, others) if settings.with_own_anchors else None
 
     @cached_property
     def sharp(self) -> AimedTracer | None:
-        """Follows direct light of the sharp pixels to their anchors; none where there are none."""
         sharp = self.settings.sharp
         return AimedTracer(self.setup, sharp.anchors, np.array(sharp.pixels)) if sharp else None
 
     def _direct(self, anchors: int, without: Labels | tuple[int, ...] = (), spread: bool = False) -> DirectTracer:
-        """Of all pixels that are not sharp, ``without`` some."""
         sharp = self.settings.sharp
         absent = np.union1d(without, sharp.pixels if sharp else ()).astype(np.int64)
         pixels = np.setdiff1d(np.arange(self.bench.n**2), absent) if len(absent) else None
@@ -92,19 +84,18 @@ class Tracers(Grids):
 
     @cached_property
     def indirect(self) -> IndirectTracer | None:
-        """Follows light over several surfaces from the projector to the sensor's centre, or to all of it where it has
-        anchors; none where there is none."""
+        """Light over several surfaces, to the points of :attr:`direct`."""
         tracer, repeats = self._indirect(self._mean_points, self.settings.shared), self.settings.repeats
         return tracer.with_adaptive_counts(repeats) if tracer and repeats else tracer
 
     @cached_property
     def from_camera(self) -> FromCamera | None:
-        """Follows all other light, from the same points; none where there is none."""
+        """All other light, from the same points."""
         return self._from_camera(self._mean_points)
 
     @cached_property
     def at_anchors(self) -> tuple[IndirectTracer | None, FromCamera | None]:
-        """Both, to every anchor of followed light."""
+        """Both to every anchor of followed light."""
         points = self._points(self.settings.followed_anchors)
         return self._indirect(points), self._from_camera(points)
 
@@ -112,7 +103,6 @@ class Tracers(Grids):
 
     @cached_property
     def glare(self) -> CombinedTracer | None:
-        """Follows light that the projector's lens scatters, to the same points; none where it scatters none."""
         scattered = replace(self.setup, projector=self.setup.projector.scattered)
         if scattered.projector.share == 0:
             return None
@@ -126,7 +116,7 @@ class Tracers(Grids):
 
     @property
     def lamps_apart(self) -> bool:
-        """Whether lamps' paths are followed for no light of the projector."""
+        """True if lamps' paths carry no light of the projector."""
         return not self._from_camera_of_projector
 
     @property
@@ -135,7 +125,6 @@ class Tracers(Grids):
 
     @property
     def _steep(self) -> bool:
-        """Whether shading normals or hair may make light of the projector's side heavy."""
         loaded = self.bench.loaded
         return self.physics.interreflection and ((self.divides and loaded.smoothed) or loaded.hairy)
 
@@ -145,7 +134,6 @@ class Tracers(Grids):
     def _indirect(
         self, points: SensorPoints, shared: bool = False, setup: OpticalSetup | None = None
     ) -> IndirectTracer | None:
-        """In the ``setup``, if not in that of all light that the lens does not scatter."""
         # Light that the lens scatters is followed from the projector alone.
         paths = Paths(self.physics.mirrors, self.physics.interreflection, steep=self._steep and setup is None)
         if not (paths.mirrors or paths.interreflection):
@@ -181,39 +169,32 @@ FOLLOWED = names(lambda effect: effect.followed)
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass.
+    """Row of the table of passes.
 
     Attributes
     ----------
-    name
-        of the pass.
     stream
-        name of its random numbers: a seed, so that the same seed gives the same frames as in earlier versions.
-    tracer
-        makes what traces it; None where there is no such light.
+        Name of the random stream, which never changes, so that the same seed gives the same frames.
     unit_cost
-        seconds of a path, or of a connection to one anchor, by which plans compare their choices.
-    grid
-        that its light is accumulated in (:data:`mitsim.light.grids.GRIDS`).
-    indirect_grid
-        that its light over several surfaces is accumulated in, if not there too.
+        Time of a path, or of a connection to one anchor [s].
+    grid, indirect_grid
+        Grid of its light, and of its light over several surfaces if another.
     anchors
-        setting that counts its anchors; what is accumulated is then the residual, light beyond its mean over them.
+        Setting that counts its anchors. The pass then accumulates the residual over their mean.
     effects
-        of which one at least calls for it; none: it is always traced.
+        Effects of which one requires the pass; empty if always traced.
     even
-        whether its samples are points of a Sobol sequence alone, so that their number matters: direct light's.
+        True if samples are points of a Sobol sequence alone, so that their number matters.
     variance_rate
-        power of the samples that its variance falls with.
+        Power of the samples with which the variance falls.
     flux
-        whether it tells the flux of each projector pixel.
+        True if the pass measures the flux of each projector pixel.
     device
-        whether its light is added up on the device: wherever the sums have ``room``, or where that ``pays`` too, as its
-        paths are many for its cells; none: on the host.
+        Add light on the device: ``room`` if the sums fit, ``pays`` if it also saves time; None for the host.
     pilot
-        run of the pilot that measures its noise (:mod:`mitsim.planner.pilot`).
+        Run of the pilot that measures its noise.
     key
-        of its samples in plans, where that is not its name.
+        Key of its samples in plans, if not its name.
     """
 
     name: str
@@ -233,30 +214,25 @@ class Pass:
 
     @property
     def samples_key(self) -> str:
-        """Of its samples in plans."""
         return f"{self.key or self.name}_samples"
 
     @property
     def grids(self) -> tuple[str, ...]:
-        """All that its light is accumulated in; the last is the one on the device."""
+        """All grids of its light; the last is the one on the device."""
         return tuple(filter(None, (self.grid, self.indirect_grid)))
 
     def called_for(self, effects: frozenset[str]) -> bool:
-        """Whether ``effects`` call for it."""
         return not self.effects or bool(self.effects & effects)
 
     def predicted_samples(self, settings: Settings) -> float:
-        """Samples of a group that ``settings`` predict."""
         return settings.samples.get(self.name, 1.0)
 
     def whole(self, samples: Number) -> Number:
-        """Samples that are traced where so many ``samples`` are needed: one at least, and whole."""
         least = np.maximum(samples, 1.0)
         return even(least) if self.even else np.ceil(least)
 
     def connections(self, counts: object) -> Number:
-        """Connections of each path, where ``counts`` has the number of anchors as settings call it; 0 for a residual
-        over one anchor."""
+        """Return the connections of each path; 0 for a residual over one anchor."""
         if not self.anchors:
             return 1.0
         count = np.asarray(getattr(counts, self.anchors), dtype=np.float64)
@@ -264,7 +240,7 @@ class Pass:
 
 
 def even(samples: Number) -> Number:
-    """The least 2^k or 3 * 2^k from ``samples`` on: so many points of a Sobol sequence are spread evenly."""
+    """Return the next 2^k or 3 * 2^k, because so many points of a Sobol sequence are evenly spread."""
     power = np.exp2(np.floor(np.log2(np.maximum(samples, 1.0))))
     found = np.where(samples <= power, power, np.where((samples <= 1.5 * power) & (power > 1), 1.5 * power, 2 * power))
     return found if isinstance(samples, np.ndarray) else float(found)
@@ -290,13 +266,11 @@ _ROWS = (
     Pass("glare", "glare", lambda made: made.glare, 3e-7, "fine", "indirect",
          effects=frozenset({"glare"})),
 )  # fmt: skip
-"""In the order in which they are traced and their light is added up. Unit costs were chosen near what was measured of
-eight shipped scenes on two cores (plans at 1e-3, November 2026); only their ratios decide. Direct light takes half as
-much where one cell a pixel holds it, and more in many fine ones."""
+"""Frames are added in this order. Unit costs are near the times of eight shipped scenes on two cores; only their ratios
+matter."""
 
 
 def table_of(*rows: Pass) -> Mapping[str, Pass]:
-    """The ``rows`` by name, which is theirs alone, as is their stream."""
     for what in ("name", "stream"):
         values = [getattr(row, what) for row in rows]
         twice = next((value for value in values if values.count(value) > 1), None)
@@ -306,6 +280,4 @@ def table_of(*rows: Pass) -> Mapping[str, Pass]:
 
 
 PASSES = table_of(*_ROWS)
-"""All passes by name."""
 EVEN = frozenset(row.name for row in PASSES.values() if row.even)
-"""Passes of direct light; all others follow it further."""

@@ -1,7 +1,7 @@
-"""Sampling: independent estimates of the light, traced pass by pass in rounds, and how many samples a round takes.
+"""Independent estimates of the light, traced pass by pass in rounds.
 
-A further round buys what is missing where that takes least: light that brings much noise for its work grows, other
-light stays as it is. Work is that of paths at fixed paces: the same seed must mean the same samples.
+A round adds samples where they reduce the variance most for their work. Work is counted at fixed paces, because the
+same seed must give the same samples.
 """
 
 from __future__ import annotations
@@ -28,30 +28,10 @@ from mitsim.transport.records import PathSamples
 # -------- Independent estimates
 
 Accumulation = Callable[[], None]
-"""Adds light of one line to what a group has."""
 
 
 class Group:
-    """One independent estimate of the light, by line and pass: the mean over its samples so far.
-
-    Parameters
-    ----------
-    simulation
-        what is traced.
-    labels
-        (n^2,) class of each projector pixel.
-    seed
-        of its random streams.
-    lines
-        that share the paths.
-
-    Attributes
-    ----------
-    done
-        samples of each pass by its name.
-    paths
-        that were traced.
-    """
+    """One independent estimate of the light by line and pass: the mean over its samples so far."""
 
     def __init__(self, simulation: Simulation, labels: Labels, seed: int, lines: int = 1) -> None:
         self.simulation, self.labels = simulation, labels
@@ -62,28 +42,10 @@ class Group:
 
     @classmethod
     def all_of(cls, simulation: Simulation, labels: Labels, seed: int, purpose: str, lines: int = 1) -> list[Group]:
-        """Every group of a light.
-
-        Parameters
-        ----------
-        simulation, labels, lines
-            as for one.
-        seed, purpose
-            root of the random streams, and what names them.
-        """
         return [cls(simulation, labels, integer(seed, "transport", purpose, group), lines) for group in range(GROUPS)]
 
     def trace(self, wanted: Mapping[str, int], accumulating: Behind[Accumulation]) -> None:
-        """Trace until so many samples as are ``wanted`` of each pass by its name are done.
-
-        Parameters
-        ----------
-        wanted
-            samples.
-        accumulating
-            what light is accumulated by while the next is traced: that takes one processor, and a tracer waits for its
-            last paths. All is there when it has been waited for.
-        """
+        """Trace until each pass has the wanted samples; `accumulating` adds light meanwhile."""
         at_once = min(PATHS_AT_ONCE, self.simulation.paths_at_once)
         for name, each in self.simulation.passes.items():
             samples = wanted.get(name, 0)
@@ -109,7 +71,6 @@ class Group:
         return [partial(self._add, name, line, light, samples) for line, light in enumerate(by_line)]
 
     def _spread(self, name: str, growth: float) -> None:
-        """Make the light of a pass the mean over so many times the samples, of which no others are there yet."""
         for means in self._means:
             means[name] /= growth
 
@@ -118,26 +79,16 @@ class Group:
         means[name] = means[name] + light if name in means else light
 
     def light(self, line: int = 0) -> LightEstimate:
-        """Mean over the samples, of a ``line``."""
         return reduce(add, self._means[line].values())
 
     def part(self, name: str, line: int = 0) -> LightEstimate:
-        """The same of one pass by its ``name``, of a ``line``."""
         return self._means[line][name]
 
 
 def trace_groups(
     groups: Sequence[Group], wanted: Mapping[str, int], report: Callable[[float], None] = lambda part: None
 ) -> None:
-    """Trace until all groups have as many samples as are wanted, accumulated.
-
-    Parameters
-    ----------
-    groups, wanted
-        what is traced, and samples of each pass by its name.
-    report
-        is called with the part that is traced, between groups.
-    """
+    """Trace and accumulate until all groups have the wanted samples."""
     with Behind[Accumulation](lambda accumulation: accumulation()) as accumulating:
         for number, group in enumerate(groups):
             if number:
@@ -149,23 +100,19 @@ def trace_groups(
 # -------- Samples of the next round: from the variance that each pass leaves, and its cost
 
 _LARGEST_GROWTH = 8
-"""Most that samples of even numbers grow by in one round."""
 _LEAST_LESS, _MOST_LESS = 1.1, 6.0
-"""By how much a round lowers the variance, as a ratio: least, as each costs a look; and most, because the first rounds
-know their error badly."""
+"""Least and largest reduction of the variance in a round: each costs a check, and the first know their error badly."""
 _BEYOND = 1.05
-"""Variance that the error asks for over what is aimed at, so that another round is rare."""
+"""Variance permitted by the error over the aim, so that another round is rare."""
 _UNEVEN = 1.2
-"""Variance of 3 * 2^k samples of direct light over what that of 2^k says, whose variance falls with their power 1.5: 24
-to 32 samples left 0.49 to 0.58, 32 to 48 0.64 to 0.70, 32 to 64 0.36 (cookie_bag, metal_blade)."""
+"""Variance of 3 * 2^k samples over that interpolated from 2^k (power 1.5): 0.49 to 0.70 measured, and 0.36 for doubling
+(cookie_bag, metal_blade)."""
 _FIRST = 0.8
-"""Part of the samples that the plan predicts with which sampling begins where most paths are of followed light: the
-prediction is safe. At 0.7 the corner needed a second round for the last tenth, by each of three seeds, which costs a
-look more: 4 to 17 % of its processor seconds and of the cookie bag's."""
+"""Part of the predicted samples in the first round of followed light. At 0.7 the corner needed a second round, whose
+check costs 4 to 17 % of the time."""
 
 
 def first_samples(simulation: Simulation) -> dict[str, int]:
-    """Samples of a group with which sampling begins in a ``simulation``, by the name of what is traced."""
     part = _FIRST if _mostly_followed(simulation) else 1.0
     return {name: int(PASSES[name].whole(part * each.predicted)) for name, each in simulation.passes.items()}
 
@@ -173,18 +120,9 @@ def first_samples(simulation: Simulation) -> dict[str, int]:
 def next_samples(
     simulation: Simulation, done: Mapping[str, int], variances: Mapping[str, float], excess: float
 ) -> dict[str, int]:
-    """Samples of a group after the next round, by the name of what is traced.
+    """Return the samples of a group after the next round.
 
-    Parameters
-    ----------
-    simulation
-        whose light is traced.
-    done
-        samples so far.
-    variances
-        of the frames by each light, up to one factor.
-    excess
-        by how much the error is to be lowered, as a ratio.
+    `variances` are those by each pass, up to one factor; `excess` is the ratio by which the error must fall.
     """
     work = _work(simulation)
     lights = [SampledPass(name, count, variances[name], work[name]) for name, count in done.items()]
@@ -194,30 +132,19 @@ def next_samples(
 
 
 def error_left(done: Mapping[str, int], samples: Mapping[str, int], variances: Mapping[str, float]) -> float:
-    """Return the relative error that more samples leave of that which fewer left.
-
-    Parameters
-    ----------
-    done, samples
-        of a group before and after, by the name of the pass.
-    variances
-        that those done left, up to one factor.
-    """
+    """Return the ratio of the errors after and before more samples."""
     left = [SampledPass(name, done[name], variances[name], 1.0).variance_left(samples[name]) for name in done]
     return math.sqrt(sum(left) / (sum(variances.values()) or 1.0))
 
 
 @dataclass(frozen=True)
 class SampledPass:
-    """A pass by ``name``: samples ``done``, the variance that they leave, and the work of one."""
-
     name: str
     done: int
     variance: float
     work: float
 
     def variance_left(self, samples: int) -> float:
-        """Variance of so many ``samples``."""
         rate = PASSES[self.name].variance_rate
         if rate == 1:
             return self.variance * self.done / samples
@@ -225,12 +152,11 @@ class SampledPass:
 
     @property
     def gain(self) -> float:
-        """By how much a sample more lowers the variance, for its work."""
+        """Return the reduction of the variance by one more sample, over its work."""
         return self.variance / (self.done * self.work)
 
     @property
     def steps(self) -> list[int]:
-        """Even numbers of samples from those done to as many as a round may come to."""
         found = [self.done]
         while (following := int(even(found[-1] + 1.0))) <= _LARGEST_GROWTH * self.done:
             found.append(following)
@@ -238,8 +164,7 @@ class SampledPass:
 
 
 def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str, int]:
-    """Samples of ``lights`` by name that leave the ``allowed`` variance together with the least work, none fewer than
-    are done; all that a round may take where nothing leaves so little."""
+    """Return the samples of least work whose joint variance is `allowed`, or all that a round may take."""
     stepped = [light for light in lights if light.name in EVEN]
     others = [light for light in lights if light.name not in EVEN]
     best, least = {light.name: light.steps[-1] for light in stepped}, math.inf
@@ -257,10 +182,10 @@ def cheapest_samples(lights: Sequence[SampledPass], allowed: float) -> dict[str,
 
 
 def _shared_out(lights: Sequence[SampledPass], allowed: float) -> dict[str, int] | None:
-    """As :func:`cheapest_samples`, where any number of samples serves; None where nothing leaves so little.
+    """Return the cheapest samples if any number serves.
 
-    Samples of those that grow go with sqrt(variance of one / work of one), by Lagrange; a light whose next sample gains
-    less for its work than theirs rests.
+    By Lagrange, samples that grow go with sqrt(variance of one / work of one). A light whose next sample gains less
+    rests.
     """
     found = {light.name: light.done for light in lights}
     if sum(light.variance for light in lights) <= allowed:
@@ -278,12 +203,10 @@ def _shared_out(lights: Sequence[SampledPass], allowed: float) -> dict[str, int]
 
 
 def _of_even(samples: int, rate: float) -> float:
-    """Variance of so many even ``samples``, to any scale, which falls with that ``rate``."""
     return float(samples**-rate) * (1.0 if samples & (samples - 1) == 0 else _UNEVEN)
 
 
 def _work(simulation: Simulation) -> dict[str, float]:
-    """Seconds by the table's unit costs of a sample of each pass."""
     return {
         name: PASSES[name].unit_cost
         * each.tracer.paths_per_sample
@@ -293,7 +216,6 @@ def _work(simulation: Simulation) -> dict[str, float]:
 
 
 def _mostly_followed(simulation: Simulation) -> bool:
-    """Whether most paths that a plan predicts are of light over several surfaces."""
     paths = {
         name: int(PASSES[name].whole(each.predicted)) * each.tracer.paths_per_sample
         for name, each in simulation.passes.items()

@@ -1,8 +1,7 @@
-"""A bench under one choice of settings: its passes traced, their light accumulated, and frames of it formed.
+"""A bench under one choice of settings: trace its passes, accumulate their light, and form frames.
 
 An effect that is off takes its neutral value here and nowhere else: a pinhole for the lens, a thin mask, a geometric
-shadow. :mod:`mitsim.planner.pilot` switches effects on and off to see what they are worth; :mod:`mitsim.light.light`
-samples the choice that the plan made.
+shadow.
 """
 
 from __future__ import annotations
@@ -29,32 +28,19 @@ from mitsim.transport.indirect import IndirectTracer
 from mitsim.transport.records import DIRECT, INDIRECT, Bundle, PathSamples
 
 _FEWEST_AT_ONCE = 2**18
-"""Paths that are held in memory at a time at least, 130 MB: so many take far longer than launching them."""
 
 
 @dataclass(frozen=True)
 class TracedPass:
-    """A pass with its tracer, and the samples of a group that the plan predicted."""
-
     row: Pass
     tracer: PassTracer
     predicted: float
 
     @property
     def whole(self) -> int:
-        """Samples of a group with which the prediction is kept."""
         return int(self.row.whole(self.predicted))
 
     def trace(self, seed: int, first: int, samples: int, accumulator: DeviceAccumulator | None = None) -> PathSamples:
-        """Light of some samples, but for what is added up in the ``accumulator``.
-
-        Parameters
-        ----------
-        seed, first, samples
-            as for :meth:`mitsim.transport.integrator.Tracer.trace`.
-        accumulator
-            of :meth:`Simulation.accumulator`.
-        """
         if accumulator is None:
             return self.tracer.trace(seed, first, samples)
         assert isinstance(self.tracer, DirectTracer | IndirectTracer), "the others have none"
@@ -62,13 +48,10 @@ class TracedPass:
 
 
 class Simulation(Tracers):
-    """A bench with settings: what is traced of it, and frames of what was accumulated. Its parameters are those of
-    :class:`mitsim.light.grids.Grids`.
-    """
+    """Tracers of a bench with settings, and frames of accumulated light."""
 
     @cached_property
     def passes(self) -> Mapping[str, TracedPass]:
-        """What is traced, by name, in the order of :data:`mitsim.light.passes.PASSES`."""
         found = {}
         for row in PASSES.values():
             several = not row.anchors or getattr(self.settings, row.anchors) > 1
@@ -78,31 +61,19 @@ class Simulation(Tracers):
 
     @cached_property
     def paths_at_once(self) -> int:
-        """Paths whose light is held in memory at a time: as many as a pass is predicted to need, within limits; rounds
-        that turn out to need more take no more memory."""
+        """Paths whose light is held at a time: those predicted, within limits."""
         most = max(each.whole * each.tracer.paths_per_sample for each in self.passes.values())
         paths_per_sample = max(each.tracer.paths_per_sample for each in self.passes.values())
         return max(min(max(most, _FEWEST_AT_ONCE), PATHS_AT_ONCE), paths_per_sample)
 
     def follow(self, seed: int, samples: int) -> PathSamples:
-        """Light of :attr:`indirect` and :attr:`from_camera` in ``samples`` of each from ``seed``."""
         tracers = [tracer for tracer in (self.indirect, self.from_camera) if tracer is not None]
         return PathSamples.join([tracer.trace(seed, 0, samples) for tracer in tracers])
 
     # ---- Accumulation
 
     def accumulator(self, name: str, labels: Labels, lines: int) -> DeviceAccumulator | None:
-        """What light of the lines is added up in on the device; none where the pass has none, or no room.
-
-        Parameters
-        ----------
-        name
-            of the pass.
-        labels
-            (n^2,) class of each projector pixel.
-        lines
-            their number.
-        """
+        """Return the accumulator of the lines' light on the device; None if the pass has none, or no room."""
         each, bundle = self.passes[name], self.grids[PASSES[name].grids[-1]].bundle
         if not each.row.device:
             return None
@@ -116,19 +87,7 @@ class Simulation(Tracers):
         return DeviceAccumulator(bundle, labels, each.tracer.board, lines)
 
     def accumulate(self, name: str, found: PathSamples | DeviceSums, labels: Labels, samples: int) -> LightEstimate:
-        """Light of a pass per sample: by grid, beyond its mean over the anchors where these have a residual.
-
-        Parameters
-        ----------
-        name
-            of the pass.
-        found
-            paths' light on the host, or sums of an :meth:`accumulator`.
-        labels
-            (n^2,) class of each projector pixel.
-        samples
-            that were traced.
-        """
+        """Return the light of a pass per sample, by grid, as a residual over the anchors where the pass has one."""
         row = PASSES[name]
         if isinstance(found, DeviceSums):
             return self._of_sums(row, found, labels, samples)
@@ -163,17 +122,13 @@ class Simulation(Tracers):
         return self._estimate({grid: light}, float(by_pixel.sum()), float(beyond.sum()), flux)
 
     def _pixels_of(self, row: Pass) -> Labels:
-        """Projector pixels that a pass traces."""
         sharp = self.settings.sharp if row.grid == "sharp" else None
         return np.array(sharp.pixels if sharp else range(self.bench.n**2), dtype=np.int64)
 
     def _residual(self, bundle: Bundle, light: sparse.csr_array) -> sparse.csr_array:
-        """``light`` beyond its mean over the sensor."""
         return light - bundle.repeat(bundle.average(light, self.mean_weights(bundle.anchors)))
 
     def flux(self, mean: PathSamples, samples: int) -> FloatArray:
-        """(n^2,) irradiance of each projector pixel's direct light, of a ``mean`` over the sensor in so many
-        ``samples``."""
         value = mean.value * (mean.kind == DIRECT) / samples
         return np.asarray(np.bincount(mean.pixel, value, minlength=self.bench.n**2 + 1)[:-1], dtype=np.float64)
 
@@ -184,7 +139,6 @@ class Simulation(Tracers):
         outside: float = 0.0,
         flux: FloatArray | None = None,
     ) -> LightEstimate:
-        """``light`` in some grids, and none in the others; all else as :class:`LightEstimate` has it."""
         rows = next(iter(light.values())).shape[0]
         every = {
             name: light[name] if name in light else sparse.csr_array((rows, grid.bundle.size))
@@ -197,13 +151,7 @@ class Simulation(Tracers):
     def with_optics(
         self, groups: Sequence[LightEstimate], first: int
     ) -> tuple[list[AccumulatedLight], list[AccumulatedLight]]:
-        """Light of the projector and ambient light, with the optics that form their frames.
-
-        Parameters
-        ----------
-        groups, first
-            independent estimates of the light, and the first row of ambient light in them.
-        """
+        """Return light of the projector and ambient light, whose first row is `first`, with their optics."""
         lights = [
             AccumulatedLight(self.grids[row.name].optics, tuple(_rows(group[row.name], 0, first) for group in groups))
             for row in GRIDS.values()
@@ -214,15 +162,6 @@ class Simulation(Tracers):
     def of_lamps(
         self, groups: Sequence[LightEstimate], first: int, bands: slice = slice(None)
     ) -> list[AccumulatedLight]:
-        """Lamps' light with the optics that form its frames.
-
-        Parameters
-        ----------
-        groups, first
-            as for :meth:`with_optics`.
-        bands
-            of which it is, where not of all.
-        """
         return [
             AccumulatedLight(grid.optics, tuple(_rows(group[name], row, row + 1) for group in groups))
             for row, grids in list(enumerate(self.by_band, first))[bands]
@@ -231,10 +170,7 @@ class Simulation(Tracers):
         ]
 
     def specular_frames(self, labels: Labels) -> ClassFrames | None:
-        """Frames of the projector's specular chains by class in ``labels`` (n^2,); None without such light.
-
-        It is a pinhole's light, whatever the projector's lens.
-        """
+        """Return frames of the specular chains by class; specular light is that of a pinhole."""
         if not self.physics.mirrors:
             return None
         found = self.bench.specular.frames(labels, self.physics.geometry, self.physics.spectrum)
@@ -244,7 +180,6 @@ class Simulation(Tracers):
 
 
 def _rows(light: sparse.csr_array, first: int, last: int) -> sparse.csr_array:
-    """Rows ``first`` .. ``last`` - 1 of ``light``, not copied."""
     start, stop = light.indptr[first], light.indptr[last]
     entries = light.data[start:stop], light.indices[start:stop], light.indptr[first : last + 1] - start
     return sparse.csr_array(entries, shape=(last - first, light.shape[1]), copy=False)
@@ -259,24 +194,19 @@ def expected_of(
     probed: FloatArray | None = None,
     restated: float = 1.0,
 ) -> ExpectedFrames:
-    """Expected frames of light in several parts.
+    """Return expected frames of light in several parts, for simulations of the same devices.
 
     Parameters
     ----------
     parts
-        simulations of the same devices, each with independent estimates of the light that it accumulated; black pixels
-        leak as the first says, specular chains are those of the last.
+        Simulations with independent estimates of their light. Leakage is that of the first, specular chains are those
+        of the last.
     rows
-        (groups' rows,) class of ``lighting`` that each row of the estimates belongs to.
-    lighting
-        the shots.
-    seed
-        of the probes that tell the Monte Carlo error.
+        (groups' rows,) class of ``lighting`` of each row of the estimates.
     leaking
-        whether black pixels leak, so that every shot lights all of them; without, shots of few pixels form faster.
+        True if black pixels leak, so that every shot lights all of them.
     probed, restated
-        what the frames of other shots say of the same classes, and the factor of the Monte Carlo error, as
-        :class:`ExpectedFrames` takes them.
+        As for :class:`ExpectedFrames`.
     """
     light = emission(parts[0][0].physics, lighting, leaking)
     formed = [simulation.with_optics(groups, len(rows)) for simulation, groups in parts]
@@ -286,14 +216,6 @@ def expected_of(
 
 
 def emission(physics: Physics, lighting: Lighting, leaking: bool = True) -> FloatArray:
-    """(shots, classes) light of each class of pixels in each shot, as a part of its full power.
-
-    Parameters
-    ----------
-    physics
-        of the projector.
-    lighting, leaking
-        as for :func:`expected_of`.
-    """
+    """Return the light (shots, classes) of each class of pixels in each shot, over its full power."""
     black = physics.black_level if leaking else 0.0
     return np.asarray(black + (1 - black) * lighting.weights)

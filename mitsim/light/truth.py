@@ -1,8 +1,7 @@
-"""What a perfect image would show: from a bench and how well frames know its light to apparent reflectance and error.
+"""Apparent reflectance, the image that a perfect reconstruction shows, with its standard error.
 
-Apparent reflectance is each projector pixel's flux of direct light toward the sensor over that of the calibration
-board. Both fluxes have random streams of their own, so an error of the frames is never one of the truth as well; but
-where the frames' light is noisy tells where the truth is to be sampled.
+It is each projector pixel's flux of direct light toward the sensor over that of the calibration board. Both fluxes have
+random streams of their own, so that an error of the frames is never one of the truth too.
 """
 
 from __future__ import annotations
@@ -22,33 +21,23 @@ from mitsim.light.settings import Settings
 from mitsim.transport.direct import FluxTracer, IntArray
 
 _FINEST = 1e-4
-"""Standard error below which the truth is not refined: 80 dB, where no image of a sensor with a full well comes."""
 _BOARD_PART = 0.5
-"""Of the truth's error, what the board may bring: a quarter of its square, for a surface that converges quickly."""
 _RATE = 2.0
-"""Power of its samples that a pixel's variance falls with: 1 of random points, 2 of stratified ones about an edge, 3
-over smooth light. Too high a guess costs another round, too low a one some rays."""
+"""Power of the samples with which a pixel's variance falls: 1 for random points, 2 about an edge, 3 over smooth
+light."""
 _ANYWHERE = 0.01
-"""Part of the mean variance that is expected of any pixel, as those that foretell it may have missed what it shows."""
 _AIM = 0.98
-"""Part of the error to aim at: half of those just at it would take another round."""
 _DOUBLINGS, _AT_ONCE = 8, 4
-"""Doublings of a pixel's samples that are weighed, and those made in one round, as the first rounds know little.
-Numbers of samples are powers of 2, at which points are even."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Apparent reflectance of every projector pixel, 1 = the calibration board.
+    """Apparent reflectance of every projector pixel, (n, n).
 
     Attributes
     ----------
-    reflectance, standard_error
-        (n, n) and what sampling may have moved it by.
     board_flux
-        (n^2,) direct light of each projector pixel on the sensor, over the board [W m^-2].
-    rays
-        that were traced for both fluxes.
+        (n^2,) direct light of each projector pixel on the sensor from the board [W m^-2].
     """
 
     reflectance: FloatArray
@@ -58,44 +47,25 @@ class Truth:
 
     @property
     def error(self) -> float:
-        """Standard error, root mean square over the image."""
+        """Standard error, rms over the image."""
         return float(np.sqrt(np.square(self.standard_error).mean()))
 
     def error_of(self, flux_error: FloatArray) -> float:
-        """What sampling leaves in any image, rms over it: the standard error ``flux_error`` (n^2,) [W m^-2] of the
-        frames' own light, over the board's."""
+        """Return the rms error that sampling leaves in any image, from the `flux_error` (n^2,) of the frames' light."""
         return float(_rms(_over(flux_error, self.board_flux)))
 
 
 def trace_truth(bench: Apparatus, settings: Settings, seed: int, flux_error: FloatArray) -> Truth:
     """Trace until the truth's standard error, rms over the image, is a sixth of the frames', or 1e-4.
 
-    Parameters
-    ----------
-    bench, settings
-        the scene, and what of lens and pixels is simulated.
-    seed
-        root of the random streams.
-    flux_error
-        (n^2,) standard error of each projector pixel's direct light in the frames [W m^-2]: what sampling alone leaves
-        in any image of them.
+    `flux_error` (n^2,) is the standard error of each projector pixel's direct light in the frames [W m^-2].
     """
     (truth,) = trace_truths(bench, settings, seed, flux_error[None])
     return truth
 
 
 def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: FloatArray) -> list[Truth]:
-    """The truth of each line of a projector, from paths that all lines share.
-
-    Parameters
-    ----------
-    bench
-        with its lines; or light that is not told apart, as one line.
-    settings, seed
-        as for :func:`trace_truth`.
-    flux_errors
-        (lines, n^2) ``flux_error`` there.
-    """
+    """Trace the truth of each line of a projector from shared paths."""
     effects = names(lambda effect: effect.in_truth) & settings.effects
     board = _Flux(before_board(bench, load_recipe().board_reflectance), effects, seed, "board", BOARD_SAMPLES)
     unit = board.mean
@@ -112,8 +82,7 @@ def trace_truths(bench: Apparatus, settings: Settings, seed: int, flux_errors: F
 
 
 class _Flux:
-    """Direct light of every projector pixel on the sensor by line, in independent groups; sampled where that helps
-    most."""
+    """Direct light of every projector pixel by line, in independent groups."""
 
     def __init__(self, bench: Apparatus, effects: frozenset[str], seed: int, name: str, samples: int) -> None:
         physics, loaded, pixels = Physics.with_effects(bench, effects), bench.loaded, bench.n**2
@@ -127,32 +96,21 @@ class _Flux:
 
     @property
     def rays(self) -> int:
-        """All that were traced."""
         return int(TRUTH_GROUPS * self._samples.sum())
 
     @property
     def mean(self) -> FloatArray:
-        """(lines, n^2) [W m^-2]."""
         return np.asarray(self._sums.mean(axis=1) / self._samples)
 
     @property
     def standard_error(self) -> FloatArray:
-        """(lines, n^2) of the mean, from the spread of the groups [W m^-2]."""
         return np.asarray(self._sums.std(axis=1, ddof=1) / self._samples / np.sqrt(TRUTH_GROUPS))
 
     def refine(self, unit: FloatArray, target: FloatArray, likely: FloatArray) -> None:
-        """Trace more where that brings most, until the standard error of every line meets its target, or too many rays
-        would be needed.
+        """Trace more where that reduces the error most, until every line meets its target or needs too many rays.
 
-        Parameters
-        ----------
-        unit
-            (lines, n^2) of the error [W m^-2].
-        target
-            (lines,) its rms over the image, in these units.
-        likely
-            (n^2,) variances at equal samples, in any unit, by what others know. The pixels' own spread does not tell:
-            a pixel whose samples happen to agree would get no more of them, and be further off than it says.
+        Errors are in units `unit` (lines, n^2). `likely` (n^2,) has variances from other knowledge, because a pixel
+        whose samples happen to agree would get no more of them.
         """
         # An edge goes on in the next pixel, where all samples so far may have missed it.
         likely = likely + mean_of_neighbours(likely.reshape(self._shape)).ravel()
@@ -166,7 +124,6 @@ class _Flux:
             self._sample(wanted)
 
     def _sample(self, wanted: IntArray) -> None:
-        """Trace until every pixel has so many samples as are ``wanted`` (n^2,): no less than it has."""
         pixels = np.flatnonzero(wanted > self._samples)
         done, more = self._samples[pixels], (wanted - self._samples)[pixels]
         block = int(np.gcd.reduce(more))
@@ -182,19 +139,7 @@ class _Flux:
 
 
 def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most: int) -> IntArray:
-    """(n^2,) samples that leave a part of the variance, doubled where a sample takes off most of it.
-
-    Parameters
-    ----------
-    likely
-        (n^2,) variances of the pixels at ``first`` samples, in any unit.
-    samples, first
-        (n^2,) that they have, powers of 2 times what they began with.
-    part
-        of today's variance that may be left.
-    most
-        samples in all.
-    """
+    """Return the samples (n^2,) that leave a part of the variance, doubled where a sample reduces it most."""
     doublings = np.arange(_DOUBLINGS)
     left = (likely * (samples / first) ** -_RATE)[:, None] * 2.0 ** (-_RATE * doublings)
     gain, cost = (1 - 2.0**-_RATE) * left, samples[:, None] * 2.0**doublings
@@ -206,10 +151,8 @@ def _allot(likely: FloatArray, samples: IntArray, first: int, part: float, most:
 
 
 def _over(flux: FloatArray, unit: FloatArray) -> FloatArray:
-    """``flux`` (..., n^2) in units ``unit``, of its shape; 0 where there is none, as the board has no light there."""
     return np.divide(flux, unit, out=np.zeros_like(flux), where=unit > 0)
 
 
 def _rms(values: FloatArray) -> FloatArray:
-    """Along the last axis."""
     return np.asarray(np.sqrt(np.square(values).mean(axis=-1)))

@@ -177,8 +177,8 @@ def image(camera: Camera, frame: FloatArray, method: str, taught: dict[str, Taug
     """
     import torch
 
-    from mitsim.learn.diagonal import Data, Diagonal
     from mitsim.learn.learned_solver import beyond_noise, datum_variance
+    from mitsim.learn.methods import Data, Diagonal
 
     prepared = camera.prepared
     sums = prepared.accumulator()

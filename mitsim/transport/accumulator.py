@@ -1,8 +1,8 @@
-"""Light added up where it is traced: connections on the device in, a sparse matrix of light per row and place out.
+"""Accumulation of light on the device: from connections to a sparse matrix of light per row and place.
 
-Light is added up in whole numbers of a small unit, so that the sums do not hang on the order in which threads add, and
-nothing but the sums is ever fetched. Where :class:`mitsim.transport.records.Bundle` splits light between two layers,
-the accumulator does so too, or draws one of them: the same in the mean.
+Light is added in whole numbers of a small unit, so that sums do not depend on the order in which threads add, and only
+the sums are fetched. Where :class:`mitsim.transport.records.Bundle` splits light between two layers, the accumulator
+splits too, or draws one layer: the mean is the same.
 """
 
 from __future__ import annotations
@@ -26,28 +26,27 @@ from mitsim.core.job import compiled_kernels
 from mitsim.transport.records import Bundle, CellAxis, Sightings
 
 MOST_PLACES = 2**26
-"""Places of all rows and lines that are held: 0.5 GB."""
 _UNIT_BITS = 30
-"""Power of two of units in the light that is passed as one: rounding moves a path's by 5e-10 of it at most, either way,
-and a place holds 2^34 times as much."""
+"""Power of two of units in a bright path's light: rounding moves a path's by 5e-10 of it at most, and a place holds
+2^34 times as much."""
 _PAYS = 4
-"""Places for each part of a path below which an accumulator pays: a place takes 0.03 us, to be fetched from the machine
-and looked through, and each part of a path on the host 0.1 us or more (balls of the highlight)."""
+"""Places for each part of a path below which an accumulator pays: fetching a place takes 0.03 us, and a part of a path
+on the host 0.1 us or more (balls of the highlight)."""
 _MOST_BITS = 52
-"""Power of two of units that one path may bring, four million times the light that is passed as one: more is no light.
-A place would hold 4096 such paths."""
+"""Power of two of units that one path may bring, four million times a bright path's; a place would hold 4096 of
+them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """Sums that hold light of any line, and how they lie in a matrix, which is found once.
+    """Sums that hold light of any line, and their places in a matrix.
 
     Attributes
     ----------
     numbers
-        of the sums, increasing.
+        Numbers of the sums, increasing.
     rows, size, lamps
-        of the matrix: rows of the projector's light, places, and rows of lamps after them.
+        Rows of the projector's light, places, and rows of lamps after them.
     """
 
     numbers: npt.NDArray[np.uint32]
@@ -57,12 +56,10 @@ class Lit:
 
     @property
     def inside(self) -> int:
-        """How many of the sums, the first, have a place: what lay outside has the last ones."""
         return int(np.searchsorted(self.numbers, np.uint32(self.size * self.rows)))
 
     @cached_property
     def layout(self) -> sparse.csr_array:
-        """(rows + lamps, size) which of the sums lies where."""
         # All places fit 32 bits, in which matrices take half the time.
         numbers = self.numbers[: self.inside]
         places = (numbers // np.uint32(self.rows)).astype(np.int32)
@@ -75,7 +72,6 @@ class Lit:
         return found
 
     def matrix(self, light: FloatArray) -> sparse.csr_array:
-        """(rows + lamps, size) the ``light`` of the sums, where they have a place."""
         layout = self.layout
         return sparse.csr_array((light[layout.data], layout.indices, layout.indptr), shape=layout.shape)
 
@@ -85,23 +81,19 @@ class DeviceAccumulator:
 
     Parameters
     ----------
-    bundle
-        how light is accumulated.
     labels
         (n^2,) row of each projector pixel.
     one
-        irradiance [W m^-2] of about a bright path's.
-    lines
-        that light is told apart by.
+        Irradiance of about a bright path [W m^-2].
 
     Attributes
     ----------
     sums
-        ((places * rows + 1) * lines,) on the device, in units. A place's rows lie side by side: neighbouring pixels,
-        which are of different rows, bring light to one place at a time. So do the lines of an entry: a path brings
-        light of every line, and memory that is not at hand is fetched once for all of them.
+        ((places * rows + 1) * lines,) on the device, in units. A place's rows lie side by side, because neighbouring
+        pixels have different rows and light one place at a time; so do the lines, because a path has light of every
+        line.
     traced
-        how often a tracer has added light.
+        Number of traces that have added light.
     """
 
     def __init__(self, bundle: Bundle, labels: Labels, one: float, lines: int = 1) -> None:
@@ -115,7 +107,6 @@ class DeviceAccumulator:
         self.traced = 0
 
     def _of_line(self, line: int, entries: mi.UInt32 | None = None) -> mi.UInt64:
-        """Sums of a ``line``, of some ``entries`` or of all."""
         if entries is None and self.lines == 1:
             return self.sums
         if entries is None:
@@ -126,36 +117,17 @@ class DeviceAccumulator:
 
     @staticmethod
     def _places(bundle: Bundle) -> int:
-        """Places of a row: those of a ``bundle``, and one for each anchor, of light from beyond all cells."""
         return bundle.size + bundle.anchors**2
 
     @staticmethod
     def holds(bundle: Bundle, labels: Labels, lines: int = 1, paths: float = math.inf) -> bool:
-        """Whether an accumulator has room, and takes less time than the host.
-
-        Parameters
-        ----------
-        bundle, labels, lines
-            of the accumulator.
-        paths
-            that it adds up.
-        """
+        """Return True if an accumulator has room, and takes less time than the host."""
         entries = (int(labels.max()) + 1) * DeviceAccumulator._places(bundle)
         parts = (4 if bundle.between else 1) * min(len(bundle.depths), 2)
         return lines * entries < MOST_PLACES and entries < _PAYS * parts * paths
 
     def place(self, seen: Sightings, chosen: mi.Float, anchor: tuple[mi.UInt32, mi.UInt32] | None = None) -> mi.UInt32:
-        """Where light is accumulated, all of it in one place.
-
-        Parameters
-        ----------
-        seen
-            the light.
-        chosen
-            random numbers in [0, 1) that choose its layer.
-        anchor
-            row and column of its anchor; the first without them.
-        """
+        """Return the one place that accumulates light; numbers `chosen` in [0, 1) choose its layer."""
         layer = mi.UInt32(0)
         for part in self._parts_beyond(seen):
             layer += dr.select(chosen < part, mi.UInt32(1), mi.UInt32(0))
@@ -163,13 +135,6 @@ class DeviceAccumulator:
         return self._place(seen, layer, cells, anchor)
 
     def shares(self, seen: Sightings, anchor: tuple[mi.UInt32, mi.UInt32]) -> Iterator[tuple[mi.UInt32, mi.Float]]:
-        """Where light is accumulated, each place with its part of it, as :meth:`Bundle.accumulate` splits it.
-
-        Parameters
-        ----------
-        seen, anchor
-            as for :meth:`place`.
-        """
         passed = [dr.clip(part, 0, 1) for part in self._parts_beyond(seen)]
         layers = [(mi.UInt32(k), a - b) for k, (a, b) in enumerate(pairwise([mi.Float(1), *passed, mi.Float(0)]))]
         rows, columns = (self._cells(axis, tau) for axis, tau in self._axes(seen))
@@ -180,20 +145,17 @@ class DeviceAccumulator:
         return (self._bundle.grid.rows, seen.row), (self._bundle.grid.columns, seen.column)
 
     def _parts_beyond(self, seen: Sightings) -> Iterator[mi.Float]:
-        """How far between each layer and the next nearer one light is; below 0 before it, and above 1 beyond."""
         for low, high in pairwise(1 / depth for depth in self._bundle.depths):
             yield (seen.inverse_depth - dr.opaque(mi.Float, low)) / dr.opaque(mi.Float, high - low)
 
     @staticmethod
     def _position(axis: CellAxis, tau: mi.Float) -> mi.Float:
-        """Cells from the first one's edge."""
         return (tau - dr.opaque(mi.Float, axis.start)) * dr.opaque(mi.Float, 1 / axis.size)
 
     def _cell(self, axis: CellAxis, tau: mi.Float) -> mi.UInt32:
         return mi.UInt32(dr.maximum(dr.floor(self._position(axis, tau)), 0))
 
     def _cells(self, axis: CellAxis, tau: mi.Float) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Cells along an axis that share the light, each with its part."""
         if not self._bundle.between or axis.count == 1:
             return [(self._cell(axis, tau), mi.Float(1))]
         position = dr.clip(self._position(axis, tau) - 0.5, 0, dr.opaque(mi.Float, axis.count - 1))
@@ -204,8 +166,6 @@ class DeviceAccumulator:
     def _place(
         self, seen: Sightings, layer: mi.UInt32, cells: Sequence[mi.UInt32], anchor: tuple[mi.UInt32, mi.UInt32] | None
     ) -> mi.UInt32:
-        """Where light of a ``layer`` and of ``cells`` along rows and columns is accumulated, or its anchor's place for
-        what lies beyond all cells."""
         inside = mi.Bool(True)
         for axis, tau in self._axes(seen):
             position = self._position(axis, tau)
@@ -219,19 +179,6 @@ class DeviceAccumulator:
     def add(
         self, lights: Sequence[mi.Float], pixel: mi.UInt32, place: mi.UInt32, active: mi.Bool | bool = True
     ) -> None:
-        """Add up light.
-
-        Parameters
-        ----------
-        lights
-            [W m^-2] of each line.
-        pixel
-            projector pixels that it is of.
-        place
-            of :meth:`place`.
-        active
-            lanes that count.
-        """
         for line, light in enumerate(lights):
             units = light * dr.opaque(mi.Float, 1 / self._unit)
             fits = (units >= 0) & (units < 2.0**_MOST_BITS)
@@ -243,10 +190,6 @@ class DeviceAccumulator:
             dr.scatter_reduce(dr.ReduceOp.Add, self.sums, amount, index, lit, mode=dr.ReduceMode.Direct)
 
     def fetch(self) -> list[DeviceSums]:
-        """The sums of each line on the host; they are empty then.
-
-        Which of them hold light is told of all lines together, as it is nearly the same of each.
-        """
         lines = range(self.lines)
         lit = dr.compress(reduce(or_, (self._of_line(line) != 0 for line in lines)))
         units = [self._of_line(line, lit) for line in lines]
@@ -259,35 +202,14 @@ class DeviceAccumulator:
 
 @dataclass(frozen=True, eq=False)
 class DeviceSums:
-    """Sums of one line on the host: what a pass brought in all its samples.
-
-    Attributes
-    ----------
-    accumulator
-        that held them.
-    lit
-        which of its sums hold light: of corner, a tenth of its accumulator's memory.
-    units
-        these sums.
-    """
-
     accumulator: DeviceAccumulator
     lit: Lit
     units: npt.NDArray[np.uint64]
 
     def light(self, samples: int = 1) -> tuple[sparse.csr_array, float, float]:
-        """(rows + lamps, places) light per sample, the last rows empty; all that was received, and what lay outside
-        [W m^-2].
+        """Return light (rows + lamps, places) per sample, all light received, and the light outside [W m^-2].
 
-        Parameters
-        ----------
-        samples
-            that the sums are of.
-
-        Raises
-        ------
-        MitsimError
-            where light is NaN, infinite, or four million times what is bright.
+        Raise MitsimError for light that is NaN, infinite, or four million times a bright path's.
         """
         lit, units, accumulator = self.lit, self.units, self.accumulator
         if len(lit.numbers) and lit.numbers[-1] == accumulator._rows * accumulator._width and units[-1]:
@@ -298,7 +220,6 @@ class DeviceSums:
         return lit.matrix(light), float(light.sum()), float(light[lit.inside :].sum())
 
     def beyond(self, samples: int = 1) -> FloatArray:
-        """(rows, anchors, anchors) light from beyond all cells per sample, of so many ``samples`` [W m^-2]."""
         lit, accumulator = self.lit, self.accumulator
         rows, anchors = accumulator._rows, accumulator._bundle.anchors
         # Its last one counts what is no light.

@@ -1,4 +1,4 @@
-"""Connections: from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
+"""Connections from a lit surface point to the irradiance that it casts on the sensor, and to the projector's lens.
 
 The bare sensor is a receiver. A surface point P that receives the flux phi irradiates the sensor point with::
 
@@ -6,9 +6,9 @@ The bare sensor is a receiver. A surface point P that receives the flux phi irra
 
 f is the BSDF, cos_s and cos_g the arriving light's cosines to the shading and the geometric normal at P, cos_P and
 cos_a those of the connection at P and at the sensor, and r(t) the pixel's angular response. Without a lens, every
-surface point that is not in the shadow of another sees the sensor: light can be followed from the projector's side,
-where every path counts for a pixel that is known from the start. Behind flat glass r and cos_a are those of the point
-that the sensor seems to see (:mod:`mitsim.transport.transmission`).
+surface point that is not in the shadow of another sees the sensor. Light can therefore be followed from the projector's
+side, where every path counts for a known pixel. Behind flat glass r and cos_a are those of the point that the sensor
+seems to see (:mod:`mitsim.transport.transmission`).
 """
 
 from __future__ import annotations
@@ -34,19 +34,18 @@ from mitsim.transport.transmission import Passage, refracted_way
 
 @dataclass(frozen=True)
 class SensorPoints:
-    """Where on the sensor light is followed to: its centre, several anchors, or random points that are accumulated as
-    one.
+    """Points of the sensor to which light is followed: its centre, several anchors, or random points as one anchor.
 
     Attributes
     ----------
     half_width
-        of the sensor [mm].
+        Of the sensor [mm].
     anchors
-        a side; one is the centre.
+        Along an axis; one is the centre.
     spread
-        whether random points stand in for the one anchor: their light is the mean over the sensor.
+        Random points replace the one anchor: their light is the mean over the sensor.
     distance
-        [mm] at which paths that start there are aimed at the same cells.
+        Distance at which paths that start there are aimed at the same cells [mm].
     """
 
     half_width: float
@@ -56,61 +55,40 @@ class SensorPoints:
 
     @property
     def count(self) -> int:
-        """Connections of a path in all."""
         return self.anchors**2
 
     @property
     def positions(self) -> FloatArray:
-        """(anchors,) along an axis [mm]."""
         return anchor_positions(self.anchors, self.half_width)
 
     def of(self, lane: mi.UInt32, paths: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Path of each ``lane``, of so many ``paths`` to each anchor, and row and column of the anchor."""
         count, anchors = dr.opaque(mi.UInt32, paths), dr.opaque(mi.UInt32, self.anchors)
         anchor = lane // count
         return lane % count, anchor // anchors, anchor % anchors
 
     def at(self, row: mi.UInt32, column: mi.UInt32, rng: mi.PCG32) -> mi.Point3f:
-        """Anchors in the camera's frame, or random points.
-
-        Parameters
-        ----------
-        row, column
-            of the anchor.
-        rng
-            draws the random points, and nothing else.
-        """
         spread = dr.opaque(mi.Bool, self.spread)
         return self.place(row, column, mi.Point2f(rng.next_float32(spread), rng.next_float32(spread)))
 
     def place(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
-        """The same, where random points are told: one kernel serves the centre, anchors, and random points.
-
-        Parameters
-        ----------
-        row, column
-            of the anchor.
-        point
-            of the unit square, which stands for a random one.
-        """
+        """Return anchors, or points given in the unit square: one kernel serves centre, anchors, and random points."""
         # Of one number alone Dr.Jit would make another kernel.
         positions = mi.Float(np.append(self.positions, 0).astype(np.float32))
         anchor = mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
         return dr.select(dr.opaque(mi.Bool, self.spread), self.inside(point), anchor)
 
     def inside(self, point: mi.Point2f) -> mi.Point3f:
-        """Each ``point`` of the unit square on the sensor, in the camera's frame."""
         side = 2 * dr.opaque(mi.Float, self.half_width)
         return mi.Point3f((point.x - 0.5) * side, (point.y - 0.5) * side, 0)
 
 
 @dataclass
 class Way:
-    """The way from a surface point P to a point of the sensor, whatever light comes to P.
+    """Way from a surface point P to a point of the sensor.
 
-    ``open`` tells whether it is, ``direction`` is the unit one in which light leaves P, ``passed`` the part of it that
-    comes through, ``geometric`` all factors [mm^-2] of the irradiance but for the BSDF and the arriving light's cosine
-    to the surface; ``row``, ``column`` and ``inverse_depth`` as in :class:`mitsim.transport.records.PathSamples`.
+    Light leaves P in ``direction``, and the part ``passed`` arrives. ``geometric`` has all factors of the irradiance
+    but the BSDF and the arriving light's cosine [mm^-2]; ``row``, ``column`` and ``inverse_depth`` are those of
+    :class:`mitsim.transport.records.PathSamples`.
     """
 
     open: mi.Bool
@@ -124,49 +102,27 @@ class Way:
 
 @dataclass
 class Reception:
-    """Irradiance for each unit of flux [mm^-2] that comes by a ``way``, and the turn's ``pdf`` [1/sr]: that of sampling
-    the turn at P from the sensor's side."""
+    """Irradiance for each unit of flux that comes by a ``way`` [mm^-2].
+
+    ``pdf`` is the density of sampling the turn at P from the sensor's side [1/sr].
+    """
 
     irradiance: mi.Spectrum
     pdf: mi.Float
     way: Way
 
     def solid_angle(self, local: mi.Point3f) -> mi.Float:
-        """Solid angle at P for each area of the sensor at ``local`` [sr/mm^2]: cos^3 / z^2 of the apparent point."""
         row, column = rows_columns(local.x, local.y)
         inverse = self.way.inverse_depth
         squared = 1 + dr.square(self.way.row - row * inverse) + dr.square(self.way.column - column * inverse)
         return dr.square(inverse) / (squared * dr.sqrt(squared))
 
     def sightings(self, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32, by_line: bool = False) -> Sightings:
-        """Light seen from here.
-
-        Parameters
-        ----------
-        light
-            [W m^-2] at the path's wavelengths.
-        pixel
-            of the projector.
-        by_line
-            whether it is told apart by line.
-        """
         return Sightings.of(light, by_line, pixel, self.way.row, self.way.column, self.way.inverse_depth)
 
 
 @dataclass(frozen=True, eq=False)
 class OpticalSetup:
-    """What light is traced in: a scene with its camera and its projector, and how its surfaces reach the sensor.
-
-    Attributes
-    ----------
-    scene, camera
-        as loaded.
-    projector
-        where light comes from.
-    geometry
-        of the camera; may stand in for the loaded one's own.
-    """
-
     scene: mi.Scene
     camera: mi.Sensor
     projector: ProjectorOptics
@@ -174,18 +130,16 @@ class OpticalSetup:
 
     @cached_property
     def passage(self) -> Passage:
-        """What light passes in the scene."""
         return Passage(self.scene)
 
     @cached_property
     def rays(self) -> ProjectorRays:
-        """Rays of the projector."""
         return ProjectorRays(self.projector)
 
     @cached_property
     @keep_scenes()
     def board(self) -> float:
-        """Irradiance [W m^-2] by the light of a projector pixel, from a white board at the aligned distance."""
+        """Irradiance by the light of a projector pixel from a white board at the aligned distance [W m^-2]."""
         pixel = dr.arange(mi.UInt32, self.projector.n**2)
         wavelengths, spectral = sample_wavelengths(self.camera, generator(mi.UInt32(0), pixel), self.projector.lines)
         flux = np.array(panchromatic(self.rays.flux(pixel, wavelengths) * spectral))
@@ -194,29 +148,10 @@ class OpticalSetup:
     def receive(
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, local: mi.Point3f, active: mi.Bool
     ) -> Reception:
-        """Connect lit surface points to sensor points.
-
-        Parameters
-        ----------
-        si
-            the surface points.
-        toward
-            unit directions that they are lit from, in the world.
-        local
-            sensor points in the camera's frame [mm].
-        active
-            lanes that count.
-        """
+        """Connect surface points, lit from unit directions `toward`, to sensor points [mm]."""
         return self.received(si, toward, self.way(si, local, active))
 
     def way(self, si: mi.SurfaceInteraction3f, local: mi.Point3f, active: mi.Bool) -> Way:
-        """Connect surface points to sensor points.
-
-        Parameters
-        ----------
-        si, local, active
-            as for :meth:`receive`.
-        """
         to_world = self.camera.world_transform()
         point = to_world.inverse() @ si.p
         sensor = to_world @ local
@@ -247,15 +182,6 @@ class OpticalSetup:
 
     @staticmethod
     def received(si: mi.SurfaceInteraction3f, toward: mi.Vector3f, way: Way) -> Reception:
-        """What comes to the sensor by a way.
-
-        Parameters
-        ----------
-        si, toward
-            as for :meth:`receive`.
-        way
-            from these points.
-        """
         si.wi = si.to_local(way.direction)
         reflected, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(toward), way.open)
         geometric = way.geometric / dr.abs(dr.dot(si.n, toward))
@@ -264,19 +190,10 @@ class OpticalSetup:
 
 
 def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = None) -> tuple[mi.Color0f, mi.Spectrum]:
-    """Wavelengths of a path, and their weights; but in spectral variants, none and 1.
+    """Return wavelengths of a path and their weights; none and 1 but in spectral variants.
 
-    Light by the weights has a mean over the wavelengths that is the mean over 360-830 nm, where a flat spectrum of 1
-    counts as 1; or the sum over given lines, each with its share.
-
-    Parameters
-    ----------
-    camera
-        that the path comes to.
-    rng
-        draws the wavelengths; it draws as many numbers where ``lines`` are given.
-    lines
-        wavelengths that are taken instead, four at most, in spectral variants.
+    Weighted light has a mean that is the mean over 360-830 nm, where a flat spectrum of 1 counts as 1; or the sum over
+    given lines, four at most, each with its share.
     """
     wavelengths, weight = camera.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_float32(), True)
     if not mi.is_spectral:
@@ -295,8 +212,6 @@ def sample_wavelengths(camera: mi.Sensor, rng: mi.PCG32, lines: Lines | None = N
 
 @dataclass
 class Landing:
-    """Points (x, y) of the camera's frame [mm], the cosine there, the way's length [mm], and whether light arrives."""
-
     x: mi.Float
     y: mi.Float
     cosine: mi.Float
@@ -305,19 +220,7 @@ class Landing:
 
 
 def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Landing:
-    """Where light crosses the plane of the sensor from the front; whether something opaque hides it is not asked.
-
-    Parameters
-    ----------
-    setup
-        the sensor, and the scene with its panes.
-    si
-        points of surfaces.
-    direction
-        unit, in which light leaves them.
-    active
-        lanes that count.
-    """
+    """Return where light crosses the plane of the sensor from the front, whatever hides it."""
     inverse, passage = setup.camera.world_transform().inverse(), setup.passage
     ray, length = mi.Ray3f(si.p, direction, si.time, si.wavelengths), mi.Float(0)
 
@@ -351,10 +254,7 @@ def landing(setup: OpticalSetup, si: mi.SurfaceInteraction3f, direction: mi.Vect
 
 @dataclass
 class Connection:
-    """From a scene point to the projector: unit direction, lens point, weight (radiance / pdf), pdf [1/sr], pixel.
-
-    ``pdf`` is 0 for a pinhole, which no sampled direction can find.
-    """
+    """Connection from a scene point to the projector: weight is radiance / pdf, 0 is the pdf of a pinhole."""
 
     direction: mi.Vector3f
     target: mi.Point3f
@@ -366,8 +266,6 @@ class Connection:
 
 @dataclass
 class LensHit:
-    """A ray that met the lens: radiance, pdf [1/sr] of a :class:`Connection` along it, pixel, and whether it did."""
-
     radiance: mi.Spectrum
     pdf: mi.Float
     pixel: mi.UInt32
@@ -375,8 +273,6 @@ class LensHit:
 
 
 class ProjectorConnector:
-    """Connections to one ``projector``; prepared once."""
-
     def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self.emitter = projector, projector.emitter
         if not projector.ideal:
@@ -384,7 +280,6 @@ class ProjectorConnector:
             self._pixel_at_unit = projector.pixel_size()
 
     def lens_point(self, rng: mi.PCG32) -> mi.Point3f:
-        """A point of the lens in the projector's frame, drawn by ``rng``; the pinhole where there is none."""
         if self.projector.aperture == 0:
             return mi.Point3f(0)
         disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(rng.next_float32(), rng.next_float32()))
@@ -393,19 +288,7 @@ class ProjectorConnector:
     def connect(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool, lens: mi.Point3f | None = None
     ) -> Connection:
-        """Connect surface points to the projector; visibility is the caller's.
-
-        Parameters
-        ----------
-        si
-            the points.
-        rng
-            random numbers for lens and spot, if there are any.
-        active
-            lanes that count.
-        lens
-            points of the lens; None: random ones.
-        """
+        """Connect surface points to the projector, without a test of visibility."""
         if self.projector.ideal:
             ds, weight = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
             return Connection(ds.d, ds.p, weight, mi.Float(0), self.projector.pixel_at(ds.uv), active & (ds.pdf > 0))
@@ -424,20 +307,9 @@ class ProjectorConnector:
     def hit(
         self, ray: mi.Ray3f, reach: mi.Float, rng: mi.PCG32, active: mi.Bool, since: mi.Float | float = 0.0
     ) -> LensHit:
-        """Rays of random directions that meet the lens; needs a finite aperture.
+        """Return the rays of random directions that meet the finite lens before they meet the scene at `reach`.
 
-        Parameters
-        ----------
-        ray
-            in world coordinates.
-        reach
-            distance [mm] to what the ray meets in the scene: the lens must lie before it.
-        rng
-            random numbers for the spot, if it is blurred.
-        active
-            lanes that count.
-        since
-            distance [mm] from the surface that the direction was drawn at to where the ray starts.
+        `since` is the distance from the surface where the direction was drawn to the ray's start [mm].
         """
         inverse = self._to_world.inverse()
         origin, direction = inverse @ ray.o, inverse @ ray.d
@@ -458,7 +330,6 @@ class ProjectorConnector:
     def _pixel_power(
         self, lens: mi.Point3f, direction: mi.Vector3f, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Spectrum, mi.Bool]:
-        """Pixel, pi scale texture, and validity of the light that leaves a lens point in a direction (both local)."""
         focus = dr.opaque(mi.Float, self.projector.focus)
         image = lens + direction * (focus / direction.z)
         if self.projector.blur > 0:
@@ -479,22 +350,12 @@ class ProjectorConnector:
 # connects the sensor itself to either. Of a projector such light is a beam's (:mod:`mitsim.transport.specular`).
 
 _SENSOR_POINTS = 129
-"""Points along each side of the sensor, its edges with them: a hole lights more than a 128th of it."""
 _LAMP_POINTS = 2**10
-"""Points of a lamp: how much of it is seen is known to some percent."""
 
 
 @keep_scenes()
 def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
-    """Whether a point of the sensor sees the ``lamp`` within the field stop.
-
-    Parameters
-    ----------
-    scene, camera
-        what may stand in the way, and the sensor.
-    lamp
-        a point, spot or directional one, or a projector.
-    """
+    """Return True if a point of the sensor sees the lamp within the field stop."""
     edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
     x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
     to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
@@ -511,14 +372,7 @@ def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
 
 @keep_scenes()
 def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
-    """Part of the field stop, in tan-angles, in which the sensor's centre sees a ``shape`` that shines; where nothing
-    is before it.
-
-    Parameters
-    ----------
-    scene, camera, shape
-        as of :func:`shines_in`; the side that shines counts.
-    """
+    """Return the part of the field stop, in tan-angles, in which the sensor's centre could see a shining shape."""
     _, rng = streams(0, dr.arange(mi.UInt32, _LAMP_POINTS), mi.UInt32(0))
     to_world, place = (
         camera.world_transform(),
@@ -539,7 +393,6 @@ def part_of_view(scene: mi.Scene, camera: mi.Sensor, shape: mi.Shape) -> float:
 
 
 def _in_view(camera: mi.Sensor, direction: mi.Vector3f) -> mi.Bool:
-    """Whether light from a ``direction`` comes through the field stop."""
     toward = camera.world_transform().inverse() @ direction
     stop = camera.geometry.tan_half_fov * toward.z
     return (dr.abs(toward.x) <= stop) & (dr.abs(toward.y) <= stop)

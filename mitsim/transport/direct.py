@@ -1,9 +1,9 @@
 """Direct light: every projector pixel's rays, followed to the first surface and on to each anchor of the sensor.
 
 A ray meets a surface at P, and P is connected to every anchor (:mod:`mitsim.transport.connect`), or to one random point
-of the sensor; those are as even as the places in the projector's pixels, and together with them. All anchors see the
-same points. Where surfaces let light pass (:mod:`mitsim.transport.transmission`), so does the ray: of the points that
-it meets one is handed out, drawn in proportion to its light."""
+of the sensor, even together with the places in the pixels. All anchors see the same points. Where surfaces let light
+pass (:mod:`mitsim.transport.transmission`), one of the points that the ray meets is drawn in proportion to its light.
+"""
 
 from __future__ import annotations
 
@@ -26,56 +26,30 @@ from mitsim.transport.transmission import Arrival
 
 IntArray = npt.NDArray[np.int64]
 _LOBE = 2.0**8
-"""Bright light over a board's. Mitsuba takes no roughness below 1e-4, whose lobe is 2.5e7 times as bright in its middle
-as a board; accumulators pass 2^22 times what is bright, 40 times that, and round light to 1.2e-7 of a board's."""
+"""Bright light over a board's. Mitsuba's sharpest lobe (roughness 1e-4) is 2.5e7 times as bright as a board;
+accumulators hold 2^22 times bright light, 40 times that."""
 
 
 class DirectTracer(Tracer):
     """Direct light of a projector at a number of anchors."""
 
     def __init__(self, setup: OpticalSetup, anchors: int, spread: bool = False, pixels: IntArray | None = None) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        setup
-            scene, camera and projector.
-        anchors
-            sensor points a side that light is connected to.
-        spread
-            connect to random points of the sensor instead, all accumulated as one anchor: the mean over the sensor.
-        pixels
-            (m,) of the projector that are traced; None: all.
-        """
+        """Prepare the tracer of some `pixels` (m,); `spread` replaces anchors by random points."""
         super().__init__(setup, SensorPoints(setup.geometry.half_width, anchors, spread))
         self._pixels = np.arange(setup.projector.n**2) if pixels is None else pixels
 
     @property
     def board(self) -> float:
-        """Irradiance [W m^-2] that light compares to: bright light, of sharp lobes too."""
+        """Bright light, of sharp lobes too [W m^-2]."""
         return _LOBE * self.setup.board
 
     @property
     def paths_per_sample(self) -> int:
-        """Connections of one sample: one per projector pixel and anchor."""
         return len(self._pixels) * self.points.count
 
     @keep_scenes()
     def sums(self, seed: int, samples: int) -> FloatArray:
-        """(m, anchors, anchors) light of each pixel at each anchor, summed over samples [W m^-2].
-
-        Parameters
-        ----------
-        seed
-            of the random numbers.
-        samples
-            the first so many of its sequence.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`trace`.
-        """
+        """Return the light (m, anchors, anchors) of each pixel at each anchor, summed over samples [W m^-2]."""
         total = np.zeros(self.paths_per_sample)
         for tracer in self.per_wavelength:
             parts = list[npt.NDArray[np.float32]]()
@@ -99,7 +73,6 @@ class DirectTracer(Tracer):
         return []
 
     def _sightings(self, flight: InFlight) -> tuple[Sightings, tuple[mi.UInt32, mi.UInt32]]:
-        """Light of each sample, and its anchor."""
         number, anchor, share = self._pair(flight)
         pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
@@ -123,19 +96,16 @@ class DirectTracer(Tracer):
         return seen, (row, column)
 
     def _by_connection(self, at: Arrival, sensor: mi.Point3f) -> tuple[Reception, mi.UnpolarizedSpectrum]:
-        """What light that comes to surfaces brings to ``sensor`` points."""
         reception = self.setup.receive(at.si, -at.direction, sensor, at.active)
         return reception, reception.irradiance * at.light
 
     def _pair(self, flight: InFlight) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Place of each sample in the list of pixels, its anchor, and its weight."""
         count = dr.opaque(mi.UInt32, len(self._pixels))
         return flight.index % count, flight.index // count, mi.Float(1)
 
     def _place(
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
-        """Where in its pixel a ray starts, by the pixel's place in the list and the anchor, and the ray's weight."""
         return jitter, mi.Float(1)
 
 
@@ -148,42 +118,24 @@ class DirectTracer(Tracer):
 
 
 class FluxTracer:
-    """Direct light at the sensor as a whole, of each projector pixel.
-
-    Attributes
-    ----------
-    paths_per_launch
-        rays of one kernel, unless those of one block are more.
-    """
+    """Direct light of each projector pixel at the sensor as a whole."""
 
     paths_per_launch = PATHS_PER_LAUNCH
 
     def __init__(self, setup: OpticalSetup, glossy: bool = False) -> None:
-        """Light that is followed in a ``setup``; ``glossy``: it has glossy surfaces, whose turns are sampled too."""
         self._setup, self._glossy = setup, glossy
         self._sensor = SensorPoints(setup.geometry.half_width, spread=True)
 
     @keep_scenes()
     def sums(self, seed: int, groups: int, pixels: IntArray, first: IntArray, samples: int) -> FloatArray:
-        """(lines, groups, m) light of m blocks of samples, each summed [W m^-2]; one line where light is not told
-        apart.
+        """Return the light (lines, groups, m) of m blocks of samples [W m^-2].
 
         Parameters
         ----------
-        seed
-            of the random numbers.
-        groups
-            independent estimates.
         pixels, first
-            (m,) projector pixel of each block, and the number of its first sample: samples ``first`` .. ``first +
-            samples - 1`` of the pixel's sequence are traced.
+            (m,) projector pixel of each block, and the number of its first sample in the pixel's sequence.
         samples
-            of each block.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
+            Samples of each block.
         """
         blocks, at_once = groups * len(pixels), max(1, self.paths_per_launch // samples)
         lines, projectors = self._setup.projector.lines, self._setup.projector.per_wavelength
@@ -211,7 +163,6 @@ class FluxTracer:
     def _light(
         self, seed: int, group: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32, lines: Lines | None
     ) -> mi.UnpolarizedSpectrum:
-        """Mean irradiance that one ray of each ``pixel`` brings to the sensor."""
         pixels = dr.opaque(mi.UInt32, self._setup.projector.n**2)
         shared, rng = streams(seed, pixel + group * pixels, sample)
         jitter = sobol_point(sample, shared)
@@ -233,7 +184,6 @@ class FluxTracer:
         return total
 
     def _by_turn(self, at: Arrival, number: mi.Float, point: mi.Point2f) -> mi.UnpolarizedSpectrum:
-        """What light that comes to surfaces brings over turns, drawn by a ``number`` and a ``point``."""
         turn = at.turn(number, point)
         lobe = at.active & (turn.pdf > 0) & ~mi.has_flag(turn.sampled_type, mi.BSDFFlags.Delta)
         place = landing(self._setup, at.si, at.si.to_world(turn.wo), lobe)
@@ -242,7 +192,6 @@ class FluxTracer:
         return self._by_connection(replace(at, active=lobe), mi.Point3f(place.x, place.y, 0))
 
     def _by_connection(self, at: Arrival, point: mi.Point3f) -> mi.UnpolarizedSpectrum:
-        """What it brings to a ``point`` of the sensor; over glossy surfaces, over 1 + A q."""
         reception = self._setup.receive(at.si, -at.direction, point, at.active)
         value = reception.irradiance * at.light
         if not self._glossy:
@@ -265,30 +214,19 @@ class FluxTracer:
 # of is found as well.
 
 _EVEN = 0.25
-"""Part of the rays that stays even: light that the axes do not tell of is found four times slower than without."""
+"""Part of the rays that stays even: light that the axes miss is found four times more slowly without."""
 _NEAR, _SELDOM = 6, 16
-"""Lobes' widths from a pixel's light, beyond which there is a fortieth of a GGX lobe (1 / (1 + 6^2)): of the pairs of
-pixel and anchor there, one in so many is connected, and stands for all."""
+"""Lobe widths beyond which a fortieth of a GGX lobe lies (1 / (1 + 6^2)): of these pairs of pixel and anchor one in so
+many is connected, and stands for all."""
 _AXES = 64
-"""Rays of a pixel that tell its axes: three would do for a plane, and print or bumps may hide some."""
 _FEWEST = 6
-"""Axes below which nothing is told: three numbers along each direction are fitted."""
 _SHARP_AXIS = 100.0
-"""Density [1/sr] of a turn above which it tells an axis: of lobes that take most of the light. To aim at fainter ones
-costs the rest of a pixel's light more than it gains (varnish that takes a twentieth: 1 to 3.7 times connections)."""
 _SEED = 20
-"""Of the axes' rays: any will do, for they decide how fast light is found and not how much of it there is."""
 _ROUND = 1e-6
-"""Relative size of a determinant below which pixels that are folded to a line have no inverse."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Aims:
-    """Where light for a sensor point lies in each pixel: centre + slope (u - u0); ``scale`` is the density's width.
-
-    All (m, 2) or (m, 2, 2) in parts of a pixel along (row, column); ``known`` (m,) tells pixels without an answer.
-    """
-
     centre: FloatArray
     slope: FloatArray
     scale: FloatArray
@@ -297,8 +235,6 @@ class _Aims:
 
 @dataclass
 class _Axis:
-    """Where rays along a lobe's axis meet the sensor's plane (x, y) and the lobe's radius there [mm], if known."""
-
     x: mi.Float
     y: mi.Float
     width: mi.Float
@@ -306,22 +242,9 @@ class _Axis:
 
 
 class AimedTracer(DirectTracer):
-    """Direct light of some projector pixels at a number of anchors.
-
-    Attributes
-    ----------
-    far
-        pairs, anchor * pixels + place of the pixel, that are connected seldom.
-    """
+    """Direct light of some projector pixels, aimed at anchors; pairs `far` of pixel and anchor are connected seldom."""
 
     def __init__(self, setup: OpticalSetup, anchors: int, pixels: IntArray) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        setup, anchors, pixels
-            as for :class:`DirectTracer`.
-        """
         super().__init__(setup, anchors, pixels=pixels)
         self._aims = self._aim()
         near = self._is_near().ravel()
@@ -330,7 +253,6 @@ class AimedTracer(DirectTracer):
 
     @property
     def paths_per_sample(self) -> int:
-        """Connections of one sample: all near pairs of pixel and anchor, and one of a few others."""
         return len(self._near) - (-len(self.far) // _SELDOM)
 
     def _pair(self, flight: InFlight) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
@@ -371,7 +293,6 @@ class AimedTracer(DirectTracer):
         return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values, dtype=np.float32)), number)
 
     def _aim(self) -> _Aims:
-        """Fit the axes of each pixel."""
         count = len(self._pixels)
         place, sensor, width, valid = (values.reshape(_AXES, count, -1) for values in self._axes())
         aims = _Aims(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.ones((count, 2)), np.zeros(count, bool))
@@ -392,7 +313,6 @@ class AimedTracer(DirectTracer):
         return aims
 
     def _is_near(self) -> npt.NDArray[np.bool_]:
-        """(anchors^2, pixels): whether an anchor lies within a few lobes of the pixel's light, as far as known."""
         aims = self._aims
         row, column = np.meshgrid(self.points.positions, self.points.positions, indexing="ij")
         at = np.stack([row.ravel(), column.ravel()], axis=1)
@@ -401,7 +321,6 @@ class AimedTracer(DirectTracer):
         return np.asarray((np.hypot(beyond[..., 0], beyond[..., 1]) < _NEAR) | ~aims.known)
 
     def _axes(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Rays sent on along their lobes' axes: place in the pixel (k, 2), on the sensor (k, 2) [mm], width, valid."""
         count = len(self._pixels)
         index = dr.arange(mi.UInt32, _AXES * count)
         number, sample = index % dr.opaque(mi.UInt32, count), index // dr.opaque(mi.UInt32, count)
@@ -419,7 +338,6 @@ class AimedTracer(DirectTracer):
         return stacked[0], stacked[1], np.array(width, dtype=np.float64), np.array(valid, dtype=np.float64)
 
     def _axis(self, at: Arrival, state: tuple[_Axis, mi.PCG32]) -> tuple[_Axis, mi.PCG32]:
-        """The axis of the first surface that turns a ray sharply."""
         axis, rng = state
         # The middle of the random numbers is the middle of a lobe, or near it.
         turn = at.turn(rng.next_float32(), mi.Point2f(0.5))

@@ -1,21 +1,16 @@
-"""From-camera light, followed from the camera's side: of lamps, in mirrors, and over sharp turns before the sensor.
+"""Light followed from the camera's side: of lamps, in mirrors, and over sharp turns before the sensor.
 
 A path starts at the sensor - its centre, a random point, or each of several anchors -, goes through a cell of
-directions, and connects to the lights at its vertices; a connection to the projector names the projector pixel that it
-used. The mask and the sensor pixels are applied
-afterwards in closed form (:mod:`mitsim.optics`).
-
-Value collected, for tan-angle t (the integrand of the reference estimator without its mask)::
+directions, and connects to the lights at its vertices; a connection to the projector finds the projector pixel. Mask
+and sensor pixels are applied afterwards in closed form (:mod:`mitsim.optics`). For tan-angle t a path collects::
 
     g(t) dt = L(t) (1 + |t|^2)^-2 r(t) dt          [W m^-2]        r: the pixel's angular response
 
-Most of the projector's light is followed from its own side (:mod:`mitsim.transport.direct`, `.indirect`). From here
-comes what that side cannot find: light whose last surface before the sensor is a mirror, and of indirect light the part
-over sharp turns (:func:`mitsim.transport.integrator.camera_part`).
-
-A path's light is accumulated under the direction and depth of its first vertex that is no mirror: through plane
-mirrors, of that vertex's image, which is where the camera sees it. Paths end at random (Russian roulette) with a
-probability that keeps the estimate unbiased; there is no last bounce.
+Most of the projector's light is followed from its own side (:mod:`mitsim.transport.direct`, `.indirect`). The camera's
+side finds the rest: light whose last surface before the sensor is a mirror, and the part of indirect light over sharp
+turns (:func:`mitsim.transport.integrator.camera_part`). Light is accumulated under the direction and depth of the first
+vertex that is no mirror; in plane mirrors, of its image, as the camera sees it. Russian roulette, which keeps the
+estimate unbiased, ends the paths.
 """
 
 from __future__ import annotations
@@ -53,55 +48,25 @@ from mitsim.transport.records import CellAxis, CellGrid, PathSamples, Sightings
 from mitsim.transport.transmission import refracted_way
 
 _SELDOM = 0.125
-"""Chance that a path goes on whose light its last turn before the sensor leaves to the projector's side: what earlier
-turns leave to this side is some 0.02 % of indirect light."""
+"""Chance to go on for a path whose last turn before the sensor belongs to the projector's side; earlier turns leave
+some 0.02 % of indirect light here."""
 _MARGIN = 1e-4
-"""Part of a cell that paths keep clear of its edges: 2e-7 of tan-angle, above float32's rounding of 3e-8."""
 
 
 class FromCameraTracer(FollowingTracer):
-    """From-camera light of a scene, at points of the sensor.
-
-    Attributes
-    ----------
-    of_projector
-        whether the projector's light is looked for, beside that of lamps.
-    """
+    """Light of a scene from the camera's side; `of_projector` includes the projector's light beside that of lamps."""
 
     of_projector: ClassVar[bool] = True
 
     def __init__(self, setup: OpticalSetup, grid: CellGrid, paths: Paths, points: SensorPoints | None = None) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        setup
-            scene, camera and projector.
-        grid
-            cells that paths start in, one each.
-        paths
-            which of them are followed.
-        points
-            where from; the sensor's centre if not given.
-        """
         super().__init__(setup, paths, points)
         self.grid, self.connector = grid, ProjectorConnector(setup.projector)
 
     @property
     def paths_per_sample(self) -> int:
-        """Paths in one sample: one per cell and anchor."""
         return self.grid.shape[0] * self.grid.shape[1] * self.points.count
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, mi.Spectrum]:
-        """Wavelengths of each path, and weights as :func:`mitsim.transport.connect.sample_wavelengths` has them.
-
-        Parameters
-        ----------
-        rng
-            of each path.
-        sample, shared
-            number of each path's sample, and the numbers that all samples of its cell share.
-        """
         return sample_wavelengths(self.setup.camera, rng, self.projector.lines)
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
@@ -118,19 +83,19 @@ class CameraState(PathState):
     Attributes
     ----------
     inverse_depth
-        1/z [1/mm] of the point that their light is seen at.
+        1/z of the point at which their light is seen [1/mm].
     part
-        of the light over the turn before the sensor that is theirs.
+        Part of the light over the turn before the sensor that is found here.
     kept, turned
-        of the rest of it, the parts that the projector's side keeps over the turns since the last mirror, and the last.
+        Parts that the projector's side keeps over the turns since the last mirror, and the last.
     in_mirror
-        whether a mirror made that turn.
+        True if a mirror made the turn before the sensor.
     travelled, since
-        length of the way [mm], and of that since the last turn.
+        Length of the way, and of the way since the last turn [mm].
     behind_glass
-        whether glass has bent the way since.
+        True if glass has bent the way since.
     came_from, came_pdf, by_delta
-        point of the last turn, its density [1/sr], and whether it was a mirror's.
+        Point of the last turn, its density [1/sr], and whether it was a mirror's.
     """
 
     inverse_depth: mi.Float = field(default_factory=lambda: mi.Float(0))
@@ -150,25 +115,11 @@ State = TypeVar("State", bound=CameraState)
 
 
 class CameraPaths(PathIntegrator[State]):
-    """Paths from the camera, with light of the projector, direct or indirect, and of lamps.
-
-    Of each kind of light one connection a path is kept.
-    """
+    """Paths from the camera, which keep one connection of each kind of light."""
 
     IMPORTANCE = False
 
     def __init__(self, tracer: FromCameraTracer, state: type[State], flight: InFlight) -> None:
-        """Paths before their first surface.
-
-        Parameters
-        ----------
-        tracer
-            the scene, and what is followed.
-        state
-            what is known of paths.
-        flight
-            the samples in flight.
-        """
         super().__init__(tracer)
         cell, row, column = tracer.points.of(flight.index, tracer.grid.shape[0] * tracer.grid.shape[1])
         self.anchor = row, column
@@ -204,7 +155,6 @@ class CameraPaths(PathIntegrator[State]):
         self.paths = state(active=active, ray=ray, rng=rng, sightings=sightings)
 
     def path_samples(self) -> list[PathSamples]:
-        """Light on the host of every path."""
         kept = self.follow(self.paths).sightings
         dr.eval(kept, self.anchor)
         return [PathSamples.fetch(seen, KINDS[kind], self.anchor) for kind, seen in kept.items()]
@@ -212,7 +162,6 @@ class CameraPaths(PathIntegrator[State]):
     # ---- lights that paths run into ---------------------------------------------------------------------------------
 
     def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light of lamps and of the projector's lens that paths have run into on their way to ``si``."""
         if first or self.rules.mirrors or self.passage.open:
             # Where the camera sees this vertex, unless an earlier one that is no mirror has settled it.
             depth = dr.rcp((paths.travelled + si.t) * self.slope)
@@ -227,8 +176,8 @@ class CameraPaths(PathIntegrator[State]):
     def _hit_lens(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
         """Keep light of the projector's lens.
 
-        Over mirrors alone it is the beams' (:mod:`mitsim.transport.specular`); over one other surface, unless that is
-        seen in a mirror, it is the projector's side's.
+        Light over mirrors alone belongs to the beams (:mod:`mitsim.transport.specular`); light over one other surface,
+        unless seen in a mirror, to the projector's side.
         """
         hit = self.connector.hit(paths.ray, si.t, paths.rng, self._is_foreign(paths), paths.since)
         share = dr.select(paths.by_delta, 1, _share(paths.came_pdf, hit.pdf))
@@ -236,7 +185,6 @@ class CameraPaths(PathIntegrator[State]):
         self._keep_projector(paths, hit.met, light, hit.pixel, paths.scattered)
 
     def _is_foreign(self, paths: State) -> mi.Bool:
-        """Paths that would bring light of the projector's lens which neither beams nor the projector's side bring."""
         return paths.active & (paths.scattered > dr.select(paths.in_mirror, mi.UInt32(0), mi.UInt32(1)))
 
     def _hit_lamp(self, paths: State, si: mi.SurfaceInteraction3f) -> None:
@@ -254,7 +202,6 @@ class CameraPaths(PathIntegrator[State]):
     # ---- connections ------------------------------------------------------------------------------------------------
 
     def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light of the projector and of lamps that surfaces send on along their paths."""
         bsdf = si.bsdf()
         if not first and self.tracer.of_projector:
             self._connect_projector(paths, si, bsdf)
@@ -276,7 +223,6 @@ class CameraPaths(PathIntegrator[State]):
         self._keep_projector(paths, active, light, connection.pixel, paths.scattered + 1)
 
     def _connection(self, paths: State, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Connection, mi.Spectrum]:
-        """A connection to the projector that nothing blocks, and the part of its light that arrives."""
         if not self.passage.panes:
             connection = self.connector.connect(si, paths.rng, active)
             seen, passed = self.passage.between(si, connection.target, connection.valid)
@@ -311,7 +257,6 @@ class CameraPaths(PathIntegrator[State]):
     # ---- turns ------------------------------------------------------------------------------------------------------
 
     def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
-        """Note a ``turn`` at ``si``; tells which paths may bring light that is not connected."""
         passing, pdf, going = turn.passing, turn.sample.pdf, mi.Bool(True)
         before_sensor = paths.straight & ~passing
         if first or self.passage.open:
@@ -340,12 +285,10 @@ class CameraPaths(PathIntegrator[State]):
     # ---- light that is kept -----------------------------------------------------------------------------------------
 
     def _irradiance(self, paths: State, radiance: mi.Spectrum) -> mi.UnpolarizedSpectrum:
-        """What ``radiance`` of a vertex along its path casts where the path started."""
         return mi.unpolarized_spectrum(radiance) * paths.throughput * self.weight
 
     @property
     def _lamps(self) -> mi.UInt32:
-        """The pixel that lamps' light goes by."""
         return dr.opaque(mi.UInt32, self.tracer.projector.n**2)
 
     def _keep_projector(
@@ -357,8 +300,6 @@ class CameraPaths(PathIntegrator[State]):
             self._keep(paths, "indirect", active & (order > 1), light, pixel)
 
     def _part(self, paths: State, kept: mi.Float) -> mi.Float:
-        """Of the projector's light, what its own side leaves to ``paths``, of which it keeps so much over turns before
-        the last."""
         return 1 - (1 - paths.part) * kept if self.rules.steep else paths.part
 
     def _keep(self, paths: State, kind: str, active: mi.Bool, light: mi.UnpolarizedSpectrum, pixel: mi.UInt32) -> None:
@@ -368,24 +309,20 @@ class CameraPaths(PathIntegrator[State]):
         self._join(paths, kind, Sightings.of(lit, self.by_line, pixel, row, column, paths.inverse_depth))
 
     def _join(self, paths: State, kind: str, seen: Sightings) -> None:
-        """Keep light of one connection a path, or that of an earlier one of its kind, which then stands for both."""
         paths.sightings[kind] = paths.sightings[kind].joined_by(seen, paths.rng.next_float32())
 
 
 def _share(own: mi.Float, rival: mi.Float) -> mi.Float:
-    """Balance heuristic of two ways to find the same light; a pdf of 0 means that a way cannot find it."""
     return dr.select(own > 0, own / (own + rival), 1)
 
 
 def _seen_at(si: mi.SurfaceInteraction3f, point: mi.Point3f) -> mi.SurfaceInteraction3f:
-    """The vertices at ``si``, at another ``point``."""
     apparent = mi.SurfaceInteraction3f(si)
     apparent.p = point
     return apparent
 
 
 def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
-    """Tan-angle of a place in a cell."""
     start, size = dr.opaque(mi.Float, axis.start), dr.opaque(mi.Float, axis.size)
     return start + (mi.Float(index) + jitter) * size
 
@@ -402,18 +339,16 @@ def _place(axis: CellAxis, index: mi.UInt32, jitter: mi.Float) -> mi.Float:
 
 @dataclass(frozen=True, eq=False)
 class LampResponse:
-    """How lamps' light is counted.
+    """Response of the camera to lamps.
 
     Attributes
     ----------
-    response
-        of the camera.
     bands
-        one for each wavelength of a path; of no width where less are wanted.
+        One for each wavelength of a path; of no width where fewer are needed.
     units
-        irradiance [W m^-2] of each line of the projector that a count of 1 stands for.
+        Irradiance of each line of the projector for a count of 1 [W m^-2].
     first
-        number of the first band among all that lamps' light is told apart by.
+        Number of the first band among all.
     """
 
     response: Response
@@ -423,29 +358,22 @@ class LampResponse:
 
 
 class LampTracer(FromCameraTracer):
-    """Lamps' light alone, at wavelengths of its own. Light of band b, counted from 0, is given to pixel number n^2 + b,
-    as an irradiance at the projector's line, or at each of its lines."""
+    """Light of lamps alone, at its own wavelengths.
+
+    Band b has the pixel number n^2 + b, and an irradiance at the projector's line, or at each of its lines.
+    """
 
     of_projector = False
     by_line = True
 
     def __init__(self, like: FromCameraTracer, counted: LampResponse) -> None:
-        """The paths of a tracer.
-
-        Parameters
-        ----------
-        like
-            what is followed.
-        counted
-            bands, and what they count.
-        """
         super().__init__(like.setup, like.grid, like.paths, like.points)
         self.counted = counted
         self._alone: mi.UInt32 | None = None
 
     @property
     def per_wavelength(self) -> Sequence[LampTracer]:
-        """Itself, or where glass parts wavelengths, the same for each band alone."""
+        """Itself, or one tracer for each band where glass separates wavelengths."""
         if not self.projector.parted:
             return [self]
         return [self._of(band) for band, (first, last) in enumerate(self.counted.bands) if last > first]
@@ -458,15 +386,6 @@ class LampTracer(FromCameraTracer):
     def wavelengths(
         self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32
     ) -> tuple[mi.Color0f, mi.UnpolarizedSpectrum]:
-        """Wavelengths of each path, and what its light counts at them.
-
-        Parameters
-        ----------
-        rng
-            not asked.
-        sample, shared
-            number of each path's sample, and the numbers that all samples of its cell share.
-        """
         place = sobol_point(shuffle(sample, shared), shared).x
         counts = mi.Float(self.counted.response.counts.astype(np.float32))
         steps = len(self.counted.response.counts) - 1
@@ -492,7 +411,6 @@ class LampTracer(FromCameraTracer):
         return [self._by_band(found) for found in super()._launch(flight)]
 
     def _by_band(self, found: PathSamples) -> PathSamples:
-        """An entry for each band of those that were ``found``, path by path."""
         assert found.lines is not None and found.lane is not None, "told apart by band"
         light = found.lines.T.ravel().astype(np.float64)
         several = PathSamples(
@@ -512,34 +430,18 @@ class LampTracer(FromCameraTracer):
 
 
 class CombinedTracer:
-    """Light that several tracers follow, of the same samples of each."""
+    """Sum of the light of several tracers, with the same samples of each."""
 
     def __init__(self, *tracers: Tracer) -> None:
-        """``tracers`` of one scene."""
         self.tracers = tracers
 
     @property
     def paths_per_sample(self) -> int:
-        """Paths in one sample."""
         return sum(tracer.paths_per_sample for tracer in self.tracers)
 
     def trace(self, seed: int, first: int = 0, samples: int = 1) -> PathSamples:
-        """Light of some samples, their sum; see :meth:`mitsim.transport.integrator.Tracer.trace`.
-
-        Parameters
-        ----------
-        seed, first, samples
-            as there.
-        """
         return PathSamples.join([tracer.trace(seed, first, samples) for tracer in self.tracers])
 
     def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
-        """The same of each of the ``seeds``; see :meth:`mitsim.transport.integrator.Tracer.replicates`.
-
-        Parameters
-        ----------
-        seeds, *samples, first
-            as there.
-        """
         traced = [tracer.replicates(seeds, *samples, first=first) for tracer in self.tracers]
         return [list(map(PathSamples.join, zip(*by_number, strict=True))) for by_number in zip(*traced, strict=True)]

@@ -1,16 +1,13 @@
 """Indirect light from the projector's side: every pixel's rays, followed over any number of surfaces to the sensor.
 
-At each surface after the first the light that a path carries is connected to the sensor: its centre, a random point,
-or each of several anchors, for which a path is the same and is followed once (:mod:`mitsim.transport.connect`). So
-every path that meets a second surface counts, and it counts for its own pixel. Of the connections of a path, to one
-anchor, one is handed out, drawn in proportion to its light, and it carries the light of all.
+After the first surface a path is connected at each surface to the sensor: its centre, a random point, or each of
+several anchors, for which one path serves (:mod:`mitsim.transport.connect`). So every path that meets a second surface
+counts, and for its own pixel. Of the connections of a path to one anchor, one is drawn in proportion to its light, and
+carries the light of all.
 
-Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side
-(:mod:`mitsim.transport.from_camera`) finds the light instead. :func:`mitsim.transport.integrator.camera_part` divides
-it.
-
-Light that only mirrors have turned before the last surface (a caustic) is direct light; the camera's side has no part
-in it. Paths end at random (Russian roulette) with a probability that keeps the estimate unbiased.
+Where the last surface turns light sharply, connections rarely meet the lobe; there the camera's side finds the light
+(:func:`mitsim.transport.integrator.camera_part`). Light that only mirrors have turned before the last surface (a
+caustic) belongs to direct light. Russian roulette, which keeps the estimate unbiased, ends the paths.
 """
 
 from __future__ import annotations
@@ -42,8 +39,6 @@ from mitsim.transport.plugins.base import sobol_point, streams
 from mitsim.transport.records import PathSamples, Sightings
 
 _ROOMS = (4**2, 12**2)
-"""Anchors that a path has room for: few numbers of them, as each is a kernel of its own, 0.4 s to compile; more
-than the most that a plan tries are a kernel for each number."""
 
 
 class IndirectTracer(FollowingTracer):
@@ -52,35 +47,30 @@ class IndirectTracer(FollowingTracer):
     adaptive: AdaptiveSamples | None = None
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same to one point of the sensor, blocks of pixels as often as ``repeats`` (blocks^2,) say."""
+        """Return a tracer to one point of the sensor that repeats blocks of pixels by `repeats` (blocks^2,)."""
         return self._with_counts(by_pixel(repeats, self.projector.n))
 
     def _with_counts(self, repeats: npt.NDArray[np.int64]) -> IndirectTracer:
-        """The same with ``repeats`` of single pixels, or of what else it counts."""
         again = copy(self)
         again.adaptive = AdaptiveSamples.of(repeats)
         return again
 
     @property
     def paths_per_sample(self) -> int:
-        """Paths of one sample: one per projector pixel and anchor, or as often as they are repeated."""
         return len(self.adaptive) if self.adaptive else self.projector.n**2 * self.points.count
 
     @property
     def connections_per_path(self) -> int:
-        """Anchors that each path is connected to: all of them."""
         return self.points.count
 
     @property
     def board(self) -> float:
-        """Irradiance [W m^-2] that light compares to."""
         return self.setup.board
 
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
         return self._paths(self._emission(flight)).path_samples(accumulator)
 
     def _emission(self, flight: InFlight) -> Emission:
-        """Where each path leaves the projector."""
         index, sample, weight = flight.index, flight.sample, 1.0
         if self.adaptive:
             index, sample, weight = self.adaptive.at(index, sample)
@@ -95,20 +85,18 @@ class IndirectTracer(FollowingTracer):
 
 @dataclass
 class Emission:
-    """Where paths leave the projector.
+    """Paths where they leave the projector.
 
     Attributes
     ----------
     pixel
-        of the projector.
+        Of the projector.
     anchor
-        row and column of that which each path is followed to.
-    rng
-        random numbers of each path.
+        Row and column of the anchor to which each path is followed.
     first_turn
-        point of the unit square that its first turn is drawn by.
+        Point of the unit square that draws the first turn.
     weight
-        of its light.
+        Of the light.
     """
 
     pixel: mi.UInt32
@@ -119,12 +107,11 @@ class Emission:
 
 
 class ProjectorPaths(PathIntegrator[PathState]):
-    """Paths from the projector's pixels; of each kind of light one connection a path and anchor is kept."""
+    """Paths from the projector's pixels, which keep one connection of each kind of light for each anchor."""
 
     IMPORTANCE = True
 
     def __init__(self, tracer: IndirectTracer, emission: Emission) -> None:
-        """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer)
         self.pixel, self.anchor = emission.pixel, emission.anchor
         self.first_turn, rng = emission.first_turn, emission.rng
@@ -138,7 +125,6 @@ class ProjectorPaths(PathIntegrator[PathState]):
         self.paths = PathState(active=mi.Bool(True), ray=ray, rng=rng, sightings=sightings)
 
     def _connect(self, paths: PathState, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light that surfaces send to the sensor; that of the ``first`` is the direct tracer's."""
         if first:
             return
         drawn = self._draw_numbers(paths)
@@ -151,11 +137,9 @@ class ProjectorPaths(PathIntegrator[PathState]):
 
     @staticmethod
     def _draw_numbers(paths: PathState) -> dict[str, mi.Float]:
-        """Those that choose which connection of each kind of light is kept: the same for every anchor."""
         return {kind: paths.rng.next_float32() for kind in ("direct", "indirect")}
 
     def _way(self, paths: PathState, si: mi.SurfaceInteraction3f, sensor: mi.Point3f) -> Way:
-        """To the sensor, for light that is kept."""
         # Light that has met nothing but what it passes is the direct tracer's.
         active = paths.active & ~paths.straight & self._is_wanted(paths.scattered + 1)
         return self.setup.way(si, sensor, active)
@@ -168,8 +152,6 @@ class ProjectorPaths(PathIntegrator[PathState]):
         drawn: dict[str, mi.Float],
         at: tuple[Held, mi.UInt32],
     ) -> None:
-        """Keep light that surfaces send by a ``way``, or that of an earlier connection, as the numbers ``drawn`` say;
-        either stands for both. ``at``: what is held of an anchor, and its number."""
         reception = self.setup.received(si, -paths.ray.d, way)
         light = reception.irradiance * self.flux * paths.throughput
         caustic, part = paths.scattered == 0, 1 - camera_part(reception.pdf)
@@ -184,7 +166,6 @@ class ProjectorPaths(PathIntegrator[PathState]):
                 self.connections.save(held, kind, number, joined)
 
     def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        """Light on the host of every path at every anchor; of indirect light none where there is an ``accumulator``."""
         paths = self.follow(self.paths)
         if accumulator is None:
             return self.connections.fetch(paths.sightings, tuple(paths.sightings))
@@ -203,54 +184,39 @@ class ProjectorPaths(PathIntegrator[PathState]):
 # -------- Connections of a path: to one point of the sensor, or to every anchor
 
 Held = dict[str, Any]
-"""What is kept of each kind of light."""
 
 
 class _OneConnection:
-    """Each path is connected to one point: its anchor, the sensor's centre, or a random one."""
-
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._anchor, self._sensor = emission.anchor, points.at(*emission.anchor, emission.rng)
 
     def none(self, kinds: Sequence[str], by_line: bool) -> Held:
-        """No light yet."""
         return {kind: Sightings.none(by_line) for kind in kinds}
 
     def anchor(self, number: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-        """Row and column of an anchor by its number."""
         return self._anchor
 
     def sensor(self, number: mi.UInt32) -> mi.Point3f:
-        """Its point, in the camera's frame."""
         return self._sensor
 
     def load(self, held: Held, kind: str, number: mi.UInt32) -> Sightings:
-        """Light of a ``kind`` that is held of it."""
         found: Sightings = held[kind]
         return found
 
     def save(self, held: Held, kind: str, number: mi.UInt32, seen: Sightings) -> None:
-        """Hold light that was ``seen`` there."""
         held[kind] = seen
 
     def at_each(self, held: Held, active: mi.Bool, visit: Callable[[Held, mi.UInt32], None]) -> Held:
-        """What is held when every anchor was visited, by its number, one after the other, where ``active``."""
         visit(held, mi.UInt32(0))
         return held
 
     def fetch(self, held: Held, kinds: Sequence[str], also: object = ()) -> list[PathSamples]:
-        """Light of some ``kinds`` on the host; what it takes is worked out with that of ``also``: apart, each would
-        follow all paths again."""
+        """Fetch some kinds with `also` in one kernel, because each would trace all paths again."""
         dr.eval([held[kind] for kind in kinds], self._anchor if kinds else (), also)
         return [PathSamples.fetch(held[kind], KINDS[kind], self._anchor) for kind in kinds]
 
 
 class _AnchorConnections(_OneConnection):
-    """Each path is followed once, and connected to one anchor after the other.
-
-    Each anchor's light is what it would be alone: the same random numbers choose which connection is handed out.
-    """
-
     def __init__(self, points: SensorPoints, emission: Emission) -> None:
         self._points, self._pixel = points, emission.pixel
         self._side, self._count = (dr.opaque(mi.UInt32, each) for each in (points.anchors, points.count))
@@ -300,13 +266,11 @@ class _AnchorConnections(_OneConnection):
 
 
 def _differing(seen: Sightings) -> list[mi.Float]:
-    """What differs between the anchors of a path, of :class:`Sightings`."""
     lines = () if seen.lines is None else seen.lines
     return [seen.value, seen.row, seen.column, seen.inverse_depth, *lines]
 
 
 def _sightings(pixel: mi.UInt32, differing: Sequence[mi.Float]) -> Sightings:
-    """Those of a ``pixel`` that differ so."""
     value, row, column, inverse_depth, *lines = differing
     return Sightings(value, pixel, row, column, inverse_depth, mi.UnpolarizedSpectrum(*lines) if lines else None)
 
@@ -318,30 +282,17 @@ def _sightings(pixel: mi.UInt32, differing: Sequence[mi.Float]) -> Sightings:
 # sample holds the mean of a block's paths, so that the light stays what it is whatever the numbers.
 
 SIDE = 4
-"""Pixels a side of a block, below the 7 of usual shifting dots, whose classes then differ."""
+"""Pixels along an axis of a block: fewer than the 7 of usual shifting dots, whose classes then differ."""
 MEMBERS = SIDE**2
-"""Pixels of a block."""
 _MOST = 8
-"""Paths of a pixel in a sample, at most: what a short look takes for noisy may be a single path."""
 _SCALES = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
-"""Paths of a block of mean noise that are tried: whole numbers fit one scale better than another."""
 
 
 def blocks_of(pixels: int) -> int:
-    """Blocks a side of ``pixels``."""
     return -(-pixels // SIDE)
 
 
 def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) -> FloatArray:
-    """(blocks, blocks) sums of squares of ``light`` by the block of its ``pixel``.
-
-    Parameters
-    ----------
-    pixel, light
-        (m,) of paths.
-    pixels
-        of the projector, a side.
-    """
     row, column = np.divmod(pixel, pixels)
     count = blocks_of(pixels)
     place = row // SIDE * count + column // SIDE
@@ -349,9 +300,9 @@ def block_moments(pixel: npt.NDArray[np.int64], light: FloatArray, pixels: int) 
 
 
 def adaptive_counts(moments: FloatArray) -> npt.NDArray[np.int64]:
-    """(blocks, blocks) paths of each block's pixels in a sample, of the least variance times cost.
+    """Return the paths (blocks, blocks) of each block's pixels in a sample, of least variance times cost.
 
-    ``moments`` (blocks, blocks) are smoothed over neighbours first; blocks without light count a tenth of the mean.
+    Moments are smoothed over neighbours first; blocks without light count a tenth of the mean.
     """
     if not moments.any():
         return np.ones(moments.shape, dtype=np.int64)
@@ -362,19 +313,18 @@ def adaptive_counts(moments: FloatArray) -> npt.NDArray[np.int64]:
 
 
 def effect_of(repeats: npt.NDArray[np.int64], moments: FloatArray) -> tuple[float, float]:
-    """Variance and paths of a sample with ``repeats``, each over those without, by ``moments`` of the light."""
     total = float(moments.sum())
     return float((moments / repeats).sum()) / total if total else 1.0, float(repeats.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveSamples:
-    """Which block, or pixel, each of a sample's units of paths belongs to.
+    """Block, or pixel, of each of a sample's units of paths.
 
     Attributes
     ----------
     unit, turn, count
-        (units,) its number, which of its paths in the sample this is, and how many there are.
+        (units,) its number, the number of the path in the sample, and the number of such paths.
     """
 
     unit: mi.UInt32
@@ -383,7 +333,6 @@ class AdaptiveSamples:
 
     @classmethod
     def of(cls, repeats: npt.NDArray[np.int64]) -> AdaptiveSamples:
-        """Those of units that have so many ``repeats`` (units,)."""
         unit = np.repeat(np.arange(len(repeats)), repeats)
         starts = np.cumsum(repeats) - repeats
         turn = np.arange(len(unit)) - starts[unit]
@@ -393,21 +342,11 @@ class AdaptiveSamples:
         return int(dr.width(self.unit))
 
     def at(self, index: mi.UInt32, sample: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
-        """Unit, number of its own sample, and weight of entry ``index`` in ``sample``."""
         unit, turn, count = (dr.gather(mi.UInt32, each, index) for each in (self.unit, self.turn, self.count))
         return unit, sample * count + turn, dr.rcp(mi.Float(count))
 
 
 def by_pixel(repeats: Sequence[int], pixels: int) -> npt.NDArray[np.int64]:
-    """(pixels^2,) repeats of each pixel, from those of the blocks row by row.
-
-    Parameters
-    ----------
-    repeats
-        of (blocks^2,) blocks.
-    pixels
-        a side.
-    """
     count = blocks_of(pixels)
     whole = np.kron(np.reshape(repeats, (count, count)), np.ones((SIDE, SIDE), dtype=np.int64))
     return np.ascontiguousarray(whole[:pixels, :pixels]).ravel()

@@ -1,10 +1,8 @@
 """The path loop: from a scene, and where paths start and connect, to the light that they bring to the camera.
 
 Paths from the projector (:mod:`~mitsim.transport.indirect`; with common vertices, :mod:`~mitsim.transport.path_reuse`)
-and from the camera (:mod:`~mitsim.transport.from_camera`) go through one loop, :class:`PathIntegrator`. Direct light
-(:mod:`~mitsim.transport.direct`) does not: at its points no direction is drawn, it is split where a surface lets it
-pass, and its random numbers are others. Nor do specular chains, which are traced on the host in double precision
-(:mod:`~mitsim.transport.specular_rays`).
+and from the camera (:mod:`~mitsim.transport.from_camera`) go through :class:`PathIntegrator`. Direct light draws no
+direction, and specular chains are traced on the host in double precision; they have loops of their own.
 """
 
 from __future__ import annotations
@@ -33,47 +31,28 @@ if TYPE_CHECKING:
     from mitsim.transport.projector import ProjectorOptics
 
 KINDS = MappingProxyType({"direct": DIRECT, "indirect": INDIRECT, "ambient": AMBIENT})
-"""Kinds of light by their names in the loop."""
 PATHS_PER_LAUNCH = 2**22
-"""Paths of one kernel: at some 100 bytes of state each, 0.4 GB; and a launch's fixed cost is small beside its work."""
 _SHARP = 1.0
-"""Density [1/sr] of sampling a turn above which its light is looked for from the camera.
-
-Three times a matt surface's 0.32, so that none of its light is, and low enough for connections to hold the rest.
-"""
+"""Density [1/sr] of a turn above which its light is followed from the camera: three times a matt surface's 0.32, so
+that connections keep all matt light."""
 _STEEP = 64.0
-"""Factor of a later turn's shading normal above which its light is looked for from the camera: 0.02 % of cookie_bag's
-indirect light, of which ten of seventeen million paths made half of the variance."""
+"""Factor of a later turn's shading normal above which light is followed from the camera: 0.02 % of cookie_bag's
+indirect light, in which ten of seventeen million paths made half of the variance."""
 _MIRRORS = 16
-"""Mirrors that a path meets without the risk to end there: as many as specular chains may have."""
 _LONGEST = 0.999
-"""Largest chance to go on: paths end even where nothing is absorbed.
+"""Largest chance to go on, so that paths end even where nothing is absorbed.
 
 In a closed room of reflectance rho the light of a path grows by rho / chance a reflection, and its second moment is
-finite only while rho^2 < chance. A chance of 0.95 at most lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
+finite only while rho^2 < chance. A chance of 0.95 lost 10 % of the light at reflectance 0.99, 79 % at 0.999.
 """
 ANY = 2**31
-"""More surfaces than any path meets; one more fits 32 bits."""
 _NOTED = 32
-"""Traces after which Dr.Jit's history of kernels is taken, which waits for the last of them: their texts are 10 MB."""
 _LEAST_CHANCE = 1e-6
-"""Throughput is divided by no less than this: paths of chance 0 have ended, and 1/0 must not be worked out for them."""
 
 
 def launches(
     paths_per_sample: int, first: int, samples: int, at_once: int = PATHS_PER_LAUNCH
 ) -> Iterator[tuple[mi.UInt32, mi.UInt32]]:
-    """(sample, lane) of every path, one kernel's at a time.
-
-    Parameters
-    ----------
-    paths_per_sample
-        paths of one sample.
-    first, samples
-        samples ``first`` .. ``first + samples - 1`` are meant.
-    at_once
-        paths of one kernel.
-    """
     total, start = paths_per_sample * samples, paths_per_sample * first
     for done in range(0, total, at_once):
         index = dr.arange(mi.UInt64, min(at_once, total - done)) + dr.opaque(mi.UInt64, start + done)
@@ -84,27 +63,17 @@ def launches(
 
 @dataclass(frozen=True, eq=False)
 class InFlight:
-    """Samples in flight, those of one kernel: their ``seed``, the number of each ``sample``, and the ``index`` of its
-    path in the sample, which tells pixel or cell, and anchor."""
-
     seed: mi.UInt32
     sample: mi.UInt32
     index: mi.UInt32
 
 
 class Tracer(ABC):
-    """Light of a scene; prepared once, each seed is an independent estimate.
-
-    Attributes
-    ----------
-    paths_per_launch
-        paths of one kernel.
-    """
+    """Tracer of a scene's light; prepared once, and each seed gives an independent estimate."""
 
     paths_per_launch: ClassVar[int] = PATHS_PER_LAUNCH
 
     def __init__(self, setup: OpticalSetup, points: SensorPoints | None = None) -> None:
-        """Light that is followed in a ``setup``, to ``points`` of the sensor; to its centre if not given."""
         self.setup, self.projector = setup, setup.projector
         self.points = points or SensorPoints(setup.geometry.half_width)
 
@@ -115,12 +84,11 @@ class Tracer(ABC):
 
     @property
     def connections_per_path(self) -> int:
-        """Of those, how many each path of a kernel stands for."""
         return 1
 
     @property
     def per_wavelength(self) -> Sequence[Self]:
-        """Itself, or where glass parts light of several wavelengths, the same for each of them alone."""
+        """Itself, or one tracer for each wavelength where glass separates them."""
         projectors = self.projector.per_wavelength
         return [self] if len(projectors) == 1 else [self._lit_by(projector) for projector in projectors]
 
@@ -131,10 +99,9 @@ class Tracer(ABC):
 
     @abstractmethod
     def _launch(self, flight: InFlight, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        """Light of the paths of one kernel, but for what is added up in the ``accumulator``."""
+        """Trace the paths of one kernel."""
 
     def _flights(self, seeds: Sequence[int], first: int, samples: int) -> Iterator[InFlight]:
-        """Some samples of each of the ``seeds``, one seed after the other, those of one kernel at a time."""
         count = self.connections_per_path
         at_once = max(1, self.paths_per_launch // count)
         # Looked up, also where there is but one, so that one kernel serves any number; Dr.Jit looks nothing up in one.
@@ -146,21 +113,9 @@ class Tracer(ABC):
 
     @keep_scenes()
     def replicates(self, seeds: Sequence[int], *samples: int, first: int = 0) -> list[list[PathSamples]]:
-        """Light of so many ``samples`` of each of the ``seeds``, by number; one kernel traces it all.
+        """Return the light of `samples` of each seed, from one kernel.
 
-        Parameters
-        ----------
-        seeds
-            of the random numbers.
-        *samples
-            numbers, the largest last.
-        first
-            of the samples.
-
-        Raises
-        ------
-        MitsimError
-            as :meth:`trace`.
+        The numbers of samples increase.
         """
         each, most = self.paths_per_sample, samples[-1]
         starts = [each * most * place for place in range(len(seeds))]
@@ -181,21 +136,9 @@ class Tracer(ABC):
     def trace(
         self, seed: int, first: int = 0, samples: int = 1, accumulator: DeviceAccumulator | None = None
     ) -> PathSamples:
-        """Light of some samples, their sum; on the host, but for what is added up where it is traced.
+        """Return the light of samples from ``first`` on, except for that in an accumulator.
 
-        Parameters
-        ----------
-        seed
-            of the random numbers.
-        first, samples
-            samples ``first`` .. ``first + samples - 1`` of the seed's sequence are traced.
-        accumulator
-            of light by pixel, whose unit is the tracer's ``board``. From the camera's side none is filled.
-
-        Raises
-        ------
-        MitsimError
-            when the scene sends NaN or infinite light to the camera.
+        The accumulator's unit is ``board``; the camera's side fills none. Raise MitsimError for NaN or infinite light.
         """
         parts = list[PathSamples]()
         for tracer in self.per_wavelength:
@@ -211,12 +154,11 @@ class Tracer(ABC):
 
 @dataclass(frozen=True)
 class Paths:
-    """Which light is followed besides projector - surface - camera.
+    """Light that is followed besides projector - surface - camera.
 
-    ``mirrors``: over delta reflections and transmissions, from the camera only on its side; ``interreflection``: any
-    number of bounces; ``emitters``: other lights of the scene, all of them one class of ambient light, which the camera
-    alone finds; ``steep``: whether light that shading normals or hair make heavy is divided between both
-    sides (:func:`projector_part`).
+    ``mirrors``: over delta reflections and transmissions, on the camera's side; ``interreflection``: any number of
+    bounces; ``emitters``: other lights of the scene, one class of ambient light, on the camera's side; ``steep``:
+    divide light that shading normals or hair make heavy between both sides (:func:`projector_part`).
     """
 
     mirrors: bool = False
@@ -226,37 +168,23 @@ class Paths:
 
 
 class FollowingTracer(Tracer):
-    """Light that is followed over any number of surfaces, or of some orders alone.
+    """Tracer of light over any number of surfaces, or of some orders.
 
     The *order* of light is the number of surfaces that have turned it and are no mirrors: 1 for what a projector lights
-    and the sensor sees, 0 for a lamp that is seen.
+    and the sensor sees, 0 for a lamp in view.
     """
 
     orders: tuple[int, int] | None = None
 
     def __init__(self, setup: OpticalSetup, paths: Paths, points: SensorPoints | None = None) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        setup
-            scene, camera and projector.
-        paths
-            which of them are followed.
-        points
-            of the sensor, that they lead to or start at; its centre if not given.
-        """
         super().__init__(setup, points)
         self.paths = paths
 
     @property
     def by_line(self) -> bool:
-        """Whether light is told apart by the wavelengths of its paths."""
         return self.projector.by_line
 
     def of_orders(self, fewest: int, most: int) -> Self:
-        """The same paths, whose light is kept of the orders ``fewest`` to ``most``, and which end where no more can
-        come; one kernel serves all of them."""
         again = copy(self)
         again.orders = fewest, most
         return again
@@ -267,26 +195,19 @@ class FollowingTracer(Tracer):
 
 @dataclass(kw_only=True)
 class PathState:
-    """A buffer of paths under way, one entry a path.
+    """Buffer of paths under way.
 
     Attributes
     ----------
-    active
-        which paths still go on.
-    ray
-        toward their next vertex.
-    rng
-        random numbers of each.
     sightings
-        light that is kept of each, by its kind in :data:`KINDS`.
+        Light kept of each path, by its kind in :data:`KINDS`.
     throughput
-        part of their light, or of their weight, that is left.
-    depth
-        vertices that turned them, mirrors with them.
-    scattered
-        those of them that are no mirrors.
+        Part of the light, or of the weight, that is left.
+    depth, scattered
+        Vertices that turned the path, with and without mirrors.
     straight
-        which have only passed surfaces so far (:mod:`mitsim.transport.transmission`): theirs is direct light's own.
+        True for paths that have only passed surfaces (:mod:`mitsim.transport.transmission`), which are direct light's
+        own.
     """
 
     active: mi.Bool
@@ -304,43 +225,35 @@ State = TypeVar("State", bound=PathState)
 
 @dataclass
 class Turn:
-    """Where paths go on from a vertex: the sample of its BSDF, whether it only passes the surface, and whether a mirror
-    turns it."""
-
     sample: mi.BSDFSample3f
     passing: mi.Bool
     delta: mi.Bool
 
 
 class PathIntegrator(ABC, Generic[State]):
-    """The paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
+    """Paths of one launch, followed from vertex to vertex: the first apart, all others in a loop of one kernel.
 
-    A subclass says where paths start, what light they bring from a vertex, and whose light they carry: the projector's
-    (``IMPORTANCE``), or that which the camera sees.
+    A subclass defines where paths start, what light they bring from a vertex, and whether they carry the projector's
+    light (``IMPORTANCE``) or the light that the camera sees.
     """
 
     IMPORTANCE: ClassVar[bool]
 
     first_turn: mi.Point2f | None = None
-    """Point that the first turn is drawn by, in place of a random one."""
     reach: int = 1
-    """How many more surfaces that are no mirrors turn the light of a path that goes on, at least."""
+    """Least number of surfaces that still turn the light of a path that goes on."""
 
     def __init__(self, tracer: FollowingTracer) -> None:
-        """Of what a ``tracer`` follows."""
         self.rules, self.setup, self.by_line = tracer.paths, tracer.setup, tracer.by_line
         self.scene, self.passage = tracer.setup.scene, tracer.setup.passage
         self.followed = self.rules.mirrors or self.rules.interreflection or self.passage.open
         self._orders = [dr.opaque(mi.UInt32, order) for order in tracer.orders or ()]
 
     def follow(self, paths: State) -> State:
-        """``paths`` at their end, all light of them kept."""
         self.vertex(paths, first=True)
         return self.follow_on(paths) if self.followed else paths
 
     def follow_on(self, paths: State) -> State:
-        """The same of ``paths`` from a later vertex than the first."""
-
         def further(paths: State) -> tuple[State]:
             self.vertex(paths, first=False)
             return (paths,)
@@ -348,7 +261,6 @@ class PathIntegrator(ABC, Generic[State]):
         return dr.while_loop((paths,), lambda paths: paths.active, further)[0]  # type: ignore[no-any-return]
 
     def vertex(self, paths: State, first: bool) -> None:
-        """Take all ``paths`` over their next vertex: their ``first``, or a later one."""
         # ---- Surface interaction: to the first one rays of neighbours go side by side, in half the time of others
         si = self.scene.ray_intersect(paths.ray, mi.RayFlags.All, first, paths.active)
 
@@ -364,15 +276,6 @@ class PathIntegrator(ABC, Generic[State]):
             self.scatter(paths, si, first)
 
     def scatter(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Turn paths as the BSDFs of their vertices say, and end some of them.
-
-        Parameters
-        ----------
-        paths, si
-            their state, and the surfaces that they have met.
-        first
-            whether these are their first vertices.
-        """
         # ---- BSDF sample; the connection may have looked at the surface from elsewhere
         toward, rules = -paths.ray.d, self.rules
         si.wi = si.to_local(toward)
@@ -420,18 +323,16 @@ class PathIntegrator(ABC, Generic[State]):
         paths.ray = self.passage.leaving(si, onward)
 
     def _run_into(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light that paths have run into on their way to ``si``; none from the projector's side."""
+        """Keep light that paths meet on their way; none from the projector's side."""
 
     @abstractmethod
     def _connect(self, paths: State, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light that the vertices at ``si`` send to the sensor, or along their paths to it."""
+        """Keep light that the vertices send to the sensor, or along their paths."""
 
     def _note_turn(self, paths: State, si: mi.SurfaceInteraction3f, turn: Turn, first: bool) -> mi.Bool:
-        """Note a ``turn`` at ``si``; tells which paths may go on."""
         return mi.Bool(True)
 
     def _is_wanted(self, order: mi.UInt32) -> mi.Bool:
-        """Whether light of an ``order`` is kept."""
         if not self._orders:
             return mi.Bool(True)
         fewest, most = self._orders
@@ -439,7 +340,7 @@ class PathIntegrator(ABC, Generic[State]):
 
 
 def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
-    """Whether the direction of ``sample`` is a mirror's, reflected or refracted."""
+    """Return True for the direction of a mirror, reflected or refracted."""
     mirror = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     return (sample.sampled_type & mirror) != 0
 
@@ -447,67 +348,48 @@ def is_delta(sample: mi.BSDFSample3f) -> mi.Bool:
 def shading_correction(
     si: mi.SurfaceInteraction3f, local: mi.Vector3f, onward: mi.Vector3f, toward: mi.Vector3f
 ) -> mi.Float:
-    """Factor of light that is followed forward and so sees shading normals the other way round (Veach 1997, 5.3).
-
-    Parameters
-    ----------
-    si
-        points of surfaces.
-    local, onward
-        direction in which it goes on, in the shading frame and in the world.
-    toward
-        that in which it came from, in the world.
-    """
+    """Return the factor of light followed forward, which sees shading normals the other way (Veach 1997, 5.3)."""
     correction = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, onward)
     return correction / (mi.Frame3f.cos_theta(local) * dr.dot(si.n, toward))
 
 
 def tilt(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
-    """Cosine of a ``direction`` to the shading normals at ``si`` over that to the geometric ones."""
+    """Return the cosine of a direction to the shading normals over that to the geometric ones."""
     return dr.dot(si.sh_frame.n, direction) / dr.dot(si.n, direction)
 
 
 def part_over_turn(paths: PathState, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
-    """Return the part of the light of ``paths`` over their next turn at ``si`` that is followed from the projector.
+    """Return the part of the light over the next turn that is followed from the projector.
 
-    Of a first turn only :func:`matt_part` counts, and after a mirror all is followed, because the camera's side finds
+    For a first turn only :func:`matt_part` counts, and after a mirror the part is one, because the camera's side finds
     nothing there.
-
-    Parameters
-    ----------
-    paths, si
-        their state, and the surfaces that they have met.
-    correction
-        factor of the shading normals there.
     """
     later = dr.select(paths.scattered > 0, projector_part(si, correction), matt_part(si))
     return dr.select(paths.depth == paths.scattered, later, 1)
 
 
 def projector_part(si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float:
-    """Return the part of the light over a turn at ``si``, but for its first, that is followed from the projector.
+    """Return the part of the light over a later turn that is followed from the projector.
 
-    A shading normal multiplies it by a ``correction``. The rest is followed from the camera, whose side has no factor.
-
-    Grazing light is met in proportion to its cosine, and multiplied by its inverse: the variance would have no end.
+    A shading normal multiplies it by a correction, which the camera's side has not. Grazing light is met in proportion
+    to its cosine and multiplied by its inverse: the variance would be infinite.
     """
     return matt_part(si) * dr.select(dr.abs(correction) > _STEEP, _STEEP / dr.abs(correction), 1)
 
 
 def matt_part(si: mi.SurfaceInteraction3f) -> mi.Float:
-    """Return 0 where the surfaces at ``si`` are hair, whose light is followed from the camera, and 1 elsewhere.
+    """Return 0 for hair, whose light is followed from the camera, and 1 elsewhere.
 
-    Mitsuba samples hair for a view. Forward, its values have the inverse cosine of grazing light, and their ratio to
-    the density has no bound: single paths had a third of the light of a quarter million.
+    Mitsuba samples hair for a view. Forward, its values over the density have no bound: single paths had a third of the
+    light of a quarter million.
     """
     return dr.select(holds_hair(si.bsdf().flags()), mi.Float(0), 1)
 
 
 def camera_part(pdf: mi.Float) -> mi.Float:
-    """Part of the light over the last turn before the sensor that is followed from the camera; the rest is connected.
+    """Return the part of the light over the last turn before the sensor that is followed from the camera.
 
-    ``pdf`` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to
-    one. A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light: it is bounded however sharp
-    the lobe. What is matt is never followed from the camera.
+    `pdf` [1/sr] is that of sampling the turn from the camera's side, which both sides know, so the parts add up to one.
+    A connection to a lobe sharper than ``_SHARP`` keeps ``_SHARP / pdf`` of its light, so that it is bounded.
     """
     return dr.select(pdf > _SHARP, 1 - _SHARP * dr.rcp(pdf), 0)

@@ -1,19 +1,18 @@
-"""Light that tracers find seldom or never: a scene and its projector in, how much of it there is and whose out.
+"""Undetected light: estimate of the light that tracers find seldom or never, and its source.
 
-Light that mirrors or curved glass bring both from the projector to a surface and from there to the camera (a print in a
-bottle), and the part of indirect light that is followed from the camera to a caustic: a path from the camera meets no
-pinhole, and none from the projector the sensor's centre. So rays of the projector are followed over mirrors to where
-they land, and what lands near the vertices of paths from the camera is what these lack: light per area, over small
-squares of a surface. A lens of the projector's own paths run into by chance, but seldom where it is small.
+Mirrors or curved glass may bring light both from the projector to a surface and from there to the camera (a print in a
+bottle). A path from the camera meets no pinhole, and none from the projector the sensor's centre; the same holds for
+the part of indirect light that is followed from the camera to a caustic. So rays of the projector are followed over
+mirrors to where they land, and those that land near the vertices of paths from the camera give the missing light: light
+per area, over small squares of a surface. Paths run into a lens of the projector by chance, but seldom if it is small.
 
-Other paths come over one mirror and one sharp lobe: a small lens in the pinhole's place casts the same light, and they
+Other paths come over one mirror and one sharp lobe. A small lens in the pinhole's place casts the same light, and paths
 run into it. Connections may meet such a lobe by chance: of the projector's side from the lobe to the sensor, of the
-camera's side from the lobe, seen in a mirror, to the projector. With x the light of a
-path that runs into the lens and I that of the connection along the same way, E[x I] is a connection's second moment, so
-a sample of connections sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would. Whether that is
-enough, whoever asks knows: lobes of curved surfaces are met seldom however broad they are.
+camera's side from the lobe, seen in a mirror, to the projector. With x the light of a path that runs into the lens and
+I that of the connection along the same way, E[x I] is a connection's second moment, so that a sample of connections
+sees the light L of a shape's lobes as ``L^2 / E[x I]`` equal hits would.
 
-Lobes that the projector lights itself, and the highlights of glossy balls, are looked for from the surface.
+Lobes that the projector lights itself, and the highlights of glossy balls, are searched from the surface.
 """
 
 from __future__ import annotations
@@ -48,26 +47,24 @@ from mitsim.transport.specular import turned_by_mirrors
 from mitsim.transport.transmission import Arrival
 
 _CUBE, _CUBES = 5e-3, 2**20
-"""Side of cubes over the scene's distance, 2 mm at 400, and codes of them: a surface that crosses a cube has the area
-of its square, or at 45 degrees 0.94 of that in the mean, and finer caustics have the right light in the mean."""
+"""Side of cubes over the scene's distance, 2 mm at 400, and their codes. A surface that crosses a cube counts with the
+area of its square (at 45 degrees 0.94 of that in the mean)."""
 _GRAZING = 1e-3
-"""Least cosine that light on a surface is divided by."""
 _LENS = 0.02
 """Radius of the lens over the scene's distance: 8 mm at 400, which one path in 3000 meets from a matt surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Light that is left out, by the place among the scene's shapes of what it comes over, (k,) each.
+    """Omitted light by shape, (k,) each.
 
     Attributes
     ----------
     mirrors, lens_hits
-        irradiance at the sensor's centre [W m^-2] that no connection finds, by the last mirror or glass, seen from the
-        camera; equal hits of the projector's own lens that a sample of paths makes.
+        Irradiance at the sensor's centre that no connection finds, by the last mirror or glass before the camera
+        [W m^-2]; equal hits of the projector's own lens in a sample of paths.
     lobes, hits
-        irradiance over a mirror and one sharp lobe, by the shape that has the lobe; equal hits that a sample of
-        connections makes.
+        Irradiance over a mirror and one sharp lobe, by the shape with the lobe; equal hits in a sample of connections.
     """
 
     mirrors: FloatArray
@@ -77,13 +74,12 @@ class LeftOut:
 
     @classmethod
     def none(cls) -> LeftOut:
-        """Nothing."""
         return cls(*np.zeros((4, 0)))
 
     def unseen(self, fewest: float, of_lens: float) -> tuple[float, int | None]:
-        """Irradiance that nothing tells of, and over which shape most of it comes.
+        """Return the irradiance that is not measured, and the shape of its largest part.
 
-        ``fewest``: hits of a sample that tell of a lobe; ``of_lens``: of the projector's own lens, that tell of light.
+        Measured light has at least ``fewest`` hits of a lobe, or ``of_lens`` hits of the projector's own lens.
         """
         light = np.where(self.lens_hits < of_lens, self.mirrors, 0) + np.where(self.hits < fewest, self.lobes, 0)
         return float(light.sum()), int(np.argmax(light)) if light.any() else None
@@ -91,22 +87,7 @@ class LeftOut:
 
 @keep_scenes()
 def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int) -> LeftOut:
-    """Light that is left out, or may be.
-
-    Parameters
-    ----------
-    setup
-        scene, camera and projector.
-    grid
-        cells that paths start in.
-    seed, samples
-        of the random numbers, and paths of each cell.
-
-    Raises
-    ------
-    MitsimError
-        when the scene sends NaN or infinite light to the camera.
-    """
+    """Estimate the light that is omitted, or may be, from `samples` paths of each cell."""
     far = setup.geometry.scene_distance
     lens = replace(setup.projector, aperture=_LENS * far, focus=far)
     tracer = _MissedTracer(replace(setup, projector=lens), grid, Paths(mirrors=True, interreflection=True))
@@ -128,15 +109,11 @@ def left_out_light(setup: OpticalSetup, grid: CellGrid, seed: int, samples: int)
 
 
 def _equal_hits(light: FloatArray, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``light`` (k,) by shape, and from the second ``moments`` of a sample how many equal hits it is."""
     return light, np.divide(np.square(light), moments, out=np.zeros(len(light)), where=light > 0)
 
 
 @dataclass
 class _Turned:
-    """Rays that mirrors have turned, where they met surfaces: place, direction, the mirror, flux [W m^-2 mm^2], and
-    what of it leaves 1 mm^2 at unit distance."""
-
     place: mi.Vector3f
     direction: mi.Vector3f
     mirror: mi.UInt32
@@ -146,15 +123,12 @@ class _Turned:
 
 @dataclass(frozen=True, eq=False)
 class _Landed:
-    """``rays`` in the order of cubes of space: the ``first`` of each cube, by its code, and cubes' ``side`` [mm]."""
-
     first: mi.UInt32
     side: mi.Float
     rays: _Turned
 
     @classmethod
     def of(cls, setup: OpticalSetup) -> _Landed | None:
-        """Those of a ``setup``; None where there are none."""
         found = turned_by_mirrors(setup.scene, setup.camera, setup.projector)
         if not (count := len(found.index)):
             return None
@@ -170,8 +144,11 @@ class _Landed:
     def light(
         self, si: mi.SurfaceInteraction3f, rng: mi.PCG32, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum, mi.UInt32]:
-        """Radiance that surfaces at ``si`` send on of the light in their cubes, one ray of each being drawn by ``rng``
-        for all; that of a lens of 1 mm^2 in the pinhole's place, where a turn meets it; and the mirror."""
+        """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all.
+
+        Further results are the radiance of a lens of 1 mm^2 in the pinhole's place, where a turn meets it, and the
+        mirror.
+        """
         code = _cube(si.p, self.side)
         first, end = (dr.gather(mi.UInt32, self.first, code + step, active) for step in (0, 1))
         count = mi.Float(end - first)
@@ -187,15 +164,11 @@ class _Landed:
 
 
 def _cube(place: mi.Point3f, side: mi.Float) -> mi.UInt32:
-    """Code of the cube that a ``place`` lies in, off the planes where scenes have their walls."""
     x, y, z = (mi.UInt32(mi.Int32(dr.floor(part / side + 0.381966))) for part in place)
     return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & (_CUBES - 1)
 
 
 class _MissedTracer(FromCameraTracer):
-    """Light that no connection finds as indirect light, that over a mirror and a lobe as direct light, by shape; in the
-    row's stead what a path into a lens of 1 mm^2 brings, or a connection."""
-
     landed: _Landed | None
 
     def _paths(self, flight: InFlight) -> _MissedPaths:
@@ -204,15 +177,11 @@ class _MissedTracer(FromCameraTracer):
 
 @dataclass(kw_only=True)
 class _MissedState(CameraState):
-    """``lobe`` is the last shape that scattered a path, ``density`` that of the turn there."""
-
     lobe: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))
     density: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
 class _MissedPaths(CameraPaths[_MissedState]):
-    """Paths from the camera that only running into the lens, or what mirrors bring to their vertices, can end."""
-
     tracer: _MissedTracer
 
     def __init__(self, tracer: _MissedTracer, flight: InFlight) -> None:
@@ -220,7 +189,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
         self._rays = tracer.setup.rays  # made before the loop, in which nothing can be evaluated
 
     def _connect(self, paths: _MissedState, si: mi.SurfaceInteraction3f, first: bool) -> None:
-        """Keep light that mirrors bring, from where it lands; what connections find is not left out."""
         if first or self.tracer.landed is None:
             return
         foreign = paths.active & (paths.in_mirror | (paths.scattered > 0))
@@ -231,7 +199,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
         self._join(paths, "indirect", Sightings.of(missed, self.by_line, mirror, panchromatic(hit), none, none))
 
     def _hit_lens(self, paths: _MissedState, si: mi.SurfaceInteraction3f) -> None:
-        """Keep light over a mirror and a sharp lobe."""
         once = paths.active & (paths.scattered == 1) & (paths.in_mirror != paths.by_delta)
         met = once & (camera_part(paths.density) > 0)
         hit = self.connector.hit(paths.ray, si.t, paths.rng, met, paths.since)
@@ -244,7 +211,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
         )
 
     def _projector_light(self, paths: _MissedState, hit: LensHit) -> mi.Float:
-        """What a connection of the projector's side, from the first surface to the sensor, brings [W m^-2]."""
         grid = self.tracer.grid
         flux = self._rays.flux(hit.pixel, paths.ray.wavelengths)
         # The path's weight without its part of the view; its first surface is at 1 / (inverse depth * slope).
@@ -262,7 +228,6 @@ class _MissedPaths(CameraPaths[_MissedState]):
 
 
 def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
-    """Places, among the shapes of a ``scene``, of those that reflect or bend light into single directions."""
     polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     shapes = enumerate(scene.shapes())
     return tuple(number for number, shape in shapes if shape.bsdf() is not None and shape.bsdf().flags() & polished)
@@ -276,15 +241,11 @@ def polished_shapes(scene: mi.Scene) -> tuple[int, ...]:
 # and what they send to the sensor's centre is added up with the scene's own materials and shadows.
 
 _POINTS, _NEAREST = 512, 1e-4
-"""Points about each spot, which tell its light to some 5 %, and the angle from its middle that they begin at."""
+"""Points about each spot, which measure its light to some 5 %, and the angle from its middle where they begin."""
 _MOST_BALLS = 2**12
-"""Balls that are looked at, every so many of more: two million points, some 0.5 s."""
 _GOLDEN = math.pi * (3 - math.sqrt(5))
-"""Angle by which points about a spot follow each other: evenly spread at any number."""
 _FEWEST_MET = 3.0
-"""Below so many meetings of all small highlights the pilot may see none, one time in twenty."""
 _ON_BALL = 1e-2
-"""Distance, in radii, within which a ray has met the point that it was aimed at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,11 +255,11 @@ class Highlights:
     Attributes
     ----------
     pixels
-        (k,) projector pixel that each spot lies in.
+        (k,) projector pixel of each spot.
     irradiance
-        (k,) that it brings to the sensor's centre without the mask [W m^-2].
+        (k,) on the sensor's centre without the mask [W m^-2].
     moments
-        (k,) second moment of what one ray of every projector pixel brings of it [W^2 m^-4].
+        (k,) second moment of the light of one ray of every projector pixel [W^2 m^-4].
     """
 
     pixels: Labels
@@ -306,8 +267,6 @@ class Highlights:
     moments: FloatArray
 
     def unmet(self, rays: float) -> Highlights:
-        """Those that so many ``rays`` of every pixel meet less than once each, and a few times all together; else
-        none."""
         seldom = np.square(self.irradiance) * rays < self.moments
         total, moment = float(self.irradiance[seldom].sum()), float(self.moments[seldom].sum())
         if total**2 * rays >= _FEWEST_MET * moment:
@@ -317,7 +276,7 @@ class Highlights:
 
 @keep_scenes()
 def highlights(setup: OpticalSetup) -> Highlights:
-    """Highlights of all glossy balls of a ``setup`` that the projector's pinhole and the sensor's centre both see."""
+    """Return the highlights of all glossy balls that the projector's pinhole and the sensor's centre both see."""
     scene, projector = setup.scene, setup.projector
     balls = [s for s in scene.shapes() if s.class_name() == "Sphere" and s.bsdf() is not None and _glossy(s.bsdf())]
     balls = balls[:: -(-len(balls) // _MOST_BALLS)] if balls else []
@@ -364,7 +323,6 @@ def _glossy(bsdf: mi.BSDF) -> bool:
 
 
 def _mirror_normals(centre: FloatArray, radius: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
-    """(k, 3) normals of balls where a mirror would turn light from ``one`` place to the ``other``."""
     normal = np.zeros_like(centre)
     for _ in range(50):
         at = centre + radius[:, None] * normal
@@ -375,7 +333,6 @@ def _mirror_normals(centre: FloatArray, radius: FloatArray, one: FloatArray, oth
 
 
 def _directions_about(normal: FloatArray, angle: FloatArray, turned: FloatArray) -> FloatArray:
-    """(k, p, 3) directions at (p,) angles from normals (k, 3), ``turned`` about them."""
     helper = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -387,8 +344,6 @@ def _directions_about(normal: FloatArray, angle: FloatArray, turned: FloatArray)
 def _radiance_toward(
     scene: mi.Scene, origin: FloatArray, aimed: FloatArray, eye: FloatArray, radius: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(k,) light that sharp lobes at points send to the ``eye`` [1/sr], mean over channels, and cosines of what comes
-    to them; 0 where either way is blocked."""
     to = aimed - origin
     ray = mi.Ray3f(
         mi.Point3f(origin.tolist()), mi.Vector3f(*device_vectors(to / np.linalg.norm(to, axis=1, keepdims=True)))
@@ -418,30 +373,24 @@ def _radiance_toward(
 # moment of a connection by x I. So N connections see the light L of the lobes as ``N L^2 / E[x I]`` equal hits would.
 
 _SHARP, _LEAST_SHARP = 100.0, 10.0
-"""Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are, as a GGX lobe of
-roughness 0.03 does; where a part of them is, that part of it, but no less than the second: as a lobe of roughness 0.02
-does that takes a twentieth of the light.
-
-Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections from all of it meet broader ones.
-"""
+"""Density [1/sr] of a turn above which its lobe counts as sharp where all turns of a pixel are (a GGX lobe of roughness
+0.03). Where a part of them is, that part of it, but no less than the second (roughness 0.02 and a twentieth of the
+light). Such a lobe fills 0.01 sr, a tenth of the shipped projector's window: connections meet broader ones."""
 _PLENTY = 2**12
-"""Rays met on the sensor that tell the light of a few pixels to a few percent; fewer are followed by a second look."""
 _CONNECTIONS = 2**18
-"""Connections that tell all other light, some 0.1 s: it is bounded, so a percent of it or less is left open."""
 _SEARCHING = 2**20
-"""Connections that look for lobes which take little of the light, and are therefore seldom sampled, some 0.1 s: varnish
-of roughness 0.005 that reflects a twentieth, on a ball of 100 mm at 390, is met eleven times, and sampled twice."""
+"""Connections that search faint lobes, some 0.1 s: varnish of roughness 0.005 that reflects a twentieth, on a ball of
+100 mm at 390, is met eleven times, and sampled twice."""
 _QUARTER, _ENOUGH_MET = 4, 16
-"""Times fewer rays with which lobes are looked for first, and rays met on the sensor from which as few tell them: twice
-as many as all rays meet of a small ball that a quarter overlooks (compact_disc: 21 to 38 of a quarter)."""
+"""Factor of fewer rays in the first search, and rays met on the sensor from which so few suffice (compact_disc: 21 to
+38)."""
 _FEWER, _WIDER = 16, 16.0
-"""A look at a sensor so many times as wide takes so many times fewer rays, and meets 16 times as much: where it meets
-nothing, the full look, which is far longer, is spared."""
+"""Factor by which a first search has a wider sensor and fewer rays, and meets 16 times as much: where it meets nothing,
+the longer search is omitted."""
 _BROAD, _WELL_MET = 2.0, 256.0
-"""Radii of all lobes on the sensor's plane, over its half-width, from which none is searched for, and hits of the
-connections that then tell their light to 6 % (compact_disc: 2000, where a quarter of all rays meets 24)."""
+"""Radius of all lobes on the sensor's plane, over its half-width, beyond which none is searched, and hits of
+connections that then measure their light to 6 % (compact_disc: 2000, where a quarter of all rays meets 24)."""
 _SHARPEST = 0.1
-"""Part of the light over sharper lobes than the width that is reported: the peak of a GGX lobe is met that often."""
 
 
 # ---- Light over sharp lobes, and what it is found from
@@ -454,16 +403,16 @@ class SharpLight:
     Attributes
     ----------
     irradiance, error
-        mean over the sensor [W m^-2], and its Monte Carlo error.
+        Mean over the sensor, and its Monte Carlo error [W m^-2].
     hits
-        of one connection of every projector pixel, those that would meet a lobe, as far as noise goes.
+        Connections, one of every projector pixel, that would meet a lobe.
     by_pixel, moments
-        (n^2,) ``irradiance`` of each projector pixel, and the second moment of its connection [W^2 m^-4].
+        (n^2,) irradiance of each projector pixel, and the second moment of its connection [W^2 m^-4].
     width
-        radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light: with P the
+        Radius of the lobes on the sensor [mm], sqrt(P / (pi q)) of all but the sharpest tenth of the light: with P the
         part of a pixel's turns that are sharp, q / P is the density of a lobe by itself.
     rest
-        all other direct light, mean over the sensor [W m^-2].
+        All other direct light, mean over the sensor [W m^-2].
     """
 
     irradiance: float
@@ -476,29 +425,15 @@ class SharpLight:
 
     @classmethod
     def none(cls, pixels: int) -> SharpLight:
-        """Of a projector of so many ``pixels`` that lights no sharp lobe."""
         return cls(0.0, 0.0, math.inf, np.zeros(pixels), np.zeros(pixels), math.inf)
 
 
 @keep_scenes()
 def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
-    """Direct light over lobes too sharp for connections.
+    """Estimate direct light over lobes too sharp for connections.
 
-    Where a shorter look at a wider sensor meets none, there is none. What few rays find comes from small parts of a few
-    pixels, as off curved surfaces: these pixels, those that connections find, and their neighbours are looked at once
-    more, with as many rays.
-
-    Parameters
-    ----------
-    setup
-        scene, camera and projector.
-    seed, samples
-        of the random numbers, and rays of every projector pixel.
-
-    Raises
-    ------
-    MitsimError
-        when the scene sends NaN or infinite light to the camera.
+    A shorter search with a wider sensor comes first. Light that few rays find comes from small parts of a few pixels,
+    as off curved surfaces: these pixels, those that connections find, and their neighbours get as many rays once more.
     """
     n, paths_per_sample = setup.projector.n, setup.projector.n**2
     lobes = _Lobes(setup)
@@ -536,7 +471,6 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
 
 
 def _broad_light(setup: OpticalSetup, least: mi.Float, seed: int, width: float) -> SharpLight:
-    """The same by connections, which meet lobes of such a ``width`` more often than turns meet the sensor."""
     pixels = setup.projector.n**2
     count = max(1, _CONNECTIONS // pixels)
     met, others = (
@@ -550,22 +484,12 @@ def _broad_light(setup: OpticalSetup, least: mi.Float, seed: int, width: float) 
 
 
 def _quantile(values: FloatArray, weights: FloatArray, part: float) -> float:
-    """Value below which ``part`` of the ``weights`` lie; inf for none."""
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(sums, part * sums[-1])]) if values.size else math.inf
 
 
 def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
-    """Numbers of the pixels that are chosen, and of all that touch one of them.
-
-    Parameters
-    ----------
-    chosen
-        (side^2,) of a square of pixels, row by row.
-    side
-        of the square.
-    """
     return np.flatnonzero(mean_of_neighbours(chosen.reshape(side, side).astype(np.float64)) > 0)
 
 
@@ -574,9 +498,6 @@ def with_neighbours(chosen: npt.NDArray[np.bool_], side: int) -> Labels:
 
 @dataclass(frozen=True, eq=False)
 class _LobeLight:
-    """Irradiance and second moment of every projector pixel, the part of its turns that are sharp, the irradiance's
-    error, and width and weight of each lobe."""
-
     by_pixel: FloatArray
     moments: FloatArray
     sharp: FloatArray
@@ -587,16 +508,12 @@ class _LobeLight:
 
 @dataclass
 class _SensorHits:
-    """Of points met on the sensor: estimates x of the mean irradiance, x I, and density q of one, drawn by x; and sharp
-    turns, wherever they went."""
-
     mean: mi.Float
     moment: mi.Float
     density: mi.Float
     turns: mi.Float
 
     def joined_by(self, more: _SensorHits, rng: mi.PCG32) -> _SensorHits:
-        """These and ``more``; in x I, points that are met over one surface are no points of another."""
         mean = self.mean + more.mean
         new = rng.next_float32() * mean < more.mean
         density = dr.select(new, more.density, self.density)
@@ -607,14 +524,11 @@ class _SensorHits:
 
 
 class _Connections(DirectTracer):
-    """Direct light over sharp lobes alone, or all other."""
-
     _over_sharp: bool
     _least: mi.Float
     _own_least: mi.Float
 
     def over(self, least: mi.Float, sharp: bool) -> _Connections:
-        """The same over ``sharp`` lobes, of at ``least`` such a density [1/sr] by pixel, or over all others."""
         self._least, self._over_sharp = least, sharp
         return self
 
@@ -634,20 +548,11 @@ class _Connections(DirectTracer):
 
 
 class _Lobes:
-    """Rays of the projector that sharp lobes of the surfaces that they light send to the sensor.
-
-    Attributes
-    ----------
-    least
-        (n^2,) density [1/sr] above which a lobe counts as sharp, by projector pixel.
-    """
-
     def __init__(self, setup: OpticalSetup) -> None:
         self.setup, self.least = setup, dr.full(mi.Float, _LEAST_SHARP, setup.projector.n**2)
 
     @keep_scenes()
     def trace(self, pixels: Labels, seed: int, first: int, samples: int, wider: float = 1.0) -> _LobeLight:
-        """What rays ``first`` to ``first + samples`` - 1 of ``pixels`` meet on a sensor so many times ``wider``."""
         squares, met, weights = 0.0, [], []
         by_pixel, moments = np.zeros((2, self.setup.projector.n**2))
         turned = dr.zeros(mi.Float, len(by_pixel))
@@ -668,8 +573,6 @@ class _Lobes:
     def meet(
         self, seed: int, sample: mi.UInt32, pixel: mi.UInt32, wider: float, turned: mi.Float
     ) -> tuple[Labels, FloatArray, FloatArray, FloatArray]:
-        """Pixels of the rays that meet the sensor, and for each x, x I, and density q of one of the points met; sharp
-        turns are added to those ``turned`` (n^2,). MitsimError where light is NaN or infinite."""
         half = dr.opaque(mi.Float, wider * self.setup.geometry.half_width)
         _, rng = streams(seed, pixel, sample)
         jitter = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -698,8 +601,6 @@ class _Lobes:
     def _meet_sensor(
         self, half: mi.Float, least: mi.Float, at: Arrival, state: tuple[_SensorHits, mi.PCG32]
     ) -> tuple[_SensorHits, mi.PCG32]:
-        """What a turn that is sampled at the surface meets on a sensor of a ``half`` width, over lobes of ``least``
-        density."""
         met, rng = state
         turn = at.turn(rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
         density = at.density(turn.wo)

@@ -1,22 +1,21 @@
 """Indirect light with shared second surfaces: neighbouring projector pixels light each other's second points.
 
-Light of projector pixel i comes to x1_i, is turned there toward x2_i, and goes on to the sensor or further. Where pixel
-k of the same block of ``SIDE`` x ``SIDE`` pixels found x2_k, x1_i sees it as well (or does not, which a ray tells): the
-balance heuristic over the block's N directions, each pixel's drawn by its own BSDF, gives the estimate::
+Light of projector pixel i comes to x1_i, is turned there toward x2_i, and goes on. x1_i may see as well x2_k, which
+pixel k of the same block of ``SIDE`` x ``SIDE`` pixels found. The balance heuristic over the block's N directions, each
+drawn by its own BSDF, gives::
 
     L_i = sum_k  f_i(x2_k) V(x1_i, x2_k) / sum_j p_j(x2_k)  x  (what x2_k hands on of light from x1_i)
 
-f_i is what x1_i sends per area at x2_k, p_j the density per area with which x1_j would have found it, 0 where x1_j
-sends it nothing. It is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 2002, "Accelerating path tracing by
-re-using paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common
-points correlate their frames, but make none of them noisier.
+f_i is the light that x1_i sends per area at x2_k, p_j the density per area of x1_j, 0 where x1_j sends nothing. The
+estimate is unbiased (Veach and Guibas 1995; Bekaert, Sbert, Halton 2002, "Accelerating path tracing by re-using
+paths"), and bounded near edges where f_i grows. Shifting dots never light neighbours together, so that common points
+correlate their frames, but make none noisier.
 
-x2 hands on: to the sensor, by its BSDF, of each x1_i; and to further surfaces, where it is diffuse, as the path goes on
-that pixel k follows. Such a path leaves x2 on the side that x1_k lights, by the shading normal; it stands for light of
-those x1_i that light the same side, and in its density count only x1_j that do. A glossy x2 is followed further for its
-own pixel alone. Where paths carry the projector's lines, pairs bring light of each, by the same weights: these are of
-geometry alone. Deltas at x1 (mirrors), wavelengths that every path draws for itself, and scenes that light passes
-straight are not shared.
+x2 sends light of each x1_i to the sensor by its BSDF, and, where diffuse, to further surfaces along the path of pixel
+k. That path leaves x2 on the side that x1_k lights, by the shading normal; it counts for those x1_i that light the same
+side, and in its density only such x1_j do. A glossy x2 is followed further for its own pixel alone. Lines share the
+weights, which are geometric. Mirrors at x1, wavelengths drawn for each path, and scenes with straight transmission are
+not shared.
 """
 
 from __future__ import annotations
@@ -47,55 +46,46 @@ if TYPE_CHECKING:
     Turner = Callable[[mi.UInt32, mi.Bool], tuple[ByLine, ByLine]]
 
 _STEP, _TURN = 5, 16
-"""Members of a block take the points of their common sequence in turn; each sample begins five members on, and sixteen
-samples one more, so that each pixel's own points are spread over the sequence."""
+"""Members of a block take the points of their common sequence in turn. Each sample begins five members on, and sixteen
+samples one more, which spreads each pixel's points over the sequence."""
 _PATHS_PER_LAUNCH = 2**20
-"""Paths of one kernel: their pairs take 256 bytes a path."""
 _MOST_COMPARED = 32
-"""Shapes that each second point is compared with: every comparison is an instruction of the kernel."""
 _REFLECTANCE = re.compile(r"(brdf_\d\.)?reflectance\.")
-"""Parameters of a diffuse material, one-sided or two-sided, and of no other."""
 
 
 class PathReuseTracer(IndirectTracer):
-    """The same light as :class:`IndirectTracer`'s, to one point of the sensor or random ones."""
+    """Light of :class:`IndirectTracer`, to one point of the sensor or random ones."""
 
     paths_per_launch = _PATHS_PER_LAUNCH
 
     @property
     def paths_per_sample(self) -> int:
-        """Paths of one sample: one for each pixel of whole blocks, or as often as these are repeated."""
         return MEMBERS * (len(self.adaptive) if self.adaptive else blocks_of(self.projector.n) ** 2)
 
     def with_adaptive_counts(self, repeats: Sequence[int]) -> IndirectTracer:
-        """The same, as :meth:`IndirectTracer.with_adaptive_counts`; ``repeats`` (blocks^2,)."""
         return self._with_counts(np.asarray(repeats, dtype=np.int64))
 
     def shares(self) -> bool:
-        """Whether what is to be followed can be shared: as the module says."""
         lines = mi.is_monochromatic or (mi.is_spectral and self.projector.lines is not None)
         several = self.points.count > 1 or not lines or mi.is_polarized
         return self.paths.interreflection and not several and not self.setup.passage.open
 
     @property
     def lines(self) -> int:
-        """Lines that light is told apart by; 1 where it is not."""
         lines = self.projector.lines
         return len(lines.shares) if lines is not None and mi.is_spectral else 1
 
     @cached_property
     def diffuse(self) -> frozenset[int]:
-        """Places among the scene's shapes of those whose material is diffuse and nothing else: no bumps, no coat."""
         shapes = enumerate(self.setup.scene.shapes())
         return frozenset(place for place, shape in shapes if _is_diffuse(shape.bsdf()))
 
     @property
     def all_diffuse(self) -> bool:
-        """Whether all surfaces are, and none of their light is divided: pairs then take no look at a material."""
+        """True if all surfaces are diffuse, and none of their light is divided."""
         return len(self.diffuse) == len(self.setup.scene.shapes()) and not self.paths.steep
 
     def _emission(self, flight: InFlight) -> Emission:
-        """Of whole blocks of pixels, the members of each one after the other."""
         block, member, sample, weight = flight.index // MEMBERS, flight.index % MEMBERS, flight.sample, 1.0
         if self.adaptive:
             block, sample, weight = self.adaptive.at(block, sample)
@@ -115,7 +105,6 @@ class PathReuseTracer(IndirectTracer):
 
 
 def _is_diffuse(bsdf: mi.BSDF | None) -> bool:
-    """Whether a material reflects like Lambert's, on one side or on either."""
     if bsdf is None or bsdf.class_name() not in ("SmoothDiffuse", "TwoSidedBRDF"):
         return False
     return all(_REFLECTANCE.match(name) for name in mi.traverse(bsdf).keys())  # noqa: SIM118 - no dictionary
@@ -127,14 +116,12 @@ class ReusedPaths(ProjectorPaths):
     tracer: PathReuseTracer
 
     def __init__(self, tracer: PathReuseTracer, emission: Emission) -> None:
-        """Of what a ``tracer`` follows, from an ``emission``."""
         super().__init__(tracer, emission)
         self.tracer = tracer
         self.member = dr.arange(mi.UInt32, dr.width(self.pixel)) % MEMBERS
 
     def path_samples(self, accumulator: DeviceAccumulator | None = None) -> list[PathSamples]:
-        """Light on the host of each pixel's own paths; that of pairs of pixels and second points goes into the
-        ``accumulator`` where there is one."""
+        """Return the light of each pixel's own paths on the host; that of pairs goes into an accumulator."""
         own, count = self._own(), dr.width(self.lit) * MEMBERS
         if accumulator is not None:
             self._accumulate(accumulator)
@@ -151,7 +138,6 @@ class ReusedPaths(ProjectorPaths):
         return [*own, self._pair_samples(values[0], self.to_sensor_way), self._pair_samples(values[1], self.further)]
 
     def _accumulate(self, accumulator: DeviceAccumulator) -> None:
-        """Add up the light of pairs."""
         way = self.to_sensor_way
         seen = Sightings(way.geometric, self.pixel, way.row, way.column, way.inverse_depth)
         places = [accumulator.place(each, self.paths.rng.next_float32()) for each in (seen, self.further)]
@@ -166,7 +152,6 @@ class ReusedPaths(ProjectorPaths):
     # ---- the paths themselves ---------------------------------------------------------------------------------------
 
     def _own(self) -> list[PathSamples]:
-        """Follow all paths; on the host the light that is not shared."""
         self._first_vertex()
         self._second_vertex()
         self.paths = self.follow_on(self.paths)
@@ -183,7 +168,6 @@ class ReusedPaths(ProjectorPaths):
         return self.connections.fetch(self.paths.sightings, tuple(self.paths.sightings))
 
     def _first_vertex(self) -> None:
-        """The first surface, and each path's turn there."""
         paths = self.paths
         self.first_ray, self.power = mi.Ray3f(paths.ray), split_by_line(self.flux, self.tracer.lines)
         self.first_hit = self.scene.ray_intersect_preliminary(paths.ray, True, active=paths.active)
@@ -193,7 +177,6 @@ class ReusedPaths(ProjectorPaths):
         self.scatter(paths, si, True)
 
     def _second_vertex(self) -> None:
-        """The second surface, its way to the sensor, and each path's turn there: of unit light where it is shared."""
         paths = self.paths
         self.second_ray = mi.Ray3f(paths.ray)
         self.second_hit = self.scene.ray_intersect_preliminary(paths.ray, active=paths.active)
@@ -217,7 +200,6 @@ class ReusedPaths(ProjectorPaths):
         self.onward = mi.Vector3f(paths.ray.d)
 
     def _diffuse(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Whether the surfaces at ``si`` are diffuse; of very many materials none counts as such."""
         shapes, diffuse = self.scene.shapes(), self.tracer.diffuse
         others = frozenset(range(len(shapes))) - diffuse
         few = min(diffuse, others, key=len)
@@ -229,11 +211,9 @@ class ReusedPaths(ProjectorPaths):
         return found if few is diffuse else ~found
 
     def _factors(self, spectrum: mi.UnpolarizedSpectrum) -> ByLine:
-        """What a ``spectrum`` makes of light by line: where no lines are told apart, all its numbers are the same."""
         return [spectrum[line] for line in range(self.tracer.lines)]
 
     def _turn(self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool) -> ByLine:
-        """Light that a surface turns from ``toward`` to ``onward``, but for a factor of the latter."""
         si.wi = si.to_local(toward)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         value = mi.unpolarized_spectrum(si.bsdf().eval(context, si, si.to_local(onward), active))
@@ -243,17 +223,18 @@ class ReusedPaths(ProjectorPaths):
     def _turn_on(
         self, si: mi.SurfaceInteraction3f, toward: mi.Vector3f, onward: mi.Vector3f, active: mi.Bool
     ) -> ByLine:
-        """The same of second surfaces, the part that is followed from here."""
         kept = self._own_part(si, tilt(si, toward) / tilt(si, onward))
         return [light * kept for light in self._turn(si, toward, onward, active)]
 
     def _own_part(self, si: mi.SurfaceInteraction3f, correction: mi.Float) -> mi.Float | int:
-        """Return the part of the light over second surfaces of such a ``correction`` that is followed from here."""
         return projector_part(si, correction) if self.rules.steep else 1
 
     def _weights(self) -> tuple[ByLine, mi.Float, mi.Float]:
-        """(lanes * members,) what each pixel sends to each second point of its block, negative to its other side, by
-        line or the same for all; (lanes,) the points' densities, and those with which their own side is lit."""
+        """Return what each pixel sends to each second point of its block, and the points' densities.
+
+        The first (lanes * members,) is negative to the point's other side; the densities (lanes,) are that of all, and
+        that of pixels that light the own side.
+        """
         width = dr.width(self.lit)
         density = dr.zeros(mi.Float, width * MEMBERS)
         index, si = dr.arange(mi.UInt32, width), self._first_points()
@@ -292,9 +273,6 @@ class ReusedPaths(ProjectorPaths):
         return sent, whole, same_side
 
     def _pair_light(self, sent: ByLine, whole: mi.Float, same_side: mi.Float, store: Store) -> None:
-        """Light of each pixel by each second point of its block, straight to the sensor and further on, by what
-        :meth:`_weights` has. ``store`` takes, of pairs, the place among all, the path of the second point, the two
-        lights, and which count."""
         index, si = dr.arange(mi.UInt32, dr.width(self.lit)), self._first_points()
         first = index - self.member
         dr.eval(whole, same_side)
@@ -316,11 +294,9 @@ class ReusedPaths(ProjectorPaths):
 
     @property
     def sends(self) -> int:
-        """Numbers that tell what a pixel sends to a second point: one for each line, or for all."""
         return self.tracer.lines
 
     def _sender(self, si: mi.SurfaceInteraction3f) -> Sender:
-        """What first surfaces at ``si`` send in a direction [1/sr], and the density [1/sr] of sampling that."""
         context, toward = mi.BSDFContext(mi.TransportMode.Importance), -self.first_ray.d
 
         def send(direction: mi.Vector3f, active: mi.Bool) -> tuple[ByLine, mi.Float]:
@@ -333,9 +309,6 @@ class ReusedPaths(ProjectorPaths):
         return send
 
     def _turner(self, si: mi.SurfaceInteraction3f) -> Turner:
-        """What second points of lanes turn of light from first points at ``si``: to the sensor, and on the ways that
-        are followed further."""
-
         def turn(at: mi.UInt32, active: mi.Bool) -> tuple[ByLine, ByLine]:
             met, ray = (dr.gather(type(each), each, at, active) for each in (self.second_hit, self.second_ray))
             second = met.compute_surface_interaction(ray, active=active)
@@ -359,7 +332,6 @@ class ReusedPaths(ProjectorPaths):
         return self.first_hit.compute_surface_interaction(self.first_ray, active=self.lit)
 
     def _pair_samples(self, values: ByLine, seen: Way | Sightings) -> PathSamples:
-        """Light on the host of pairs of pixels and second points."""
         by_line = np.array(values)
         light = by_line.sum(axis=0)
         check_finite(light)
@@ -385,10 +357,10 @@ class ReusedPaths(ProjectorPaths):
 
 
 class DiffuseReusedPaths(ReusedPaths):
-    """The same where all surfaces are diffuse: what they turn hangs on two cosines, and on no material.
+    """Paths where all surfaces are diffuse, so that turns depend on two cosines and no material.
 
     A diffuse surface of shading normal s and geometric normal n turns light from w by rho / pi |s w| / |n w|, whatever
-    it goes on to, on the side that s w tells.
+    it goes on to, on the side of s w.
     """
 
     sends = 1
@@ -438,5 +410,4 @@ class DiffuseReusedPaths(ReusedPaths):
 
     @staticmethod
     def _cosines(shading: mi.Normal3f, normal: mi.Normal3f, toward: mi.Vector3f) -> mi.Float:
-        """Cosine of a direction to the shading normal over that to the geometric one."""
         return dr.abs(dr.dot(shading, toward)) / dr.abs(dr.dot(normal, toward))

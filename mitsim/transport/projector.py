@@ -1,12 +1,12 @@
-"""The projector as tracers see it: from a pixel of its window to the ray through it, its area, and the flux it sends.
+"""The projector as tracers see it: from a pixel of its window to the ray through it, its area, and its flux.
 
-A stock ``projector`` emitter does not tell its field of view, so it is asked for the uv of many points; its power is
-what it casts on the plane at unit distance, pi x scale x texture. A ray of a pixel that is cut into N rays carries
+A stock ``projector`` emitter does not state its field of view, so that its map is fitted to the uv of many points. It
+casts pi x scale x texture on the plane at unit distance. A ray of a pixel that is cut into N rays carries
 ``phi = pi scale texture a / N``, a being the pixel's area on that plane: the same through every point of a lens. Every
-pixel has its own rays, so light is never attributed to a pixel by chance.
+pixel has its own rays, so that light is never attributed to a pixel by chance.
 
-The map is written once (:class:`CanvasMap`, and :class:`ProjectorOptics` for the window) and used in two kinds of
-numbers: the renderer's float32, a lane each (:class:`ProjectorRays`), and the host's float64 (:class:`PinholeRays`).
+One map (:class:`CanvasMap`, and :class:`ProjectorOptics` for the window) serves the renderer's float32
+(:class:`ProjectorRays`) and the host's float64 (:class:`PinholeRays`).
 """
 
 from __future__ import annotations
@@ -26,27 +26,20 @@ from mitsim.devices.projector import Lines
 from mitsim.transport.plugins.base import Numbers, channels, device_vectors, host_values, turn_and_origin
 
 _WAVELENGTH_SETS = 8
-"""Sets of four wavelengths: 15 nm apart, finer than any measured spectrum that a scene would hold."""
 _FAR = 1000.0
-"""Depth [mm] at which the emitter is asked: large beside its place, so that float32 coordinates do not matter."""
 _PROBES = 24
-"""Points a side that the map is fitted to: 24^2 bring float32's 6e-8 of the canvas a point to 3e-9."""
 _FIRST_REACH = 0.02
-"""Tan-angle of the first points: inside the picture of any projector of more than 2.3 degrees."""
 _PROBE_STEP = 1e-2
-"""Tan-angle between the two points that a pixel's size is read from: inside the same pictures."""
 
 
 @dataclass(frozen=True)
 class ProjectorOptics:
-    """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas, fractions of
-    a pixel where it has moved.
+    """The emitter and its window: n x n pixels from (first_row, first_column) of a (rows, columns) canvas.
 
     ``aperture`` is the lens radius [mm] (0: a pinhole), ``focus`` the distance of the sharp plane [mm], ``blur`` the
-    standard deviation of a projector pixel's spot, in projector pixels. ``lines`` are those that spectral variants
-    trace its light at; None: wavelengths drawn from all. ``parted`` tells that glass sends each wavelength its own way.
-    ``share`` is the part of a pixel's light that leaves by the pixel; the lens scatters the rest, with a standard
-    deviation of ``glare_spread`` pixels.
+    standard deviation of a pixel's spot [pixels]. ``lines`` are traced in spectral variants (None: drawn wavelengths),
+    and ``parted`` if glass separates them. ``share`` of a pixel's light leaves by the pixel; the lens scatters the rest
+    with a standard deviation of ``glare_spread`` pixels.
     """
 
     emitter: mi.Emitter
@@ -64,16 +57,13 @@ class ProjectorOptics:
 
     @property
     def scattered(self) -> ProjectorOptics:
-        """The light that the lens scatters, as if it were another projector's: wide spots."""
+        """Light that the lens scatters, as a projector with wide spots."""
         spread = math.hypot(self.blur, self.glare_spread)
         return replace(self, share=1 - self.share, blur=spread, glare_spread=0.0)
 
     @property
     def per_wavelength(self) -> tuple[ProjectorOptics, ...]:
-        """Itself, or where its lines part, one for each line, of which a path carries that alone.
-
-        MitsimError where wavelengths that part would be drawn.
-        """
+        """Itself, or one projector for each separated line; raise MitsimError if wavelengths are drawn."""
         if not (self.parted and mi.is_spectral):
             return (self,)
         if self.lines is None:
@@ -85,36 +75,23 @@ class ProjectorOptics:
 
     @property
     def by_line(self) -> bool:
-        """Whether light is told apart by line."""
         return self.lines is not None and self.lines.several
 
     @cached_property
     def canvas_map(self) -> CanvasMap:
-        """Where the emitter sends its canvas."""
         return CanvasMap.of(self.emitter)
 
     @property
     def ideal(self) -> bool:
-        """A pinhole with sharp pixels."""
         return self.aperture == 0 and self.blur == 0
 
     def canvas_point(
         self, row: Numbers, column: Numbers, number: Callable[[float], Numbers] = float
     ) -> tuple[Numbers, Numbers]:
-        """Canvas coordinates (u, v), 0..1, of the window's point ``row``, ``column`` in pixels.
-
-        Parameters
-        ----------
-        row, column
-            in the window.
-        number
-            turns the window's numbers into numbers of their kind.
-        """
         rows, columns, first_row, first_column = map(number, (*self.canvas, self.first_row, self.first_column))
         return (column + first_column) / columns, (row + first_row) / rows
 
     def pixel_at(self, uv: mi.Point2f) -> mi.UInt32:
-        """The window's pixel (row-major) at canvas point ``uv``; outside of the window, the nearest."""
         n = _opaque(self.n)
         row, column = (
             dr.clip(dr.floor(place * _opaque(count) - _opaque(part)) - _opaque(first), 0, n - 1)
@@ -126,10 +103,10 @@ class ProjectorOptics:
         return mi.UInt32(row * n + column)
 
     def pixel_size(self) -> tuple[float, float]:
-        """Size (x, y) of a pixel on the plane at unit distance [mm], as the emitter's own float32 tells it.
+        """Size (x, y) of a pixel on the plane at unit distance [mm], by the emitter's own float32.
 
-        :class:`CanvasMap` knows it better, by 1e-4; but frames of a blurred spot are equal bit for bit from version to
-        version only with this.
+        :class:`CanvasMap` is 1e-4 more exact, but frames of a blurred spot stay bit-equal from version to version only
+        so.
         """
         probe = dr.zeros(mi.SurfaceInteraction3f, 2)
         probe.p = self.emitter.world_transform() @ mi.Point3f([0.0, _PROBE_STEP], [0.0, _PROBE_STEP], [1.0, 1.0])
@@ -141,7 +118,7 @@ class ProjectorOptics:
 
 @dataclass(frozen=True, eq=False)
 class CanvasMap:
-    """Where a stock ``projector`` sends its canvas: local tan-angles x = x[0] u + x[1], y = y[0] v + y[1].
+    """Map of a stock ``projector``: local tan-angles x = x[0] u + x[1], y = y[0] v + y[1].
 
     ``turn`` (3, 3) and ``origin`` (3,) [mm] take local points to the world.
     """
@@ -153,7 +130,6 @@ class CanvasMap:
 
     @classmethod
     def of(cls, emitter: mi.Emitter) -> CanvasMap:
-        """The map of an ``emitter``, fitted in float64 to what it says in float32 (6e-8 of the canvas a point)."""
         turn, origin = turn_and_origin(mi.traverse(emitter)["to_world"])
         reach = _FIRST_REACH
         for _ in range(2):  # first near the axis, to learn the field of view, then over all of it
@@ -168,46 +144,21 @@ class CanvasMap:
         return cls(turn, origin, fits[0], fits[1])
 
     def tangents(self, u: Numbers, v: Numbers, number: Callable[[float], Numbers] = float) -> tuple[Numbers, Numbers]:
-        """Local tan-angles (x, y) of points of the canvas.
-
-        Parameters
-        ----------
-        u, v
-            canvas coordinates, 0..1.
-        number
-            turns the map's numbers into numbers of their kind.
-        """
+        """Return local tan-angles (x, y) of canvas points; `number` converts the map's numbers to theirs."""
         x, y = ([number(float(value)) for value in axis] for axis in (self.x, self.y))
         return x[0] * u + x[1], y[0] * v + y[1]
 
     def pixel_area(self, canvas: Sequence[int]) -> float:
-        """Area [mm^2] of a pixel of a ``canvas`` (rows, columns) on the plane at unit distance."""
         return float(abs(self.x[0] * self.y[0]) / (canvas[0] * canvas[1]))
 
 
 class ProjectorRays:
-    """Rays of a ``projector``, with its lens and its blur, a lane each.
-
-    Prepared once; numbers are opaque, so one compiled kernel serves all projectors of a kind.
-    """
+    """Rays of a projector with its lens and its blur; numbers are opaque, so that one kernel serves all projectors."""
 
     def __init__(self, projector: ProjectorOptics) -> None:
         self.projector, self._map = projector, projector.canvas_map
 
     def sample(self, pixel: mi.UInt32, jitter: mi.Point2f, rng: mi.PCG32, wavelengths: mi.Color0f) -> mi.Ray3f:
-        """A ray through each pixel, and through random points of the lens and of the blurred spot.
-
-        Parameters
-        ----------
-        pixel
-            number of the projector pixel, row-major.
-        jitter
-            point of the pixel (column, row), 0..1.
-        rng
-            random numbers for lens and spot, if there are any.
-        wavelengths
-            of the ray [nm].
-        """
         projector = self.projector
         n = dr.opaque(mi.UInt32, projector.n)
         row, column = mi.Float(pixel // n) + jitter.y, mi.Float(pixel % n) + jitter.x
@@ -224,7 +175,7 @@ class ProjectorRays:
         return mi.Ray3f(self._origin + self._turn @ lens, dr.normalize(self._turn @ image), 0.0, wavelengths)
 
     def flux(self, pixel: mi.UInt32, wavelengths: mi.Color0f) -> mi.Spectrum:
-        """Flux of each ``pixel`` at ``wavelengths`` [W m^-2 mm^2]: irradiance at unit distance times area there."""
+        """Return the flux of each pixel: irradiance at unit distance times area there [W m^-2 mm^2]."""
         n = dr.opaque(mi.UInt32, self.projector.n)
         centre = self._image(mi.Float(pixel // n) + 0.5, mi.Float(pixel % n) + 0.5)
         at = dr.zeros(mi.SurfaceInteraction3f)
@@ -243,19 +194,19 @@ class ProjectorRays:
         return mi.Matrix3f(*map(_opaque, self._map.turn.ravel()))
 
     def _image(self, row: mi.Float, column: mi.Float) -> mi.Vector3f:
-        """Where a point of the window lies on the plane at unit distance, in the projector's frame."""
         canvas_point = self.projector.canvas_point(row, column, _opaque)
         return mi.Vector3f(*self._map.tangents(*canvas_point, _opaque), 1)
 
 
 def _opaque(value: float) -> mi.Float:
-    """A number that is data of a kernel, not part of its code."""
     return dr.opaque(mi.Float, float(value))
 
 
 def line_wavelengths(lines: Lines) -> tuple[mi.Color0f, FloatArray]:
-    """Wavelengths [nm] of a path that carries some ``lines``, and weights (4,) whose mean over light is the sum of its
-    lines. Where the lines are fewer than four, the first is repeated, with weight 0."""
+    """Return wavelengths [nm] of a path with some lines, and weights (4,) whose mean is the sum of the lines.
+
+    Fewer than four lines are filled with the first, of weight 0.
+    """
     size = len(dr.zeros(mi.UnpolarizedSpectrum))
     more = size - len(lines.shares)
     # Opaque numbers keep the compiled kernel the same for all lines.
@@ -265,8 +216,7 @@ def line_wavelengths(lines: Lines) -> tuple[mi.Color0f, FloatArray]:
 
 
 def wavelength_sets(lines: Lines | None = None) -> list[mi.Color0f | None]:
-    """Wavelengths [nm] at which spectra are taken: none but for spectral variants, there the ``lines``, or without any
-    evenly over the range."""
+    """Return the wavelengths [nm] of spectra: the lines, or evenly over the range; none but in spectral variants."""
     if not mi.is_spectral:
         return [None]
     if lines is not None:
@@ -285,13 +235,12 @@ class PinholeRays:
     origin
         (3,) pinhole in world coordinates [mm].
     area
-        area of one pixel on the plane at unit distance [mm^2 at 1 mm].
+        Area of one pixel on the plane at unit distance [mm^2 at 1 mm].
     power
-        (n * n, channels) irradiance on that plane that each pixel casts, by colour channel or wavelength [W m^-2].
+        (n * n, channels) irradiance there of each pixel, by colour channel or wavelength [W m^-2].
     """
 
     def __init__(self, projector: ProjectorOptics, wavelengths: Sequence[mi.Color0f | None]) -> None:
-        """Of a ``projector``; ``wavelengths`` are sets at which spectra are taken, from :func:`wavelength_sets`."""
         self._projector, n = projector, projector.n
         self._map = projector.canvas_map
         self.origin = self._map.origin
@@ -302,13 +251,11 @@ class PinholeRays:
             self.power *= line_wavelengths(projector.lines)[1]
 
     def directions(self, points: FloatArray) -> FloatArray:
-        """(k, 3) world directions of unit length through window ``points`` (row, column) (k, 2) in projector pixels."""
         world = self._local(points) @ self._map.turn.T
         return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
 
     def points(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where ``places`` (k, 3) in world coordinates are seen: window points (row, column) (k, 2) in projector
-        pixels, and depths (k,) [mm]; of places behind the projector, at depths below 0, points mean nothing."""
+        """Return window points (row, column) (k, 2) and depths [mm] of places (k, 3)."""
         local = np.linalg.solve(self._map.turn, (places - self.origin).T)
         depth, canvas = local[2], self._projector.canvas
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -321,7 +268,6 @@ class PinholeRays:
         return np.stack([*tangents, np.ones(len(points))], axis=1)
 
     def _irradiance(self, points: FloatArray, wavelengths: mi.Color0f | None) -> FloatArray:
-        """(k, channels) irradiance on the plane at unit distance that window points (k, 2) cast [W m^-2]."""
         _, emitted, depth, cosine = _direction_samples(
             self._projector.emitter, self._map.turn, self.origin, self._local(points), wavelengths
         )
@@ -331,7 +277,6 @@ class PinholeRays:
 def _direction_samples(
     emitter: mi.Emitter, turn: FloatArray, origin: FloatArray, local: FloatArray, wavelengths: mi.Color0f | None
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum, float, FloatArray]:
-    """A projector's direction sample at points in ``local`` directions (k, 3): sample, light, depth [mm], cosines."""
     depth = _FAR * max(1.0, float(np.abs(origin).max()) / 100)
     forward = turn[:, 2] / np.linalg.norm(turn[:, 2])
     world = local @ turn.T

@@ -1,15 +1,11 @@
-"""Specular chains: from a scene and a pinhole projector to beams of rays that reach the sensor over perfect mirrors
-alone, or over nothing.
+"""Specular chains: beams of rays that reach the sensor from a pinhole projector over perfect mirrors alone, or nothing.
 
-A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it; nor does one find a
-projector in view, through a hole or beside a card. Such light is traced from the projector instead
-(:mod:`mitsim.transport.specular_rays`). Rays go through a grid of points of each projector pixel. Four neighbours that
-met the same surfaces in the same way (the same *chain*) bound a beam; beams near the sensor are divided until the map
-from the projector's window to the sensor is bilinear over each.
-:mod:`mitsim.optics.mirror_frames` turns beams into frames.
-
-Flux: the stock projector's irradiance on the plane at unit distance is pi x scale x texture, the same everywhere on it,
-so a beam holds that times its area on this plane.
+A path projector - mirror - sensor has a delta at both ends, so no path from the camera finds it; nor a projector in
+view. Such light is traced from the projector (:mod:`mitsim.transport.specular_rays`) through a grid of points of each
+pixel. Four neighbours that met the same surfaces in the same way (the same *chain*) bound a beam. Beams near the sensor
+are divided until the map from the window to the sensor is bilinear over each. :mod:`mitsim.optics.mirror_frames` turns
+beams into frames. Flux: the projector's irradiance on the plane at unit distance is pi x scale x texture, so that a
+beam has that times its area on this plane.
 """
 
 from __future__ import annotations
@@ -33,66 +29,42 @@ from mitsim.transport.projector import PinholeRays, ProjectorOptics
 from mitsim.transport.specular_rays import Boxes, Chains, Crossings, IntArray, Mask, Rays, SpecularRays, grazing, join
 
 _UNIT = 2**24
-"""Lattice points a projector pixel's side: what a ball of 10 um sends to a sensor leaves a projector pixel of 2 mm
-through 0.1 um."""
+"""Lattice points along a projector pixel: a ball of 10 um lights a sensor through 0.1 um of a pixel of 2 mm."""
 _DIVISIONS = 2**14
-"""Parts a side that squares of the first grid are divided into at most: a rim in a projector pixel of 300 sensor
-pixels is found to a 20th of one."""
+"""Most parts along a square of the first grid: a rim in a pixel of 300 sensor pixels is found to a 20th of one."""
 _DEEPER = 2**4
-"""How much finer that is than squares whose light may land anywhere are divided: those are left out, and counted."""
 _MOST = 2**16
-"""Squares of one size beyond which none is divided further: a wire of 0.15 mm reaches it, in 5 processor seconds."""
+"""Squares of one size beyond which none is divided: a wire of 0.15 mm reaches it, in 5 processor seconds."""
 _AT_ONCE = 2**18
-"""Squares that are looked at together, some hundreds of MB."""
 _COARSE = 128
-"""Least number of coarse beams along the window's side: a mirror of a hundredth of the window is seen."""
+"""Fewest coarse beams along the window: a mirror of a hundredth of the window is found."""
 _TURNED, _MIRRORS = 256, 16
-"""Rays along the window's side that tell where mirrors send its light to, and how many mirrors a ray may meet."""
 _ACROSS_SENSOR = 128
-"""Rays across a sensor that the projector shines on over no mirror: a hole that lights a 128th of it is seen."""
+"""Rays across a sensor in the projector's direct light: a hole that lights a 128th of it is found."""
 _TOLERANCE = 0.02
-"""Largest departure from a bilinear map, in sensor pixels: twice what float32 leaves of a place at the sensor."""
+"""Largest departure from a bilinear map, in sensor pixels: twice float32's error at the sensor."""
 _SHADES = 0.01
-"""The same for the light left, relative: of a painted mirror, whose paint is seldom known better."""
 _SMALL = 2.0
-"""Whole beams below this many sensor pixels are not divided further: what varies inside is finer than frames show."""
+"""Sensor pixels below which whole beams are not divided."""
 _PAINT = 0.5
-"""The same for beams that an edge of paint cuts, which are kept whole: half a pixel, which a frame does not resolve."""
 _RIM = 1 / 16
-"""The same for beams that a rim cuts, of which points stand for the part inside: along a straight rim that part is out
-by the same in all of them, 1.5 % of a pixel; each halving doubles the beams along every rim."""
+"""The limit for beams that a rim cuts, whose inner part is represented by points: 1.5 % of a pixel along a straight
+rim; each halving doubles the beams."""
 _THIN, _MANY = 0.25, 8.0
-"""Sensor pixels across, and how many times that the light of a square is longer, of squares that are thinned out: what
-they stand for then is half a pixel wide at most, which a frame does not resolve."""
+"""Sensor pixels across, and ratio of length, of squares that are thinned out: half a pixel wide at most."""
 _STRAIGHT = 0.1
-"""Departure from a bilinear map over the light's extent, below which corners tell how wide it is."""
 _SHARES = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25])
-"""Part of a square that each of its 3 x 3 nodes stands for (trapezoidal rule)."""
 _MARGIN = 0.02
-"""Sine by which the field stop is widened when squares are left out: 1 degree, more than a square's rays curve."""
 
 
 @keep_scenes()
 def trace_specular_chains(
     scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int = _MIRRORS
 ) -> Beams:
-    """All beams that leave the projector, meet perfect mirrors or lenses alone, or nothing, and reach the sensor.
+    """Return the beams from the projector's pinhole to the sensor over perfect mirrors or lenses alone, or nothing.
 
-    A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 a side) is not seen.
-
-    Parameters
-    ----------
-    scene, camera
-        what light meets, and the sensor with its ``geometry``.
-    projector
-        where it comes from; taken as a pinhole.
-    max_depth
-        mirrors that a beam may meet, at least 1.
-
-    Raises
-    ------
-    MitsimError
-        for a depth below 1.
+    A mirror that no ray of the coarse grid meets (one point a projector pixel, at least 128 along an axis) is not
+    found.
     """
     if max_depth < 1:
         raise MitsimError(f"max_depth of specular chains is {max_depth}; give at least 1")
@@ -105,7 +77,6 @@ def trace_specular_chains(
 
 
 def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> tuple[list[Beams], FloatArray]:
-    """Beams of the pixels of a window of ``n`` a side, and (2,) the flux that none has and their variance."""
     arcs, close = grazing(tracer, geometry.half_width, _UNIT)
     parts, left = [], np.array([close, 0.0])
     # Where the window holds the sensor itself, it is looked for as finely as small mirrors are.
@@ -121,14 +92,9 @@ def _projector_beams(tracer: SpecularRays, n: int, geometry: CameraGeometry) -> 
 
 
 def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics) -> Rays:
-    """Rays that mirrors have turned, before each surface; one is sent through the middle of each square of a grid.
+    """Return the rays that mirrors have turned, before each surface, for a grid over the window.
 
-    In the ``spectrum``'s stead they have their flux [W m^-2 mm^2], and what leaves 1 mm^2 at unit distance.
-
-    Parameters
-    ----------
-    scene, camera, projector
-        as for :func:`trace_specular_chains`.
+    Instead of a spectrum they have their flux [W m^-2 mm^2], and what leaves 1 mm^2 at unit distance.
     """
     parts = list[Rays]()
     for each in projector.per_wavelength:
@@ -145,7 +111,6 @@ def turned_by_mirrors(scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOp
 def _search(
     tracer: SpecularRays, row: IntArray, column: IntArray, size: int, n: int, geometry: CameraGeometry
 ) -> tuple[list[Beams], FloatArray]:
-    """The same of all chains in squares of the lattice (first row and column, ``size``)."""
     crossings, place = _trace_squares(tracer, row, column, np.array([0, size]))
     # Squares that a chain has a corner of, one for each chain; corners (row, column) by the ray that they are.
     chains, number = np.unique(crossings.chain, return_inverse=True)
@@ -163,7 +128,6 @@ def _search(
 
 
 def _ranges(first: IntArray, last: IntArray) -> IntArray:
-    """All whole numbers from each ``first`` to before its ``last``, one range behind another."""
     counts = last - first
     return np.asarray(np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts - first, counts))
 
@@ -173,8 +137,6 @@ def _ranges(first: IntArray, last: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class _Nodes:
-    """What is known at lattice points of one chain, any shape: whether a ray arrived, and where, how, how bright."""
-
     valid: Mask
     sensor: FloatArray
     tangent: FloatArray
@@ -184,15 +146,12 @@ class _Nodes:
         return _Nodes(self.valid[index], self.sensor[index], self.tangent[index], self.throughput[index])
 
     def quarter(self, i: int, j: int) -> _Nodes:
-        """The corners (q, 2, 2) of a quarter of squares that are known at (q, 3, 3) nodes."""
         return self.take((slice(None), slice(i, i + 2), slice(j, j + 2)))
 
 
 def _trace_squares(
     tracer: SpecularRays, row: IntArray, column: IntArray, steps: IntArray
 ) -> tuple[Crossings, IntArray]:
-    """Rays through the points of squares at ``steps`` from their first corner, shared ones traced once; and which ray
-    (q, k, k) each point is."""
     rows, columns = np.broadcast_arrays(row[:, None, None] + steps[:, None], column[:, None, None] + steps)
     line, number = np.unique(columns, return_inverse=True)
     key, place = np.unique(rows.ravel() * len(line) + number.ravel(), return_inverse=True)
@@ -201,7 +160,6 @@ def _trace_squares(
 
 
 def _nodes(crossings: Crossings, chain: Chains, place: IntArray) -> _Nodes:
-    """What is known at rays ``place`` (q, ., .) of squares of one ``chain`` (q,) each."""
     chains, number = np.unique(crossings.chain, return_inverse=True)
     rays = int(max(place.max(initial=0), crossings.ray.max(initial=0))) + 1
     key = number * rays + crossings.ray
@@ -230,7 +188,6 @@ def _refine(
     n: int,
     geometry: CameraGeometry,
 ) -> tuple[list[Beams], FloatArray]:
-    """The same inside ``squares``: chain, first row and column (q,), and :func:`_spread` (q, 2) of each."""
     chain, row, column, spread = squares
     parts: list[Beams] = []
     unresolved = variance = 0.0
@@ -280,10 +237,9 @@ def _refine(
 
 
 def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
-    """How wide (q,) [mm] the light of squares is across their longer side, inf unless that is many times longer; and
-    the direction (q, 2) in the window that it is so little moved by, of unit length.
+    """Return the width (q,) of long squares' light [mm], and the unit direction (q, 2) of least motion.
 
-    A wire spreads light across itself a thousand times more than along.
+    A wire spreads light across itself a thousand times more than along. The width is inf for compact light.
     """
     corners = nodes.sensor[:, ::2, ::2]
     # What the sensor's place moves by over the square, for a step down and a step across.
@@ -298,7 +254,6 @@ def _thinness(nodes: _Nodes) -> tuple[FloatArray, FloatArray]:
 
 
 def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
-    """``corners`` (q, 2, 2) of squares that stand for a ``factor`` (q,) of them along a ``way`` (q, 2)."""
     wide = np.flatnonzero(factor > 1)
     if not len(wide):
         return corners
@@ -315,14 +270,11 @@ def _stretch(corners: _Nodes, way: FloatArray, factor: IntArray) -> _Nodes:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Beams without extent, and the ``number`` (k,) of the square that each is of."""
-
     beams: Beams
     number: IntArray
 
     @property
     def variance(self) -> float:
-        """Of the sum of their flux, as if each square were all or nothing."""
         return float(np.square(np.bincount(self.number, self.beams.flux)).sum()) if len(self.number) else 0.0
 
     def take(self, chosen: Mask) -> _Points:
@@ -332,9 +284,9 @@ class _Points:
 
 
 def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGeometry) -> _Points:
-    """Squares that are not divided further as beams without extent, one at each node (q, 3, 3) that meets the sensor.
+    """Convert undivided squares to beams without extent, one at each node (q, 3, 3) that meets the sensor.
 
-    A node stands for its part of the square's ``flux`` (q,): of an edge's squares that is right in the mean.
+    A node represents its part of the square's flux (q,): for squares of an edge that is right in the mean.
     """
     seen = nodes.valid & (np.abs(nodes.sensor) < geometry.half_width).all(axis=-1)
     seen &= (np.abs(nodes.tangent) <= geometry.tan_half_fov).all(axis=-1)
@@ -348,38 +300,33 @@ def _points(nodes: _Nodes, flux: FloatArray, pixel: IntArray, geometry: CameraGe
 
 
 def _nodes_of(tracer: SpecularRays, chain: Chains, row: IntArray, column: IntArray, half: int) -> _Nodes:
-    """Nodes (q, 3, 3) at corners, edge middles and centre of squares."""
     crossings, place = _trace_squares(tracer, row, column, half * np.arange(3))
     return _nodes(crossings, chain, place)
 
 
 def _box(valid: Mask, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(q, 2) least and greatest values (q, ., ., 2) at valid nodes, inf and -inf where there are none."""
     low, high = (np.where(valid[..., None], values, limit) for limit in (np.inf, -np.inf))
     return low.min(axis=(1, 2)), high.max(axis=(1, 2))
 
 
 def _size(low: FloatArray, high: FloatArray) -> FloatArray:
-    """(q,) larger side of boxes, 0 where nothing or one ray arrived."""
     return np.asarray(np.where(np.isfinite(low), high - low, 0).max(axis=-1))
 
 
 def _extent(nodes: _Nodes) -> FloatArray:
-    """(q,) larger side of the bounding box of what arrived [mm]."""
     return _size(*_box(nodes.valid, nodes.sensor))
 
 
 def _spread(nodes: _Nodes, before: FloatArray) -> FloatArray:
-    """(q, 2) how far apart the rays of squares arrive, by place [mm] and by sine; that ``before`` where one ray did."""
     sizes = np.stack([_size(*_box(nodes.valid, values)) for values in (nodes.sensor, _sines(nodes))], axis=1)
     return np.asarray(np.where(sizes > 0, sizes, before))
 
 
 def _near(nodes: _Nodes, spread: FloatArray, geometry: CameraGeometry) -> Mask:
-    """(q,) whether a square may light the sensor within the field stop: its corners' box, grown by what may be hidden.
+    """Return (q,) True for squares that may light the sensor within the field stop.
 
-    A whole square bulges by its curvature; one that a rim cuts may be as large as the ``spread`` (q, 2) of the square
-    that it is part of. Directions are compared by sines, which stay finite.
+    A whole square bulges by its curvature; one that a rim cuts may be as large as the `spread` (q, 2) of its parent.
+    Directions are compared by sines, which stay finite.
     """
     sine = geometry.tan_half_fov / np.hypot(1, geometry.tan_half_fov)
     whole = nodes.valid.all(axis=(1, 2))
@@ -394,25 +341,21 @@ def _near(nodes: _Nodes, spread: FloatArray, geometry: CameraGeometry) -> Mask:
 
 
 def _sines(nodes: _Nodes) -> FloatArray:
-    """Sines of the rays' angles to the axis, along rows and columns."""
     return np.asarray(nodes.tangent / np.sqrt(1 + np.square(nodes.tangent).sum(axis=-1, keepdims=True)))
 
 
 def _departure(values: FloatArray) -> FloatArray:
-    """(q,) largest distance of values (q, 3, 3, k) from the bilinear map of their corners; NaN if one lacks."""
     blend = np.array([[1, 0], [0.5, 0.5], [0, 1]])
     flat = np.einsum("ia,jb,qabk->qijk", blend, blend, values[:, ::2, ::2])
     return np.asarray(np.linalg.norm(values - flat, axis=-1).max(axis=(1, 2)))
 
 
 def _fluxes(tracer: SpecularRays, row: IntArray, column: IntArray, size: int, n: int) -> FloatArray:
-    """(q,) flux into squares of the lattice [W m^-2 mm^2]."""
     power = tracer.rays.power.mean(axis=1)[_pixel(row, column, n)]
     return np.asarray(power * tracer.rays.area * (size / _UNIT) ** 2)
 
 
 def _pixel(row: IntArray, column: IntArray, n: int) -> IntArray:
-    """(q,) projector pixel of points of the lattice."""
     return (row // _UNIT) * n + column // _UNIT
 
 
@@ -433,21 +376,16 @@ def _join(parts: list[Beams], left: FloatArray) -> Beams:
 _ACROSS_BALL = 0.25
 """Step of the finer grid in radii of a ball, disk or wire: some 50 rays meet a ball."""
 _ACROSS_FACE = 1 / 3
-"""The same in heights of a flat facet: its inscribed circle, of two thirds, holds a point of any such grid."""
+"""Step in heights of a flat facet, whose inscribed circle contains a point of any such grid."""
 _ACROSS_SMOOTH = 1.0
-"""The same in heights of a smooth mesh's faces: their neighbours' normals go over into each other."""
 _SPOT_MARGIN = 1.5
-"""Radius of a spot in the window over its radius at the axis: perspective stretches by 1 / cos^2, 1.3 at 30 degrees."""
+"""Radius of a spot in the window over that at the axis: perspective stretches by 1 / cos^2, 1.3 at 30 degrees."""
 _BOXES_AT_ONCE = 2**20
-"""Squares that boxes cover, looked up at a time: some tens of MB."""
 _MOST_SPOTS = 2**21
-"""Spots of all mirrors, some 300 MB; of a mesh of more faces some are left out."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """Pieces of mirrors: centre (k, 3), radius (k,), and the step (k,) of rays that finds what is on them [mm]."""
-
     centre: FloatArray
     radius: FloatArray
     step: FloatArray
@@ -456,18 +394,9 @@ class _Spots:
 def first_squares(
     mirrors: Sequence[mi.Shape], rays: PinholeRays, n: int, coarse: int, more: Sequence[Boxes] = ()
 ) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Squares that tile the window, small ones where small mirrors are seen: size, first rows and first columns.
+    """Return squares that tile the window, small where small mirrors are seen: size, first rows and first columns.
 
-    Parameters
-    ----------
-    mirrors
-        shapes whose light is looked for.
-    rays
-        of the projector.
-    n, coarse
-        projector pixels along the window's side, and squares of the coarsest grid, at least.
-    more
-        boxes that are looked through besides, as finely as they say.
+    `coarse` is the least number of coarsest squares along the window; `more` boxes are refined besides.
     """
     size = _UNIT // min(_UNIT, 2 ** max(0, int(np.ceil(np.log2(coarse / n)))))
     line = np.arange(0, n * _UNIT, size)
@@ -491,7 +420,6 @@ def first_squares(
 
 
 def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: FloatArray) -> Mask:
-    """(q,) whether squares (row, column) meet one of the boxes from ``low`` to ``high`` (k, 2), in squares."""
     found = np.zeros(len(row), dtype=bool)
     if not len(low):
         return found
@@ -515,7 +443,6 @@ def _squares_in_boxes(row: IntArray, column: IntArray, low: FloatArray, high: Fl
 
 
 def _window_boxes(spots: _Spots, rays: PinholeRays) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Boxes (k, 2) that hold ``spots`` in the window, and steps, in points of the lattice."""
     place, depth = rays.points(spots.centre)
     front = (depth > 0) & np.isfinite(place).all(axis=1)
     place, scale = place[front] * _UNIT, _UNIT / (np.sqrt(rays.area) * depth[front])
@@ -524,7 +451,6 @@ def _window_boxes(spots: _Spots, rays: PinholeRays) -> tuple[FloatArray, FloatAr
 
 
 def _spots(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
-    """Spots of one mirror; ``cell`` is a square's side at unit distance."""
     if shape.is_mesh() and shape.class_name() != "Rectangle":
         return _of_faces(shape, rays, cell)
     box = shape.bbox()
@@ -543,7 +469,6 @@ def _spots(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
 
 
 def _along(start: FloatArray, way: FloatArray, radius: float, step: float, square: float) -> _Spots:
-    """Spots along a line, no further apart than their radius or a ``square`` [mm]."""
     length = float(np.linalg.norm(way))
     count = min(max(1, int(np.ceil(length / max(radius, square, 1e-9)))), _MOST_SPOTS)
     middle = (np.arange(count) + 0.5) / count
@@ -552,7 +477,6 @@ def _along(start: FloatArray, way: FloatArray, radius: float, step: float, squar
 
 
 def _of_faces(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
-    """Spots of a mesh: its faces, long ones in pieces."""
     count = shape.face_count()
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_SPOTS // 4)).astype(np.uint32))
     corners = np.array(shape.face_indices(mi.UInt32(chosen))).T
@@ -577,5 +501,4 @@ def _of_faces(shape: mi.Shape, rays: PinholeRays, cell: float) -> _Spots:
 
 
 def _depth(rays: PinholeRays, place: FloatArray) -> float:
-    """Depth [mm] of a place in front of the projector, at least some."""
     return max(float(rays.points(place[None])[1][0]), 1.0)

@@ -1,9 +1,9 @@
 """Rays that follow perfect mirrors: from points of a pinhole projector's window to where they cross the sensor plane.
 
-Rays are traced in Mitsuba's float32, which is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error
-in a masked frame. So each hit is polished in float64: the ray is met with the tangent plane of the surface that was
-hit, and reflection or refraction is worked out again there. What is left is the surface's own place and normal in
-float32: nothing for a mirror that faces the axis squarely; round ones and smooth meshes are met in float64 once more.
+Mitsuba's float32 is good to about 1e-4 mm at the sensor: 1 % of a pixel, and as much error in a masked frame. So each
+hit is computed again in float64: the ray meets the tangent plane of the surface, and is reflected or refracted there.
+The error that is left is the surface's own place and normal in float32: nothing for a mirror that faces the axis; round
+ones and smooth meshes are met in float64 too.
 """
 
 from __future__ import annotations
@@ -27,19 +27,15 @@ IntArray = npt.NDArray[np.int64]
 Chains = npt.NDArray[np.uint64]
 Mask = npt.NDArray[np.bool_]
 _FAINTEST = 1e-5
-"""Part of its light below which a ray ends, after three or four reflections of glass: a hundredth of accuracy 1e-3."""
+"""Part of its light at which a ray ends, after three or four reflections of glass: a hundredth of accuracy 1e-3."""
 _AGREEMENT = 1e-4
-"""Largest distance of our direction to Mitsuba's: float32 agrees to some 1e-6, another law of bending is far beyond."""
 _OFFSET = 1e-4
-"""How far a ray starts off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon, 1500 roundings."""
+"""Start of a ray off its surface, for each mm of its coordinates: Mitsuba's own ray epsilon."""
 _GRAZING = 0.02
-"""Least cosine that this distance is divided by, so that a grazing ray does not start centimetres away."""
 _CHAIN = np.uint64(0x9E3779B97F4A7C15)
-"""Multiplier of a chain's number, 2^64 over the golden ratio: it scatters neighbouring sequences (Knuth)."""
 
 
 def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
-    """Materials of a ``scene`` with a part of one of the ``kinds``, ``mi.BSDFFlags`` added up."""
     materials: list[mi.BSDF] = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
@@ -50,16 +46,14 @@ def delta_bsdfs(scene: mi.Scene, kinds: int) -> list[mi.BSDF]:
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Rays that crossed the sensor plane from the front, over mirrors or none; one ray may arrive several times.
+    """Rays that crossed the sensor plane from the front; one ray may arrive several times.
 
     Attributes
     ----------
-    ray
-        (k,) number of the ray that was sent.
     chain
-        (k,) a number for the sequence of surfaces that turned it, and whether each reflected or transmitted it.
+        (k,) number of the sequence of surfaces that turned the ray, by reflection or transmission.
     sensor, tangent
-        (k, 2) where it crosses [mm] and its tan-angles from there, (row, column) in index coordinates.
+        (k, 2) place [mm] and tan-angles there, (row, column) in index coordinates.
     throughput
         (k,) part of the light left.
     """
@@ -77,14 +71,12 @@ class Rays:
 
     Attributes
     ----------
-    index
-        number of the ray that was sent.
     mirror
-        number, in Dr.Jit's registry, of what turned it last and is no pane of glass; 0 for nothing.
-    origin, direction, start
-        where it left a surface, which way, and a place on it a little beyond, clear of the surface.
-    chain, spectrum
-        as in :class:`Crossings`, and the part of its light left by colour.
+        Number, in Dr.Jit's registry, of the last surface that turned the ray and is no pane; 0 for none.
+    start
+        Place a little beyond the surface, clear of it.
+    spectrum
+        Part of the light left by colour.
     """
 
     index: IntArray
@@ -100,27 +92,17 @@ Some = TypeVar("Some", Crossings, Rays)
 
 
 def join(parts: Sequence[Some]) -> Some:
-    """All of one or more ``parts`` in one."""
     return type(parts[0])(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 class SpecularRays:
-    """Follows rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
+    """Rays of a projector over delta reflections, refractions and straight transmissions to the sensor plane.
 
-    At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends
-    there: that light is found from the camera.
+    At a surface that both reflects and transmits, a ray goes both ways. A ray that meets anything that scatters ends:
+    that light is found from the camera.
     """
 
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, projector: ProjectorOptics, max_depth: int) -> None:
-        """What is followed.
-
-        Parameters
-        ----------
-        scene, camera, projector
-            as loaded.
-        max_depth
-            surfaces that a ray may meet between the two.
-        """
         self._scene, self._max_depth = scene, max_depth
         self._clear = CLEAR if transmits(scene) else _OFFSET
         self._wavelengths = wavelength_sets(projector.lines)
@@ -135,8 +117,7 @@ class SpecularRays:
         self._camera_turn, self.camera_place = turn_and_origin(camera.world_transform())
 
     def follow(self, points: FloatArray, turned: list[Rays] | None = None) -> Crossings:
-        """Send rays through window ``points`` (row, column) (k, 2), in projector pixels; a list ``turned`` gets those
-        that mirrors have turned, before each surface that they meet."""
+        """Send rays through window points (k, 2) [pixels]; `turned` receives those that mirrors turned."""
         count = len(points)
         origin = np.broadcast_to(self.rays.origin, (count, 3))
         rays = Rays(
@@ -172,7 +153,6 @@ class SpecularRays:
         return si
 
     def _cross(self, rays: Rays, distance: FloatArray) -> tuple[Crossings, Mask]:
-        """Rays that cross the sensor plane from the front before they meet anything."""
         origin = (rays.origin - self.camera_place) @ self._camera_turn
         direction = rays.direction @ self._camera_turn
         ahead = (origin[:, 2] > 0) & (direction[:, 2] < 0)
@@ -190,7 +170,6 @@ class SpecularRays:
         return crossing, arrived
 
     def _bounce(self, rays: Rays, si: mi.SurfaceInteraction3f, active: Mask) -> list[Rays]:
-        """The rays that go on, polished, by lobe; see the module."""
         count = len(active)
         hits = _plane_hits(rays, si)
         shading = hits.normal.copy()
@@ -234,7 +213,6 @@ class SpecularRays:
     def _sample_lobe(
         self, kind: int, component: int, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.BSDFSample3f, FloatArray]:
-        """Direction sample of a component, and weights (k, channels) over all wavelength sets."""
         weights = []
         context = mi.BSDFContext(mi.TransportMode.Importance)
         context.component = component
@@ -252,10 +230,10 @@ class SpecularRays:
 
 
 def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
-    """Return the numbers, in Dr.Jit's registry, of the ``materials`` that have a delta part, by its kind and component.
+    """Return the registry numbers of materials with a delta part, by its kind and component.
 
-    Of a component a BSDF gives the part of the light, so that nothing is left to chance. Light that passes straight is
-    one part, whatever the material is made of.
+    A BSDF gives the part of the light for one component, so that nothing is left to chance. Straight light is one part
+    of any material.
     """
     found: dict[tuple[int, int], list[int]] = {}
     straight = int(mi.BSDFFlags.Null)
@@ -269,7 +247,6 @@ def _lobes(materials: Iterable[mi.BSDF]) -> dict[tuple[int, int], list[int]]:
 
 
 def _plane_hits(rays: Rays, si: mi.SurfaceInteraction3f) -> Hits:
-    """Where rays met surfaces, in float64 with the tangent plane of each."""
     count = len(rays.index)
     hit, geometric, normal = (vectors(v, count) for v in (si.p, si.n, si.sh_frame.n))
     with np.errstate(all="ignore"):
@@ -282,7 +259,6 @@ def _plane_hits(rays: Rays, si: mi.SurfaceInteraction3f) -> Hits:
 
 
 def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: FloatArray) -> FloatArray:
-    """(k, 3) directions after a surface in float64: reflected, refracted by ``eta`` (Snell) or straight on."""
     cosine = (direction * normal).sum(axis=1, keepdims=True)
     reflected = direction - 2 * cosine * normal
     inside = 1 - (1 - cosine**2) / eta[:, None] ** 2
@@ -292,7 +268,6 @@ def _redirect(normal: FloatArray, kind: IntArray, eta: FloatArray, direction: Fl
 
 
 def _rows_columns(points: FloatArray) -> FloatArray:
-    """(k, 2) index coordinates of points (k, 3) of the camera's frame."""
     return np.stack(rows_columns(points[:, 0], points[:, 1]), axis=1)
 
 
@@ -305,14 +280,11 @@ def _rows_columns(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Points and normals (k, 3) where rays met surfaces, geometric and for shading."""
-
     point: FloatArray
     geometric: FloatArray
     normal: FloatArray
 
     def put(self, chosen: IntArray, other: Hits) -> None:
-        """Take the ``other`` hits for those ``chosen``, where they are finite."""
         good = np.isfinite(other.point).all(axis=1) & np.isfinite(other.normal).all(axis=1)
         for name in vars(self):
             getattr(self, name)[chosen[good]] = getattr(other, name)[good]
@@ -323,8 +295,6 @@ class _Surface(Protocol):
 
 
 class ExactHits:
-    """The spheres, cylinders and smooth meshes among some ``shapes``."""
-
     def __init__(self, shapes: Sequence[mi.Shape]) -> None:
         self._surfaces: dict[int, _Surface] = {}
         for shape in shapes:
@@ -333,17 +303,6 @@ class ExactHits:
                 self._surfaces[_number(shape)] = surface
 
     def refine(self, origin: FloatArray, direction: FloatArray, hits: Hits, shape: IntArray, face: IntArray) -> None:
-        """Replace ``hits`` on the surfaces that are known.
-
-        Parameters
-        ----------
-        origin, direction
-            (k, 3) of the rays.
-        hits
-            in float32's precision.
-        shape, face
-            (k,) numbers of the shapes in Dr.Jit's registry, and of their faces.
-        """
         for number in np.intersect1d(shape, list(self._surfaces)) if self._surfaces else ():
             mine = np.flatnonzero(shape == number)
             old = Hits(*(getattr(hits, name)[mine] for name in vars(hits)))
@@ -371,8 +330,6 @@ def _surface(shape: mi.Shape) -> _Surface | None:
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """All points at the ``radius`` from a centre, or from the line along an ``axis`` through it."""
-
     centre: FloatArray
     axis: FloatArray
     radius: float
@@ -396,8 +353,6 @@ class _Round:
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles, (k, 3, 3) each, and the normals of their corners."""
-
     places: FloatArray
     normals: FloatArray
 
@@ -425,45 +380,28 @@ class _Mesh:
 
 
 def _edges(triangles: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """First corner, and the edges from it to the others."""
     return triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
 
 
 # -------- Balls of glass, whose light comes from close to their rim
 
 _ACROSS = 2**10
-"""Rays across a ball of glass: their light turns by a third of a degree from ray to ray, half a sensor at 400 mm."""
 _TO_RIM = 0.25
-"""Step of the finer grid where light comes from near a rim, over the distance to it."""
 _TOO_CLOSE = 1 / 64
-"""Distance to the rim, in radii, within which light is counted and not looked for: of a ball of glass of index 1.5 it
-is 4 % of what comes back, and 98 % of the squares."""
+"""Distance to the rim, in radii, within which light is counted but not traced: for glass of index 1.5 it is 4 % of the
+returned light, and 98 % of the squares."""
 _FINEST = 2**10
-"""Points of the lattice below which the same holds of a step: squares are divided ten times more."""
 _PIECE, _MOST_PIECES = 4.0, 2**10
-"""Steps along each piece of an arc, and pieces of one at most: boxes about long ones would be mostly empty."""
 Boxes = tuple[FloatArray, FloatArray, FloatArray]
-"""Corners (k, 2) of boxes in the window, least and greatest, and the step (k,) of rays that finds what is in them, in
-points of the lattice."""
+"""Corners (k, 2) of boxes in the window, and the step (k,) of rays that finds their content [lattice points]."""
 
 
 def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Boxes], float]:
-    """Where balls of glass send light to the sensor from close to their rim, and flux [W m^-2 mm^2] that comes from too
-    close to it to be looked for.
+    """Return where balls of glass send light to the sensor from near their rim, and the flux too near to trace.
 
-    What is reflected inside of a ball leaves it the more steeply the closer to the rim it came in: two thirds of the
-    light that a ball of glass sends back may come from its last thirtieth, which squares that the rim cuts do not show.
-    Rays across the middle of each ball, in its plane with projector and sensor, tell where that is; by symmetry the
-    rest lies on an arc.
-
-    Parameters
-    ----------
-    tracer
-        mirrors, and the projector's rays.
-    half_width
-        of the sensor [mm].
-    unit
-        points of the lattice a pixel.
+    Light that is reflected inside a ball leaves more steeply the closer to the rim it entered: two thirds of the
+    returned light may come from the last thirtieth. Rays across the middle of each ball, in its plane with projector
+    and sensor, show where; by symmetry the rest lies on an arc.
     """
     glass = int(mi.BSDFFlags.DeltaTransmission)
     balls = [s for s in tracer.mirrors if s.class_name() == "Sphere" and s.bsdf().flags() & glass]
@@ -497,9 +435,6 @@ def grazing(tracer: SpecularRays, half_width: float, unit: int) -> tuple[list[Bo
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """The plane through a projector, a ball's centre and a sensor: place of the projector and directions to the ball,
-    across in the plane, and out of it; the ball's distance and radius, and the sensor's from the line through both."""
-
     origin: FloatArray
     axes: tuple[FloatArray, FloatArray, FloatArray]
     distance: float
@@ -508,7 +443,6 @@ class _Plane:
 
     @classmethod
     def of(cls, ball: mi.Shape, tracer: SpecularRays) -> _Plane:
-        """Of a ``ball`` and what a ``tracer`` knows."""
         box, origin = ball.bbox(), tracer.rays.origin
         to_ball = np.array(box.center(), dtype=np.float64).ravel() - origin
         distance = float(np.linalg.norm(to_ball))
@@ -522,15 +456,12 @@ class _Plane:
         return cls(origin, axes, distance, float(np.array(box.extents()).max()) / 2, aside)
 
     def places(self, across: FloatArray, turned: FloatArray) -> FloatArray:
-        """(k, 3) places beside the ball's centre that rays pass the centre by so many radii toward (k,), ``turned`` out
-        of the plane by angles (k,)."""
         sine = across * min(self.radius / self.distance, 1.0)
         ahead, aside, out = self.axes
         to = np.cos(turned)[:, None] * aside + np.sin(turned)[:, None] * out
         return np.asarray(self.origin + self.distance * (np.sqrt(1 - sine**2)[:, None] * ahead + sine[:, None] * to))
 
     def arc(self, across: FloatArray, half_width: float, rays: PinholeRays, unit: int) -> Boxes:
-        """Boxes that find what rays ``across`` (2,) send to the sensor, and those beside the plane."""
         step, wide = _TO_RIM * (1 - float(np.abs(across).max())), self._half_angle(half_width)
         low, high = float(across.min()) - step, float(across.max()) + step
         count = min(math.ceil(2 * wide / (_PIECE * step)), _MOST_PIECES)
@@ -546,10 +477,8 @@ class _Plane:
         return np.min(corners, axis=0), np.max(corners, axis=0), np.full(count, step * self.radius * scale)
 
     def flux(self, across: FloatArray, half_width: float, rays: PinholeRays) -> float:
-        """Flux between the arcs of two rays ``across`` (2,)."""
         ring = abs(across[1] ** 2 - across[0] ** 2) / 2 * (self.radius / self.distance) ** 2
         return float(rays.power.mean() * ring * 2 * self._half_angle(half_width))
 
     def _half_angle(self, half_width: float) -> float:
-        """Angle to either side, about the line from the projector to the ball, that light on the sensor leaves at."""
         return min(math.pi, math.sqrt(2) * half_width / max(self.aside, half_width / 4))

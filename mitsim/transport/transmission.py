@@ -1,10 +1,11 @@
-"""Light that passes surfaces: from two points of a scene to the way between them and the part of the light it keeps.
+"""Light that passes surfaces: the way between two points of a scene, and the part of the light it keeps.
 
 The hole of a cut-out (``mask``), a thin pane (``thindielectric``), a filter: their *null lobe* lets a part of the light
-go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No direction that
-is drawn at random tells such light from that of free space, so it is what it would be without the surface, weaker:
-direct light stays direct, and a light is looked for behind a hole as before it. Scenes without such surfaces keep a
-plain test of visibility."""
+go straight on as if nothing were there. Flat glass bends it, but to one way between two points only. No random
+direction distinguishes such light from that of free space, so it is what it would be without the surface, weaker:
+direct light stays direct, and a light is searched behind a hole as before it. Scenes without such surfaces keep a plain
+test of visibility.
+"""
 
 from __future__ import annotations
 
@@ -21,26 +22,23 @@ from mitsim.transport.plugins.base import generator
 from mitsim.transport.plugins.glass import is_glass
 
 CLEAR = 32 * 2.0**-24
-"""How far a ray starts beyond a surface, for each mm of its coordinates, where a scene transmits light: 32 roundings of
-single precision, 8e-4 mm at 400 mm, where a point is 1 or 2 of them off. Mitsuba's own 9e-5 is 0.036 mm there, and
+"""Start of a ray beyond a surface, for each mm of its coordinates, where a scene transmits light: 32 roundings of
+single precision, 8e-4 mm at 400 mm, where a point is 1 or 2 of them wrong. Mitsuba's own 9e-5 is 0.036 mm there, and
 skips a print so close behind glass."""
 _LOOSE = 1500 * 2.0**-24
-"""The same beyond what an instance holds, as far as Mitsuba's own rays start: its points lie 100 roundings off, and
-would be hidden by their own surface. Points of a cylinder lie up to 6e-8 D^2 / r off, 1e-3 mm of a radius r of 6 mm at
-a distance D of 300. Its rays are Mitsuba's, which start along the normal: along a grazing ray, this distance is longer
-than the way through a rod of 4 mm, and light would come out of its side."""
+"""Start beyond an instance, as far as Mitsuba's own rays: its points are 100 roundings wrong. Points of a cylinder are
+up to 6e-8 D^2 / r wrong, 1e-3 mm of a radius r of 6 mm at a distance D of 300. Its rays are Mitsuba's, which start
+along the normal: along a grazing ray the distance is longer than the way through a rod of 4 mm."""
 _GRAZING = 0.02
-"""Least cosine that this distance is divided by, so that a grazing ray does not skip centimetres."""
 State = TypeVar("State", bound=tuple[object, ...])
 
 
 def lets_through(material: mi.BSDF) -> bool:
-    """Whether a ``material`` transmits light, bent, scattered or straight."""
     return bool(int(material.flags()) & (int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null)))
 
 
 def transmits(scene: mi.Scene) -> bool:
-    """Whether a surface of a ``scene`` lets light through; an instance hides its materials, and may have such."""
+    """Return True if a surface lets light through; an instance hides its materials, and may."""
     materials = [shape.bsdf() for shape in scene.shapes()]
     return any(bsdf is not None and lets_through(bsdf) for bsdf in materials) or _has_instances(scene)
 
@@ -51,7 +49,7 @@ def _has_instances(scene: mi.Scene) -> bool:
 
 @dataclass
 class Arrival:
-    """Light that comes to points of surfaces: in a ``direction``, and which samples in flight count."""
+    """Light that comes to points of surfaces in a ``direction``, for the samples in flight that count."""
 
     si: mi.SurfaceInteraction3f
     direction: mi.Vector3f
@@ -59,20 +57,18 @@ class Arrival:
     active: mi.Bool
 
     def turn(self, number: mi.Float, point: mi.Point2f) -> mi.BSDFSample3f:
-        """Where it goes on, sampled as the surfaces scatter by a random ``number`` and ``point``."""
         self.si.wi = self.si.to_local(-self.direction)
         context = mi.BSDFContext(mi.TransportMode.Importance)
         return self.si.bsdf().sample(context, self.si, number, point, self.active)[0]
 
     def density(self, local: mi.Vector3f) -> mi.Float:
-        """Density [1/sr] of such a turn to ``local`` directions."""
         self.si.wi = self.si.to_local(-self.direction)
         return self.si.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), self.si, local, self.active)
 
 
 @dataclass
 class Passed:
-    """Light beyond a surface: where it goes on, the part left, and the refractive index there over that before."""
+    """Light beyond a surface: direction, the part left, and the refractive index there over that before."""
 
     direction: mi.Vector3f
     part: mi.Spectrum
@@ -80,18 +76,16 @@ class Passed:
 
 
 class Passage:
-    """What light passes in a ``scene``; prepared once.
+    """Transmission of light in a scene; prepared once.
 
     Attributes
     ----------
-    scene
-        as loaded.
     panes
-        shapes of flat glass.
+        Shapes of flat glass.
     open
-        whether there is a surface that light may pass. An instance hides its materials, and may have such.
+        True if light may pass a surface straight.
     transmits
-        whether there is a surface that transmits light in any way, so that something may stand close behind it.
+        True if a surface transmits light in any way, so that something may stand close behind it.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -105,17 +99,7 @@ class Passage:
         self._round = int(mi.ShapeType.Cylinder) in kinds
 
     def between(self, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> tuple[mi.Bool, mi.Spectrum]:
-        """Whether points see each other, and the part of the light that what lies between them lets through.
-
-        Parameters
-        ----------
-        si
-            points of surfaces.
-        target
-            points that they are connected to.
-        active
-            lanes that count.
-        """
+        """Return whether surface points and targets see each other, and the part of the light that arrives."""
         if not self.open:
             return ~self.scene.ray_test(self.leaving_to(si, target), active), mi.Spectrum(1)
         ray = self.leaving_to(si, target)
@@ -135,19 +119,9 @@ class Passage:
         return dr.max(part) > 0, part
 
     def along(self, ray: mi.Ray3f, light: mi.Spectrum, state: State, visit: Callable[[Arrival, State], State]) -> State:
-        """The state after ``visit`` of every surface on the way of each ray, up to the first that lets no light
-        straight on.
+        """Return the state after ``visit`` of every surface on the way of each ray, up to the first opaque one.
 
         Neighbouring rays are taken for coherent, which are found faster.
-
-        Parameters
-        ----------
-        ray, light
-            what comes to the first surface.
-        state
-            before that.
-        visit
-            of what comes to a surface, and a state, makes another state.
         """
         if not self.open:
             si = self.scene.ray_intersect(ray, mi.RayFlags.All, True)
@@ -167,17 +141,10 @@ class Passage:
         return dr.while_loop(begun, lambda active, *_: active, advance)[3:]  # type: ignore[no-any-return]
 
     def next_surface(self, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.SurfaceInteraction3f:
-        """Where a ray that goes on meets the next surface: never behind its start, so that it gets on.
+        """Return the next surface on a ray, never behind its start, so that the ray advances.
 
-        Of triangles as long and thin as those of a wire, single precision may put the point 0.01 mm along the wire,
-        behind the ray's start; then it is the ray's own.
-
-        Parameters
-        ----------
-        ray, active
-            rays, and the lanes that count.
-        coherent
-            whether rays of neighbouring lanes are alike, which are found faster.
+        On triangles as long and thin as those of a wire, single precision may put the point 0.01 mm behind the ray's
+        start; then it is the ray's own.
         """
         si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent, active)
         si.p = dr.select(dr.dot(si.p - ray.o, ray.d) > 0, si.p, ray(si.t))
@@ -185,21 +152,9 @@ class Passage:
 
     @staticmethod
     def straight(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """Part of the light that the surface at ``si`` lets straight on, where ``active``."""
         return mi.unpolarized_spectrum(si.bsdf().eval_null_transmission(si, active))
 
     def through(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> Passed:
-        """What light does that comes to surfaces and passes them.
-
-        Parameters
-        ----------
-        si
-            points of the surfaces, met by a ray of that direction.
-        direction
-            unit, of the light.
-        active
-            lanes that count.
-        """
         passed = Passed(mi.Vector3f(direction), self.straight(si, active), mi.Float(1))
         if self.panes:
             context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -213,21 +168,18 @@ class Passage:
         return passed
 
     def is_pane(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Whether the surface at ``si`` is flat glass."""
         found = mi.Bool(False)
         for pane in self.panes:
             found |= si.shape == pane
         return found
 
     def passes(self, si: mi.SurfaceInteraction3f, sample: mi.BSDFSample3f) -> mi.Bool:
-        """Whether the direction of a ``sample`` at ``si`` is that of light which passes."""
         if not self.open:
             return mi.Bool(False)
         bent = self.is_pane(si) & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DeltaTransmission)
         return mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null) | bent
 
     def clear(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Float:
-        """How far a ray that leaves the surface at ``si`` in a ``direction`` starts from it [mm]."""
         slope = dr.maximum(dr.abs(dr.dot(si.n, direction)), _GRAZING)
         clear = mi.Float(CLEAR)
         if self._instanced:
@@ -235,27 +187,17 @@ class Passage:
         return clear * (1 + dr.max(dr.abs(si.p))) / slope
 
     def onward(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
-        """Return a ray that starts beyond the surface at ``si`` in a ``direction``, on the line through the point; that
-        from a cylinder starts beside the line."""
+        """Return a ray that starts beyond the surface on the line through the point; beside it for a cylinder."""
         start = si.p + direction * self.clear(si, direction)
         if self._round:
             start = dr.select(_is_round(si), si.spawn_ray(direction).o, start)
         return mi.Ray3f(start, direction, si.time, si.wavelengths)
 
     def leaving(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Ray3f:
-        """A ray that leaves the surface at ``si`` in a ``direction``: as Mitsuba has it where no surface transmits."""
+        """Return a ray that leaves the surface; Mitsuba's own where no surface transmits."""
         return self.onward(si, direction) if self.transmits else si.spawn_ray(direction)
 
     def leaving_to(self, si: mi.SurfaceInteraction3f, target: mi.Point3f) -> mi.Ray3f:
-        """The ray of :meth:`leaving` that ends short of a ``target``.
-
-        Parameters
-        ----------
-        si
-            points of surfaces.
-        target
-            points that the rays lead to.
-        """
         ray = si.spawn_ray_to(target)
         if self.transmits:
             direction = dr.normalize(target - si.p)
@@ -266,7 +208,6 @@ class Passage:
 
 
 def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Return True where the surfaces at ``si`` are cylinders."""
     return si.shape.shape_type() == mi.UInt32(int(mi.ShapeType.Cylinder))
 
 
@@ -284,21 +225,17 @@ def _is_round(si: mi.SurfaceInteraction3f) -> mi.Bool:
 # inside of a pane are found by paths that are followed.
 
 _STEPS = 8
-"""Most corrections of a ray's direction: each squares the error, so that four bring 100 mm to float32's rounding."""
+"""Corrections of a ray's direction: each squares the error, so that four bring 100 mm to float32's rounding."""
 _CLOSE = 5e-4
-"""Miss [mm] at which correcting ends: three times what float32 leaves at 400 mm; it moves a shadow by 3 nm."""
 _MET = 0.02
-"""Miss [mm] up to which a ray has met its target: rays that a pane's edge keeps from it end far beyond."""
 _LARGEST_STEP = 0.3
-"""Most that a direction is corrected by at once [rad], lest one that is wrong at an edge leaves the scene."""
 _MOST_FACES = 1000
-"""Triangles of a mesh that is looked at: boxes and sheets have a few."""
 _FLAT = 1e-4
 """Sine below which two normals count as one: meshes are written with five digits."""
 
 
 def flat_panes(scene: mi.Scene) -> list[mi.ShapePtr]:
-    """Shapes of a ``scene`` that are of smooth glass and flat: rectangles, disks, sheets and boxes."""
+    """Return the shapes of smooth flat glass: rectangles, disks, sheets and boxes."""
     return [
         mi.ShapePtr(shape)
         for shape in scene.shapes()
@@ -328,22 +265,20 @@ def _is_flat(shape: mi.Shape) -> bool:
 
 @dataclass
 class RefractedWay:
-    """How light gets from points of surfaces to their targets.
+    """Way of light from points of surfaces to their targets.
 
     Attributes
     ----------
-    direction
-        unit, in which it leaves the surface.
     apparent
-        where the target sees the surface.
+        Where the target sees the surface.
     length
-        of the way [mm].
+        Of the way [mm].
     part
-        of the light that arrives.
+        Part of the light that arrives.
     eta
-        refractive index at the target over that at the surface.
+        Refractive index at the target over that at the surface.
     open
-        whether there is a way.
+        True if there is a way.
     """
 
     direction: mi.Vector3f
@@ -356,11 +291,6 @@ class RefractedWay:
 
 @dataclass
 class _Ray:
-    """A ray under way: the last surface that it left, and how it moves with two turns of its start.
-
-    ``clear`` is how far beyond that surface it is looked on from, ``part`` what is left of its light.
-    """
-
     active: mi.Bool
     place: mi.Point3f
     direction: mi.Vector3f
@@ -374,7 +304,6 @@ class _Ray:
     eta: mi.Float
 
     def move_crossing(self, distance: mi.Float, normal: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """How its crossing moves with the plane of a ``normal`` at a ``distance``."""
         moves = []
         for place, direction in ((self.place_a, self.direction_a), (self.place_b, self.direction_b)):
             at = place + direction * distance
@@ -384,8 +313,6 @@ class _Ray:
 
 @dataclass
 class _Aim:
-    """A direction that is corrected, and what the ray in it did."""
-
     active: mi.Bool
     direction: mi.Vector3f
     step: mi.UInt32
@@ -398,19 +325,7 @@ class _Aim:
 
 
 def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Point3f, active: mi.Bool) -> RefractedWay:
-    """The way from points to targets through the panes between them; straight where there are none.
-
-    Parameters
-    ----------
-    passage
-        the scene, and what light passes in it.
-    si
-        points of surfaces.
-    target
-        points that they are connected to.
-    active
-        lanes that count.
-    """
+    """Return the way from points to targets through the panes between them; straight without panes."""
     search = _Search(passage, si, target, dr.normalize(target - si.p))
     nothing = mi.Float(0)
     start = _Aim(
@@ -425,15 +340,12 @@ def refracted_way(passage: Passage, si: mi.SurfaceInteraction3f, target: mi.Poin
 
 @dataclass
 class _Search:
-    """Points of surfaces and their targets; ``facing`` is the straight direction, normal to the target's plane."""
-
     passage: Passage
     si: mi.SurfaceInteraction3f
     target: mi.Point3f
     facing: mi.Vector3f
 
     def correct(self, aim: _Aim) -> _Aim:
-        """What the ray of ``aim`` does at the target's plane, and a better direction."""
         facing, (a, b) = self.facing, mi.coordinate_system(aim.direction)
         zero, clear = mi.Vector3f(0), self.passage.clear(self.si, aim.direction)
         ray = _Ray(
@@ -466,11 +378,9 @@ class _Search:
         )
 
     def reach(self, ray: _Ray) -> mi.Float:
-        """Distance [mm] of a ``ray`` to the target's plane."""
         return dr.dot(self.target - ray.place, self.facing) / dr.dot(ray.direction, self.facing)
 
     def advance(self, ray: _Ray) -> _Ray:
-        """A ``ray`` beyond the next surface before the target; what is opaque stops its light, not the search."""
         origin = ray.place + ray.direction * ray.clear
         onward = mi.Ray3f(origin, ray.direction, self.si.time, self.si.wavelengths)
         met = self.passage.next_surface(onward, ray.active)
@@ -503,26 +413,21 @@ class _Search:
 # tracers of this room CLEAR.
 
 _OWN, _MITSUBA = 2 * CLEAR, 1.1 * 1500 * 2.0**-24
-"""Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see: their own offsets, with what
-rounding leaves of both surfaces."""
+"""Gaps, for each mm of coordinates, that our tracers and Mitsuba's integrators still see."""
 _POINTS, _FEWEST = 2**16, 8
-"""Points of each surface that are looked at, and how many make a contact: a ball that rests on a pane touches none."""
 _PARALLEL = 0.999
-"""Cosine between normals of two surfaces in contact; where cards cross they come close, and hide nothing there."""
 _MOST = 16
-"""Surfaces that are looked at; with more of them contacts of the others are not found."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Number of a shape that lets light through, its distance [mm] to what stands too close, and the least allowed."""
+    """Shape that lets light through, its distance to what stands too close, and the least allowed [mm]."""
 
     shape: int
     gap: float
     least: float
 
     def words(self, estimator: str) -> tuple[str, str]:
-        """What was found, and what an ``estimator`` allows."""
         rule = (
             f"{estimator} sees what stands at least {self.least:.2g} mm from a surface that lets light through; leave "
             "a gap of air, or take one surface with the material of both"
@@ -531,7 +436,7 @@ class Contact:
 
 
 def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
-    """Why the factored estimator and the reference must not be given a ``scene``; None where they may."""
+    """Return why the factored estimator and the reference must not be given a scene; None where they may."""
     shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None]
     clear = [shape for shape in shapes if lets_through(shape.bsdf())]
     found: list[Contact | None] = [None, None]
@@ -546,15 +451,12 @@ def contacts(scene: mi.Scene) -> tuple[Contact | None, Contact | None]:
 
 
 def _close(shape: mi.Shape, other: mi.Shape) -> bool:
-    """Whether the boxes of two shapes meet, but for a gap that is looked for."""
     (low, high), (first, last) = ([np.array(box.min), np.array(box.max)] for box in (shape.bbox(), other.bbox()))
     reach = _MITSUBA * (1 + max(np.abs(low).max(), np.abs(high).max()))
     return bool((first - reach <= high).all() and (low - reach <= last).all())
 
 
 def _gaps(shape: mi.Shape, others: Sequence[mi.Shape]) -> tuple[FloatArray, FloatArray]:
-    """Distances [mm] of points of a ``shape`` to the next parallel surface of its own or of ``others``, inf where none
-    is close, and the points' coordinates."""
     named = {f"shape{i}": other for i, other in enumerate(others)}
     # Surfaces that coincide with the shape's own are found without it.
     scenes = [(mi.load_dict({"type": "scene", **named, "own": shape}), 2 * CLEAR)]

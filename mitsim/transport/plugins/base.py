@@ -1,4 +1,4 @@
-"""What plugins and tracers share: the base of BSDFs, coordinates, arrays on the host, and random numbers.
+"""Common parts of plugins and tracers: the base of BSDFs, coordinates, arrays on the host, and random numbers.
 
 Index coordinates grow as rows and columns of images do: row = -y, column = -x in Mitsuba's camera frame, as lengths or
 as tan-angles.
@@ -19,15 +19,13 @@ from mitsim.core.arrays import FloatArray
 
 
 def numbers(text: str) -> list[float]:
-    """Those of a list in a scene file, a ``text`` with commas or blanks between them; ValueError where one is none."""
     return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
 
 
 def bsdf_class() -> type:
-    """Base of our BSDFs for the variant in use.
+    """Return the base of our BSDFs for the variant in use.
 
-    ``name`` is the plugin's, ``model`` holds its checked parameters; without ``eval_pdf`` of its own a BSDF is a delta,
-    which no given direction meets.
+    Without ``eval_pdf`` of its own a BSDF is a delta, which no given direction meets.
     """
 
     class ModelBSDF(mi.BSDF):  # type: ignore[misc]
@@ -53,27 +51,24 @@ def bsdf_class() -> type:
 
 
 def host_values(values: mi.Float, count: int) -> npt.NDArray[Any]:
-    """(count,) of a Dr.Jit array ``values`` of ``count`` numbers or one; real numbers in double precision."""
     array = np.array(values)
     array = array.astype(np.float64) if array.dtype.kind == "f" else array
     return np.broadcast_to(array.reshape(-1), (count,))
 
 
 def vectors(values: mi.Vector3f, count: int) -> FloatArray:
-    """(``count``, 3) of a Dr.Jit vector ``values``."""
     return np.stack([host_values(part, count) for part in (values.x, values.y, values.z)], axis=1)
 
 
 def channels(spectrum: mi.UnpolarizedSpectrum, count: int) -> FloatArray:
-    """(``count``, channels) of a ``spectrum``."""
     return np.stack([host_values(spectrum[i], count) for i in range(len(spectrum))], axis=1)
 
 
 def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Components of ``vectors`` (k, 3) on the device, in single precision.
+    """Copy vectors (k, 3) to the device, in single precision.
 
-    Gathered of one array: Dr.Jit takes arrays over as they lie in memory, and compiles kernels that read them anew for
-    each alignment, which is another for nearly every k (50 ms each).
+    They are gathered from one array, because Dr.Jit compiles kernels that read arrays in place anew for each alignment,
+    which differs for nearly every k (50 ms each).
     """
     flat = mi.Float(np.ascontiguousarray(vectors, dtype=np.float32).ravel())
     first = 3 * dr.arange(mi.UInt32, len(vectors))
@@ -84,29 +79,24 @@ def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
 # -------- Coordinates
 
 Numbers: TypeAlias = "mi.Float | FloatArray"
-"""What the formulas of this room take: the renderer's numbers, a lane each, or NumPy's."""
 RIGID = 1e-4
 """Largest :func:`rigidity_error` of a rigid transform: matrices of five digits pass, a scale of 1.0001 does not."""
 
 
 def rows_columns(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
-    """Index coordinates (row, column) of a point ``x``, ``y`` of the camera's frame, in their unit."""
     return -y, -x
 
 
 def x_y(row: Numbers, column: Numbers) -> tuple[Numbers, Numbers]:
-    """Camera coordinates (x, y) of index coordinates ``row``, ``column``, in their unit."""
     return -column, -row
 
 
 def turn_and_origin(transform: mi.AffineTransform4f) -> tuple[FloatArray, FloatArray]:
-    """(3, 3) linear part and (3,) origin [mm] of a ``transform``, in double precision."""
     matrix = np.array(transform.matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0]
     return matrix[:3, :3], matrix[:3, 3]
 
 
 def rigidity_error(turn: FloatArray) -> float:
-    """Largest entry of R^T R - 1 for the linear part ``turn`` (3, 3) of a transform: 0 where it only turns."""
     return float(np.abs(turn.T @ turn - np.eye(3)).max())
 
 
@@ -120,27 +110,16 @@ def rigidity_error(turn: FloatArray) -> float:
 # unbiased. The other dimensions are plain random numbers.
 
 _SEQUENCE_BITS = 20
-"""Bits of a sample's number that count in the second dimension: chosen for 2^20 samples of a stream, more than a pass
-takes of one."""
 
 
 def generator(seed: mi.UInt32, stream: mi.UInt32) -> mi.PCG32:
-    """An independent PCG32 for each ``stream`` of a ``seed``; the cipher TEA scatters neighbours, as in Mitsuba."""
+    """Return an independent PCG32 for each stream of a seed; the cipher TEA scatters neighbours, as in Mitsuba."""
     state, sequence = mi.sample_tea_32(seed, stream)
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
 
 
 def streams(seed: int | mi.UInt32, stream: mi.UInt32, sample: mi.UInt32) -> tuple[mi.PCG32, mi.PCG32]:
-    """Two generators for one sample of a stream.
-
-    Parameters
-    ----------
-    seed, stream
-        of the one that all the stream's samples share, which :func:`stratified` scrambles them by; one seed, or one for
-        each lane.
-    sample
-        number of the sample, which has the other for its own.
-    """
+    """Return the generator that all samples of a stream share, for :func:`stratified`, and the sample's own."""
     shared = seed_of(seed)
     return generator(shared, stream), generator(shared ^ (sample * 0x9E3779B9 + 1), stream)
 
@@ -151,14 +130,14 @@ def seed_of(seed: int | mi.UInt32) -> mi.UInt32:
 
 
 def sobol_point(index: mi.UInt32, rng: mi.PCG32) -> mi.Point2f:
-    """Point ``index`` of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
+    """Return a point of a Sobol sequence in the unit square, scrambled by numbers drawn from ``rng``."""
     first = _scramble(dr.brev(index), rng.next_uint32())
     second = _scramble(_second_dimension(index), rng.next_uint32())
     return mi.Point2f(_unit(first), _unit(second))
 
 
 def shuffle(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
-    """Numbers of samples in another order, drawn from ``rng``, in which each aligned block of 2^m is again one.
+    """Permute the numbers of samples so that each aligned block of 2^m is again one.
 
     :func:`stratified` points of them are as even as those of ``index`` and independent of these, so two pairs of
     dimensions pad to four (Burley 2020, "Practical hash-based Owen scrambling", section 4).
@@ -167,7 +146,7 @@ def shuffle(index: mi.UInt32, rng: mi.PCG32) -> mi.UInt32:
 
 
 def _second_dimension(index: mi.UInt32) -> mi.UInt32:
-    """Dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1.
+    """Return dimension 2 of Sobol's sequence, 32-bit fixed point: direction numbers of the polynomial x + 1.
 
     Bit b of the index counts (1 + S)^b, with S the shift by one digit. So the reversed bits are a polynomial in S that
     is taken at 1 + S: as (1 + S)^k is 1 + S^k for k = 2^j, modulo 2, of 2 k coefficients the upper k add to the lower.
@@ -179,7 +158,7 @@ def _second_dimension(index: mi.UInt32) -> mi.UInt32:
 
 
 def _scramble(bits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling: each bit is flipped by a hash of those above it."""
+    """Apply nested uniform scrambling: a hash of the bits above flips each bit."""
     x = dr.brev(bits) + seed
     for multiplier in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
         x ^= x * multiplier
@@ -187,18 +166,14 @@ def _scramble(bits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def _unit(bits: mi.UInt32) -> mi.Float:
-    """[0, 1) from the upper 24 bits, all that a float32 holds."""
     return mi.Float(bits >> 8) * (1 / 2**24)
 
 
 def panchromatic(radiance: mi.UnpolarizedSpectrum) -> mi.Float:
-    """One number for a spectrum of ``radiance``, by a flat response: the mean over channels, or over wavelengths that
-    have the weights of :func:`mitsim.transport.connect.sample_wavelengths`."""
+    """Return the mean of radiance over channels, or over wavelengths with the weights of a path."""
     # dr.mean would write the number of lanes into the kernel: another kernel for each number of paths.
     return dr.sum(radiance) / len(radiance)
 
 
 def split_by_line(light: mi.UnpolarizedSpectrum, lines: int) -> list[mi.Float]:
-    """Light of each of several ``lines``, or of all in one, whose weights ``light`` has as :func:`panchromatic` takes
-    them."""
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]

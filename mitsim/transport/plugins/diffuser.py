@@ -1,10 +1,10 @@
-"""A refractive diffuser before a bare sensor, lit by a distant point, in; the pattern of light on the sensor out.
+"""Pattern of light that a refractive diffuser before a bare sensor makes of a distant point.
 
-A sheet of glass (polycarbonate, as DiffuserCam's) whose face towards the sensor is a random, smooth relief. A distant
-point's parallel rays meet the flat face, then the relief, are refracted by Mitsuba's smooth dielectric, and land on the
-sensor, where they are counted. For small slopes a ray at x lands at x + d (n - 1) grad h(x), with h the thickness, so
-that the irradiance is 1 / |det(1 + d (n - 1) Hess h)|, summed over all x that land there: the caustics of a diffuser.
-Axes as in docs/physics.md: the sensor at z = 0 looks along +z, row 0 is at +y, column 0 at +x.
+A sheet of glass (polycarbonate, as DiffuserCam's) has a random, smooth relief towards the sensor. Parallel rays meet
+the flat face, then the relief, are refracted by Mitsuba's smooth dielectric, and are counted on the sensor. For small
+slopes a ray at x lands at x + d (n - 1) grad h(x), with h the thickness, so that the irradiance is 1 / |det(1 + d (n -
+1) Hess h)|, summed over all x that land there: the caustics of a diffuser. The sensor at z = 0 looks along +z, row 0 is
+at +y, column 0 at +x.
 """
 
 from __future__ import annotations
@@ -21,28 +21,14 @@ from mitsim.core.seeds import integer, stream
 from mitsim.transport.plugins.base import host_values, vectors
 
 _THICKNESS_MM = 1.0
-"""Of the sheet; it moves tilted light only, by its thickness times the tangent in glass."""
 _CLEAR_MM = 0.05
-"""How far along its line a refracted ray starts, beyond the face that it leaves and before the next one."""
 _RAYS_AT_ONCE = 2**22
-"""0.3 GiB of rays and their surface interactions."""
 _VERTICES = 12
-"""Vertices for each correlation length: normals between them, taken linearly, are then off by 0.3 % of the slope."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """A face over a square that is centred on the axis.
-
-    Attributes
-    ----------
-    side_mm
-        of the square.
-    height_mm
-        (g, g) how far the glass stands out towards the sensor [mm], at x = y = -side/2 to side/2; first index x.
-    slope_x, slope_y
-        (g, g) its derivatives, which say how rays are refracted.
-    """
+    """A face over a square on the axis: height (g, g) of the glass towards the sensor [mm], and slopes."""
 
     side_mm: float
     height_mm: FloatArray
@@ -51,21 +37,9 @@ class Relief:
 
 
 def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int) -> Relief:
-    """A normal random surface with the autocorrelation exp(-r^2 / (2 correlation^2)).
+    """Draw a normal random surface with the autocorrelation exp(-r^2 / (2 correlation^2)) and an rms slope.
 
-    Parameters
-    ----------
-    side_mm, correlation_mm
-        of the square, and of the relief; [mm].
-    slope
-        root mean square derivative along x and along y.
-    seed
-        of the surface.
-
-    Raises
-    ------
-    MitsimError
-        for lengths that do not fit, or a slope that is no small positive number.
+    Raise MitsimError for lengths that do not fit, or a slope that is no small positive number.
     """
     if not (0 < correlation_mm < side_mm / 4 and 0 < slope <= 0.5):
         raise MitsimError(
@@ -89,17 +63,10 @@ def random_relief(side_mm: float, correlation_mm: float, slope: float, seed: int
 
 @dataclass(frozen=True, eq=False)
 class Diffuser:
-    """A sheet before a sensor.
+    """Sheet of an index at a distance [mm] before a sensor.
 
-    Attributes
-    ----------
-    relief
-        its face towards the sensor; by default chosen so that, in pixels of 23.4 um, its caustics fill as much of 300 x
-        400 pixels as the public point spread function of DiffuserCam, in cells about as wide.
-    index
-        of refraction.
-    distance_mm
-        from the relief's zero to the sensor.
+    By default the caustics fill as much of 300 x 400 pixels of 23.4 um as the public point spread function of
+    DiffuserCam, in cells about as wide.
     """
 
     relief: Relief = field(default_factory=lambda: random_relief(6.0, 0.35, 0.05, 0))
@@ -107,7 +74,6 @@ class Diffuser:
     distance_mm: float = 8.0
 
     def scene(self) -> mi.Scene:
-        """Flat face and relief, with Mitsuba's smooth dielectric; glass between them."""
         glass = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}
         side, top = self.relief.side_mm, self.distance_mm + _THICKNESS_MM
         # Wider than the relief by what tilted light needs.
@@ -152,22 +118,10 @@ def point_spread(
     rays: int = 4096,
     seed: int = 0,
 ) -> FloatArray:
-    """(rows, columns) irradiance of a distant point's light behind a diffuser, over that before it.
+    """Return the irradiance (rows, columns) of a distant point behind a diffuser, over that before it.
 
-    Only light that meets the relief is traced: what surrounds it is opaque.
-
-    Parameters
-    ----------
-    diffuser
-        what stands before the sensor; a Mitsuba variant is selected.
-    shape, pitch_mm
-        rows and columns of the sensor, and the distance of its pixels.
-    tilt
-        tangents along x and y of the direction that light travels in.
-    rays
-        a side of the square of rays, one at random in each cell: a pixel of area a gets a / side^2 of them.
-    seed
-        of their places.
+    Only light that meets the relief is traced. `tilt` has tangents along x and y of the light's direction; `rays` is
+    the number along an axis, one at random in each cell.
     """
     scene, side = diffuser.scene(), diffuser.relief.side_mm
     rows, columns = shape
@@ -193,7 +147,6 @@ def point_spread(
 
 
 def _landing(scene: mi.Scene, places: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(k, 3) where rays from ``places`` (3, k) ``along`` a direction cross z = 0, and (k,) the part of their light."""
     unit = along / np.linalg.norm(along)
     ray = mi.Ray3f(mi.Point3f(places.astype(np.float32)), mi.Vector3f(*unit.tolist()))
     part, active = mi.Float(1), mi.Bool(True)

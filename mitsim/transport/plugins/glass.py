@@ -51,7 +51,6 @@ from mitsim.transport.plugins.base import bsdf_class, numbers
 
 PLUGIN = "mitsim_glass"
 _USUAL = "n-bk7"
-"""Where nothing is said, as Mitsuba's own ``dielectric`` has it: the commonest glass of windows and lenses."""
 CATALOGUE = MappingProxyType(
     {
         # Schott, optical glass data sheets 2023.
@@ -69,23 +68,16 @@ CATALOGUE = MappingProxyType(
         ),
     }
 )
-"""Sellmeier's B_1, C_1 [um^2], B_2, C_2, ... of glasses, by the source that stands above them."""
+"""Sellmeier's B_1, C_1 [um^2], B_2, C_2, ... of glasses, with their sources."""
 _LINE_D, _LINE_F, _LINE_C = 0.58756, 0.48613, 0.65627
-"""Fraunhofer's lines [um] that catalogues state index and Abbe's number by."""
 _PAIRS = 4
-"""Most terms of Sellmeier's formula: as many as any catalogue fits."""
 _VISIBLE = 360.0, 830.0
-"""Wavelengths [nm] of Mitsuba's spectra, over which an index must be one."""
 _CHECKED_WAVELENGTHS = 48
-"""Wavelengths at which that is looked at: 10 nm apart."""
 _MOST_INDEX = 5.0
-"""Above germanium's 4: more is no glass."""
 Length = TypeVar("Length", float, Any)
 
 
 class GlassModel(BaseModel):
-    """The checked parameters; meaning and limits stand in the module's table."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     glass: str | None = None
@@ -96,7 +88,6 @@ class GlassModel(BaseModel):
 
     @classmethod
     def build(cls, **values: object) -> GlassModel:
-        """Build from loose ``values``; a bad one raises MitsimError with one line."""
         model = validate(cls, values, PLUGIN)
         given = [name for name in ("glass", "sellmeier", "index") if getattr(model, name) is not None]
         if len(given) > 1:
@@ -120,7 +111,7 @@ class GlassModel(BaseModel):
         return model
 
     def index_squared(self, wavelength: Length) -> Length:
-        """Square of the index of refraction at a ``wavelength`` [nm], a number or Dr.Jit's."""
+        """Return the square of the index at a wavelength [nm], a number or Dr.Jit's."""
         square = (wavelength * 1e-3) ** 2
         if self.index is not None and self.abbe is not None:
             slope = (self.index - 1) / (self.abbe * (_LINE_F**-2 - _LINE_C**-2))
@@ -142,20 +133,12 @@ def _model(props: mi.Properties) -> GlassModel:
 
 
 def is_glass(material: mi.BSDF) -> bool:
-    """Whether a ``material`` is of this plugin, by itself: Mitsuba knows all classes of Python by one name."""
+    """Return True for this plugin; Mitsuba has one name for all Python classes."""
     return isinstance(getattr(material, "model", None), GlassModel)
 
 
 def tune(scene: mi.Scene, wavelength_nm: float) -> None:
-    """Give the glass of a scene the one wavelength that it has in mono and RGB variants.
-
-    Parameters
-    ----------
-    scene
-        as loaded. Glass whose file names a wavelength of its own keeps that.
-    wavelength_nm
-        of the light.
-    """
+    """Set the wavelength of a scene's glass in mono and RGB variants, unless its file names one."""
     parameters = mi.traverse(scene)
     for name, (_, _, node, _) in parameters.properties.items():
         if is_glass(node) and node.model.wavelength is None:
@@ -164,8 +147,6 @@ def tune(scene: mi.Scene, wavelength_nm: float) -> None:
 
 
 def plugin_class() -> type:
-    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
-
     class DispersiveGlass(bsdf_class()):  # type: ignore[misc]
         name = PLUGIN
 

@@ -75,9 +75,7 @@ from mitsim.transport.plugins.base import bsdf_class, numbers
 
 PLUGIN = "mitsim_grating"
 _ORDERS = 16
-"""Highest order: a compact disc, 1600 nm, sends visible light to 4 at most; each costs a lobe in every evaluation."""
 _ROUNDING = 1e-6
-"""How far above 1 a sum of decimals may come out; float32 when it was read back from Mitsuba."""
 
 Part = Annotated[float, Field(ge=0, le=1)]
 Wavelength = Annotated[float, Field(ge=1, le=1e6)]
@@ -85,8 +83,6 @@ Share = Annotated[float, Field(ge=0, le=1e9)]
 
 
 class GratingModel(BaseModel):
-    """The checked parameters; meaning and limits stand in the module's table."""
-
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     pitch: float = Field(1600.0, ge=1, le=1e9, description="groove period [nm]")
@@ -103,7 +99,6 @@ class GratingModel(BaseModel):
 
     @classmethod
     def build(cls, **values: object) -> GratingModel:
-        """Build from loose ``values``; a bad one raises MitsimError with one line."""
         model = validate(cls, values, PLUGIN)
         total = sum(model.orders.values()) + model.diffuse
         if total > 1 + _ROUNDING:
@@ -122,7 +117,6 @@ class GratingModel(BaseModel):
 
     @property
     def orders(self) -> dict[int, float]:
-        """Efficiency of each order, from the lowest to the highest."""
         positive = self.efficiencies[1:]
         negative = positive if self.negative_efficiencies is None else self.negative_efficiencies
         below = {-1 - i: part for i, part in enumerate(negative)}
@@ -144,7 +138,6 @@ def _model(props: mi.Properties) -> GratingModel:
 
 
 def _numbers(name: str, value: Any) -> object:
-    """A number as it is, a text or an array as a list of numbers."""
     if isinstance(value, bool | int | float):
         return [value] if name in ("efficiencies", "negative_efficiencies", "wavelengths", "shares") else value
     try:
@@ -156,8 +149,6 @@ def _numbers(name: str, value: Any) -> object:
 
 
 def plugin_class() -> type:
-    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
-
     class Grating(bsdf_class()):  # type: ignore[misc]
         name = PLUGIN
 
@@ -206,7 +197,6 @@ def plugin_class() -> type:
         # ---- what the derivation in the module's docstring says
 
         def _grating_vector(self, si: mi.SurfaceInteraction3f) -> mi.Vector2f:
-            """g in the local frame; at a disc's centre, and where a linear grating is seen end on, any will do."""
             circular = self.model.grooves == "circular"
             across = si.to_local(si.dp_du if circular else mi.Vector3f(self.model.direction))
             flat = mi.Vector2f(across.x, across.y)
@@ -214,7 +204,6 @@ def plugin_class() -> type:
             return dr.select(length > 0, flat / length, mi.Vector2f(1, 0))
 
         def _lines(self, si: mi.SurfaceInteraction3f) -> Iterable[tuple[float, mi.UnpolarizedSpectrum]]:
-            """Share and wavelength [nm] of the lines, the wavelength with one entry for each channel."""
             if mi.is_spectral:
                 return [(1.0, mi.UnpolarizedSpectrum(si.wavelengths))]
             if mi.is_rgb:
@@ -222,18 +211,15 @@ def plugin_class() -> type:
             return zip(self._shares, map(mi.UnpolarizedSpectrum, self.model.wavelengths), strict=True)
 
         def _lobes(self, si: mi.SurfaceInteraction3f) -> Iterator[tuple[mi.Float, mi.UnpolarizedSpectrum]]:
-            """Reflected part and shift m lambda / pitch (by channel) of every line's orders."""
             for share, wavelength in self._lines(si):
                 for index, order in enumerate(self.orders):
                     part = share * dr.gather(mi.Float, self.efficiencies, index)
                     yield part, order * wavelength / self.pitch
 
         def _total(self) -> mi.Float:
-            """Everything that is reflected without the factor ``reflectance``: lobes are drawn by their part of it."""
             return self.diffuse + dr.sum(self.efficiencies)
 
         def _distribution(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.UnpolarizedSpectrum:
-            """Sum of eta D + diffuse / pi, by channel, without reflectance and cosine."""
             g = self._grating_vector(si)
             q = mi.Vector2f(si.wi.x + wo.x, si.wi.y + wo.y)
             along = (q.y * g.x - q.x * g.y) / self.sigma_groove

@@ -57,21 +57,10 @@ PLUGIN = "mitsim_projector"
 
 
 def aperture_scene_parts(projector: mi.Emitter, radius: float, focus: float) -> dict[str, Any]:
-    """Scene parts that replace a stock projector: its aperture as a disk that shines as it does.
+    """Return scene parts that replace a stock projector: its aperture as a disk that shines alike.
 
-    Parameters
-    ----------
-    projector
-        stock ``projector`` emitter; its bitmap is taken to be nearest and clamped, as the scenes have it.
-    radius
-        of the aperture [mm].
-    focus
-        distance of the sharp plane from the aperture [mm].
-
-    Raises
-    ------
-    MitsimError
-        for a radius or focus that is not above 0, or a projector without a bitmap or with a scaled ``to_world``.
+    The bitmap is taken to be nearest and clamped. Raise MitsimError for a radius or focus [mm] that is not above 0, or
+    a projector without a bitmap or with a scaled ``to_world``.
     """
     for name, value in (("radius", radius), ("focus", focus)):
         if not (math.isfinite(value) and value > 0):
@@ -114,7 +103,7 @@ def _number(props: mi.Properties, name: str, low: float, high: float) -> float:
 
 
 def plugin_class() -> type:
-    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
+    """Return the plugin for the variant in use."""
 
     class ApertureProjector(mi.Emitter):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
@@ -134,7 +123,6 @@ def plugin_class() -> type:
         def _power(
             self, point: mi.Point3f, direction: mi.Vector3f, wavelengths: mi.Color0f, active: mi.Bool
         ) -> tuple[mi.Spectrum, mi.Float]:
-            """pi scale texture of the ray that leaves the aperture, and its cosine to the axis."""
             inverse = self.to_world.inverse()
             o, d = inverse @ point, inverse @ direction
             active &= d.z > 0
@@ -195,7 +183,6 @@ def plugin_class() -> type:
         def sample_ray(
             self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
         ) -> tuple[mi.Ray3f, mi.Spectrum]:
-            """A point of the aperture and one of the picture, both even: the weight is pi scale texture x its area."""
             ps, _ = self.sample_position(time, sample2, active)
             near = mi.Vector3f((1 - 2 * sample3.x) * self.reach, (1 - 2 * sample3.y) * self.reach / self.aspect, 1)
             direction = dr.normalize(self.to_world @ mi.Point3f(near * self.focus) - ps.p)

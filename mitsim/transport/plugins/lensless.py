@@ -81,7 +81,7 @@ from mitsim.transport.plugins.base import (
 
 PLUGIN = "mitsim_lensless"
 _BOX_RADIUS = 0.5 + 1e-4
-"""Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box says 0.5 in float32."""
+"""Radius [pixels] of a filter that keeps light in its pixel; Mitsuba's box states 0.5 in float32."""
 
 
 def _geometry(props: mi.Properties, film: mi.Film) -> CameraGeometry:
@@ -106,7 +106,7 @@ def _check_rigid(transform: mi.AffineTransform4f) -> None:
 
 
 def plugin_class() -> type:
-    """The plugin for the variant in use: Mitsuba's base classes exist per variant."""
+    """Return the plugin for the variant in use."""
 
     class Lensless(mi.Sensor):  # type: ignore[misc]
         def __init__(self, props: mi.Properties) -> None:
@@ -121,7 +121,7 @@ def plugin_class() -> type:
             self.wear(_geometry(props, self.film()))
 
         def wear(self, geometry: CameraGeometry) -> None:
-            """Take the camera of a ``geometry``, which has the mask of a camera file."""
+            """Set the camera of a geometry, with the mask of a camera file."""
             self.geometry = geometry
             mask = geometry.build_mask()
             self._openings, self._feature = Openings(mask), mask.feature_mm
@@ -141,10 +141,7 @@ def plugin_class() -> type:
                 self._columns.append(mi.Float(columns.astype(np.float32)))
 
         def stratify(self, points: tuple[int, int] | None) -> None:
-            """Draw u and t of a pixel's paths from Sobol points that are scrambled by (seed, paths a pixel) ``points``.
-
-            Each pixel has points of its own, and so has each seed. None: random numbers again.
-            """
+            """Draw u and t of each pixel from Sobol points scrambled by (seed, paths a pixel); None: at random."""
             self._points = points
 
         def sample_ray(
@@ -181,7 +178,6 @@ def plugin_class() -> type:
             return mi.RayDifferential3f(ray), weight
 
         def _stratify(self, film: mi.Point2f, seed: int, paths: int) -> tuple[mi.Point2f, mi.Point2f]:
-            """Even points in the pixels of ``film`` points (0..1), and of the unit square; in the order of lanes."""
             rows, columns = self.geometry.frame_shape
             count = mi.Point2f(columns, rows)
             place = dr.minimum(dr.floor(film * count), count - 1)
@@ -192,7 +188,6 @@ def plugin_class() -> type:
             return film, sobol_point(shuffle(index, rng), rng)
 
         def _on_sensor(self, film: mi.Point2f) -> mi.Point2f:
-            """Points (0..1) of the region of interest, which the film shows, on the whole sensor (0..1)."""
             geometry, roi = self.geometry, self.geometry.roi
             if roi is None:
                 return film
@@ -200,7 +195,6 @@ def plugin_class() -> type:
             return (first + film * shown) / whole
 
         def _active(self, sample: mi.Point2f) -> mi.Point2f:
-            """Film points (0..1) drawn together into the active square of their pixels."""
             geometry = self.geometry
             if geometry.pixel_fill_factor == 1:
                 return sample
@@ -209,7 +203,6 @@ def plugin_class() -> type:
             return middle + (sample - middle) * (geometry.active_sides[1] / geometry.pixel_pitch)
 
         def _direction(self, u: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
-            """Tan-angles t from sensor points u [mm] to open places of the mask, and the part of all that is open."""
             geometry = self.geometry
             stop, side = geometry.tan_half_fov, self._feature
             # What the field stop shows of the mask, in features from the mask's first corner.
@@ -223,10 +216,6 @@ def plugin_class() -> type:
             return t, part
 
         def _crossing(self, u: mi.Point2f, t: mi.Vector2f, sample: mi.Point2f) -> mi.Point2f:
-            """Where rays of tan-angles t from sensor points u cross the mask, tilted; then moved as its blur says.
-
-            A Gaussian blur is the mean over places that are moved at random: the bits of a ``sample`` tell how far.
-            """
             distance, flaws = self.geometry.mask_distance, self._flaws
             if any(flaws.tilt_mrad):
                 tilt = mi.Vector2f(*x_y(*(float(np.tan(angle * 1e-3)) for angle in flaws.tilt_mrad)))
@@ -244,7 +233,6 @@ def plugin_class() -> type:
             return point
 
         def _place(self, row: mi.Float, column: mi.Float) -> tuple[mi.Float, mi.Float]:
-            """Row and column of the mask, as whole numbers, at places [mm] about its centre."""
             if self._lines is None:
                 return tuple(dr.floor(s / self._feature + 0.5 * self._features) for s in (row, column))
             angle = np.radians(self._flaws.turn_deg)
@@ -258,7 +246,6 @@ def plugin_class() -> type:
             )
 
         def _transmission(self, point: mi.Point2f, active: mi.Bool) -> mi.Float:
-            """Mask transmission at mask-plane points (x, y) [mm]; opaque outside its features."""
             row, column = rows_columns(point.x, point.y)
             row_centre, column_centre = self.geometry.mask_offset
             row, column = self._place(row - row_centre, column - column_centre)
@@ -290,10 +277,7 @@ def plugin_class() -> type:
 
 
 class OpenAxis:
-    """The open rows of a grid, or its columns; coordinates count features from the first one's edge.
-
-    ``bits`` (N,) tell which are open.
-    """
+    """Open rows of a grid, or its columns; coordinates count features from the first one's edge."""
 
     def __init__(self, bits: BoolArray) -> None:
         self._size = len(bits)
@@ -303,7 +287,6 @@ class OpenAxis:
         self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
 
     def open_within(self, low: mi.Float, width: float) -> _Seen:
-        """What is open from ``low`` on over a ``width``."""
         # From the feature that holds its start: the width of a narrow view keeps its digits.
         start = mi.UInt32(dr.clip(low, 0, self._size))
         within = low - mi.Float(start)
@@ -316,15 +299,12 @@ class OpenAxis:
         return _Seen(self._places, start, within, before, skipped, dr.maximum(length, 0))
 
     def _open(self, index: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
-        """How many features are open before the one of an ``index``, and whether it is itself: 1 or 0."""
         before = dr.gather(mi.UInt32, self._before, index)
         return before, mi.Float(dr.gather(mi.UInt32, self._before, index + 1) - before)
 
 
 @dataclass
 class _Seen:
-    """An axis from the range's start: the feature that holds it, how far inside, what is open before, and within."""
-
     places: mi.UInt32
     start: mi.UInt32
     within: mi.Float
@@ -333,7 +313,6 @@ class _Seen:
     length: mi.Float
 
     def draw(self, number: mi.Float) -> mi.Float:
-        """Distance from the range's start, in features, of the open place that a ``number`` in [0, 1) means."""
         place = self.skipped + number * self.length
         whole = mi.UInt32(place)
         feature = dr.gather(mi.UInt32, self.places, dr.minimum(self.before + whole, dr.width(self.places) - 1))
@@ -341,27 +320,18 @@ class _Seen:
 
 
 class Openings:
-    """The open places of a ``mask``; of a plate without grids of them, a rectangle that holds them."""
+    """Open places of a mask; for a plate without grids of them, a rectangle that contains them."""
 
     def __init__(self, mask: Mask | Plate) -> None:
         self._grids = [(OpenAxis(rows), OpenAxis(columns)) for rows, columns in mask.openings]
 
     def draw(self, corner: mi.Point2f, width: float, number: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """An open place of a square window, each as likely as any other.
-
-        Parameters
-        ----------
-        corner
-            the window's first (row, column), in features from the mask's first corner.
-        width
-            its side, in features.
-        number
-            of the unit square: the same for the same place.
+        """Draw an open place of a square window, each as likely as any other.
 
         Returns
         -------
         row and column from the window's first corner, in features, and the part of the window that is open: where it is
-        0 the place means nothing.
+        0 the place is undefined.
         """
         grids = [
             (rows.open_within(corner.x, width), columns.open_within(corner.y, width)) for rows, columns in self._grids
@@ -379,5 +349,4 @@ class Openings:
 
 
 def _part(amount: mi.Float, whole: mi.Float) -> mi.Float:
-    """An ``amount`` in units of the ``whole``; 0 of nothing."""
     return dr.select(whole > 0, amount / whole, 0)

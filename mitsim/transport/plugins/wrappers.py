@@ -34,13 +34,11 @@ from mitsim.scene.limits import BUMPS, CHOICES, DIRECTED
 from mitsim.transport.plugins.base import bsdf_class
 
 PREFIX = "mitsim_"
-"""Of the names of these plugins, before those of Mitsuba."""
 _ANY = 2**32 - 1
-"""Component of a context that asks for all of them."""
 
 
 def plugin_classes() -> dict[str, type]:
-    """Return the plugins for the variant in use, by name: Mitsuba's base classes exist per variant."""
+    """Return the plugins for the variant in use, by name."""
 
     class Wrapper(bsdf_class()):  # type: ignore[misc]
         parts: list[mi.BSDF]
@@ -51,7 +49,6 @@ def plugin_classes() -> dict[str, type]:
             self.m_flags = reduce(or_, (part.flags() for part in parts))
 
         def _shares(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Sequence[mi.Float]:
-            """Return the share of the light that each part has."""
             return (mi.Float(1),)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -174,8 +171,7 @@ def plugin_classes() -> dict[str, type]:
 def _adjoint(
     bsdf: mi.BSDF, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
 ) -> mi.Spectrum:
-    """Return the value of a ``bsdf`` for light that comes from ``si.wi`` and is seen from ``wo``, with the cosine of
-    ``wo`` in place of that of ``si.wi``."""
+    """Return the value for light from ``si.wi`` seen from ``wo``, with the cosine of ``wo``."""
     seen = mi.SurfaceInteraction3f(si)
     seen.wi = wo
     context = mi.BSDFContext(mi.TransportMode.Radiance, ctx.type_mask, ctx.component)

@@ -23,12 +23,9 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.job import Job, Limits
 from mitsim.core.runs import Capture
 from mitsim.exchange import tensors
-from mitsim.learn import networks, training, verbs
-from mitsim.learn.critic import Critic
-from mitsim.learn.diagonal import BIN, Binning, Data, Diagonal
+from mitsim.learn import methods, training, verbs
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
-from mitsim.learn.methods import CLASSES
-from mitsim.learn.networks import LEVELS, WAYS, UNet, has_half
+from mitsim.learn.methods import BIN, CLASSES, LEVELS, WAYS, Binning, Critic, Data, Diagonal, UNet, has_half
 from mitsim.learn.training import train_network
 from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
@@ -97,9 +94,9 @@ def test_half_precision_is_of_training_alone(monkeypatch: pytest.MonkeyPatch) ->
     """And of the step that a training's time is told from. (Planted: of images too; a step of images' precision.)"""
     network, images = UNet(1, 1, 4), torch.randn((1, 1, 16, 16), generator=torch.Generator().manual_seed(1))
     torch.nn.init.ones_(network.last.weight)
-    monkeypatch.setattr(networks, "has_half", lambda device: False)
+    monkeypatch.setattr(methods, "has_half", lambda device: False)
     single = network(images).detach()
-    monkeypatch.setattr(networks, "has_half", lambda device: True)
+    monkeypatch.setattr(methods, "has_half", lambda device: True)
     assert torch.equal(network.eval()(images), single)
     rounded = network.train()(images).detach()
     assert 1e-4 < float((rounded - single).abs().max() / single.abs().max()) < 0.1

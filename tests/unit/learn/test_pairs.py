@@ -24,8 +24,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.learn import pairs as pairs_module
 from mitsim.learn.pair_request import PairsRequest, Variation
 from mitsim.learn.pair_store import PairStore, PrintPart
-from mitsim.learn.pairs import make_pairs
-from mitsim.learn.white_prints import electrons_per_joule
+from mitsim.learn.pairs import electrons_per_joule, make_pairs
 from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
@@ -105,7 +104,9 @@ def test_light_lies_in_the_pictures_pixel_of_its_own_row_and_column() -> None:
     light = sparse.csr_array(([1.0, 2.0, 3.0], [0, 7, 23], [0, 3]), shape=(1, 24))
     optics = SimpleNamespace(shape=(4, 6), cells=(2, 3))
     part = PrintPart(cast(Any, optics), light, np.array([2, 0]), np.array([3, 1, 2]), lamps=False)
-    assert part._pixel(4).tolist() == [2 * 4 + 3, 0 * 4 + 1, 0 * 4 + 2]
+    picture = np.arange(16.0).reshape(4, 4)
+    (found,) = part.times(picture).groups
+    assert found.data.tolist() == [1.0 * picture[2, 3], 2.0 * picture[0, 1], 3.0 * picture[0, 2]]
 
 
 @pytest.fixture
