@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from mitsim.acquire.sense import Sensed
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
+    from mitsim.studies.characterise import Characterisation
     from mitsim.studies.demo import DemoResult
-    from mitsim.studies.emva_results import Characterisation
     from mitsim.studies.framework.campaign import CampaignResult
     from mitsim.studies.framework.experiment import Scope
     from mitsim.studies.framework.run import StudyResult
@@ -496,7 +496,7 @@ def characterise(
     >>> import mitsim as ms
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
-    from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
+    from mitsim.devices.flatlist import Procedure, capacity_of, load_flats
     from mitsim.studies.framework.run import check_study_folder
 
     asked = dict(options_of(_Simulated, procedure, "characterise"))
@@ -507,8 +507,6 @@ def characterise(
                 "characterise: got no camera; give one to simulate, or as frames the folder of a real one"
             )
         _refuse({*asked}, [*asked], "on frames of a real camera")
-        from mitsim.devices.flatlist import load_flats
-
         listed = load_flats(Path(frames))
         if output is not None:
             check_study_folder(output, "characterise")
@@ -523,8 +521,9 @@ def characterise(
     if "wavelength" in asked:
         asked["wavelength_nm"] = asked.pop("wavelength")
     done = Procedure(frames=frames, **asked)
+    check_wavelength(done.wavelength_nm)
     capacity_of(sensor)
-    efficiency_of(sensor, done)
+    done.efficiency(sensor)
     if output is not None:
         check_study_folder(output, "characterise")
     from mitsim.studies.characterise import characterise as run_characterise

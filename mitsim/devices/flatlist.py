@@ -1,10 +1,11 @@
-"""What frames of a camera under even light and in the dark are of: a folder with its list in, checked sets of them out.
+"""Frames that characterise a camera: the checked list of a real camera's frames, or the sizes of a simulation.
 
-The list is `session.toml` or `session.json`, as that of a calibration; none of its frames is opened.
+The list is `session.toml` or `session.json`, as that of a calibration. No frame is opened, and numpy is not imported.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,13 +13,61 @@ from typing import Annotated
 from pydantic import FailFast, Field
 
 from mitsim.core.configuration import Configuration, Positive, validate
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import FileName
+from mitsim.core.seeds import check_root
 from mitsim.devices.framelist import read_list
+from mitsim.devices.sensor import SensorModel
 
 _MOST_SETS, _MOST_FRAMES = 4096, 10_000
 """Of a list, and frames of a set: ten times what EMVA 1288's longest procedures take."""
+_LIMITS = {"pixels": (32, 4096), "steps": (20, 1000), "frames": (2, 10_000)}
+"""Below 32 rows a row's part is known to a quarter. EMVA 1288 takes at least 50 steps and 16 frames."""
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """Sizes of a simulated characterisation.
+
+    Attributes
+    ----------
+    pixels : rows and columns of the frames, of binned pixels.
+    steps : steps of the light.
+    frames : frames of each stack.
+    seed : root of every draw; the camera's fixed pattern has its own.
+    wavelength_nm : wavelength of the light, for a camera with a curve of quantum efficiency.
+    """
+
+    pixels: int = 256
+    steps: int = 50
+    frames: int = 100
+    seed: int = 0
+    wavelength_nm: float = 550.0
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in _LIMITS.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ArgumentError(name, f"{value}: give a whole number from {least} to {most}")
+        check_root(self.seed)
+
+    def efficiency(self, sensor: SensorModel) -> float:
+        """Return electrons per photon; 1 if the sensor states none or has filters, because electrons are counted."""
+        return sensor.efficiency(self.wavelength_nm) if sensor.states_efficiency else 1.0
+
+
+def capacity_of(sensor: SensorModel) -> float:
+    """Return the electrons that saturate a pixel: its full well, or the ADC's end; MitsimError without either."""
+    full = sensor.superpixel_full_well_e
+    if sensor.largest_dn is not None:
+        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
+    if not math.isfinite(full):
+        raise MitsimError(
+            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
+            "give full_well_e or bits"
+        )
+    return full
 
 
 class DarkSet(Configuration):

@@ -45,8 +45,7 @@ from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import curves, pair_chart
-from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
-from mitsim.sensor.specimen import specimen
+from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.framework.claims import Cell, difference, grid_with_truths, single_precision, verdict, within
 from mitsim.studies.framework.experiment import (
     IMAGE,

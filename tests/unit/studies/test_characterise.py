@@ -9,9 +9,9 @@ import pytest
 
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
+from mitsim.devices.flatlist import Procedure
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.studies.characterise import characterise
-from mitsim.studies.emva_options import Procedure
 from tests.invented import sensor
 
 SMALL = Procedure(pixels=64, steps=25, frames=16)

@@ -16,8 +16,7 @@ from scipy.fft import dctn, idctn
 from mitsim.core.errors import MitsimError
 from mitsim.devices.flatlist import load_flats
 from mitsim.devices.sensor import load_sensor
-from mitsim.studies.characterise import CAMERA_FILE, characterise_frames
-from mitsim.studies.emva_results import FIELDS, Characterisation, _set_field
+from mitsim.studies.characterise import CAMERA_FILE, FIELDS, Characterisation, characterise_frames
 from tests.real_flats import CAMERAS, Light, camera, write_flats
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -33,10 +32,7 @@ SLOW_LAMPS = "random walk", "step", "linear"
 
 def off_by(done: Characterisation, name: str) -> dict[str, float]:
     """By how many standard errors each field of the camera found is off that of the camera of this ``name``."""
-    model = camera(name)
-    bends = [*model.linearity, 0.0, 0.0]
-    given = {row.name: _set_field(model, row.name) if row.name in FIELDS else bends[int(row.name[-1])]
-             for row in done.fields}  # fmt: skip
+    given = {row.name: FIELDS[row.name][1](camera(name)) for row in done.fields}
     return {
         row.name: (row.found - value) / row.standard_error
         for row in done.fields
