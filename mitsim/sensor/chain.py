@@ -1,10 +1,10 @@
-"""Irradiance on the sensor in, digital numbers out, stage by stage after EMVA 1288 release 4.0.
+"""The sensor chain after EMVA 1288 release 4.0, from irradiance to digital numbers, stage by stage.
 
-The order is physics and not to be permuted: irradiance x area x time -> photons -> quantum efficiency ->
+The order is physics and must not change: irradiance x area x time -> photons -> quantum efficiency ->
 photoelectrons -> crosstalk -> response of each pixel -> + dark current -> Poisson -> full-well clip -> linearity ->
 + offset, row noise, read noise -> gain -> black level -> quantise. A stage that a camera does not name is left out.
-Means and variances in closed form are in `mitsim.sensor.moments`. All values are per superpixel (see
-`SensorModel`); arrays keep their shape and are float64 until the last stage.
+`mitsim.sensor.moments` has means and variances in closed form. All values are per superpixel (see `SensorModel`);
+arrays keep their shape and are float64 until the last stage.
 """
 
 from __future__ import annotations
@@ -28,30 +28,18 @@ from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
-"""Digital numbers: codes, or real values of a sensor without bits."""
 _MANY = 64.0
-"""Mean electrons from which counts are quantiles of normal deviates: three draws in a million are another count (see
-:func:`poisson_count`), less than 1e9 draws tell; numpy's Poisson draw, besides, loses digits above 1e11."""
+"""Mean electrons from which counts are quantiles of normal deviates. Three draws in a million differ from the Poisson
+law, fewer than 1e9 draws show; numpy's Poisson draw loses digits above 1e11.
+"""
 
 
 def electrons_from_irradiance(
     irradiance: npt.ArrayLike, exposure_s: float, model: SensorModel, wavelength_nm: float
 ) -> FloatArray:
-    """Expected photoelectrons, without dark current.
+    """Compute photoelectrons without dark current, mu_e = eta E A t / (h c / lambda) (EMVA 1288 4.0, "sensitivity").
 
-    mu_e = eta E A t / (h c / lambda), EMVA 1288 4.0, "sensitivity". ValueError for negative or NaN irradiance or
-    exposure.
-
-    Parameters
-    ----------
-    irradiance
-        [W m^-2], any shape, which the result has.
-    exposure_s
-        0 or more.
-    model
-        the sensor.
-    wavelength_nm
-        of the light.
+    `irradiance` [W m^-2] has any shape. ValueError for negative or NaN irradiance or exposure.
     """
     light = checked_light(irradiance, "irradiance")
     if not 0 <= exposure_s < math.inf:
@@ -60,18 +48,9 @@ def electrons_from_irradiance(
 
 
 def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
-    """Exposure [s] after which light and dark current fill a part of the full well in the mean.
+    """Compute the exposure [s] after which light and dark current fill a fraction of the full well on average.
 
-    MitsimError when there is no light or no full well, or the fraction is not in (0, 1].
-
-    Parameters
-    ----------
-    peak_irradiance, wavelength_nm
-        of the light [W m^-2].
-    fraction
-        of the full well.
-    model
-        the sensor.
+    MitsimError without light or a full well, or if the fraction is not in (0, 1].
     """
     if not 0 < fraction <= 1:
         raise MitsimError(f"exposure: got fraction {fraction} of full well; allowed is above 0, up to 1")
@@ -95,19 +74,14 @@ def expose(
     shot_rng: np.random.Generator,
     read_rng: np.random.Generator,
 ) -> Digital:
-    """One noisy frame: uint32 DN, or float64 where the model has no bits. ValueError for negative or NaN electrons.
+    """Draw one noisy frame: uint32 DN, or float64 if the model has no bits. ValueError for negative or NaN electrons.
 
     Parameters
     ----------
-    expected_electrons
-        photoelectrons, any shape; (rows, columns) of a camera whose pixels differ, share noise or light.
-    exposure_s
-        adds its dark electrons.
-    model
-        the sensor.
-    shot_rng, read_rng
-        streams of their own, so that switching one noise off leaves the other's draw as it was. Row noise is drawn
-        from a child of the latter.
+    expected_electrons : photoelectrons of any shape; (rows, columns) if pixels differ or share noise or light.
+    exposure_s, model : exposure [s], which adds dark electrons, and sensor. shot_rng, read_rng : separate streams, so
+    that one noise can be switched off without a change of the other. Row noise
+        is drawn from a child of `read_rng`.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     shape = np.shape(light)
@@ -120,7 +94,6 @@ def expose(
 
 
 def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: Any, read: Any) -> Any:
-    """All stages from the Poisson draw on, of pixels whose normal deviates are ``shot`` and ``read``."""
     electrons = bend(clip_at_full_well(_electron_counts(light + dark, few, shot), model), model)
     if offset is not None:
         electrons = electrons + offset
@@ -128,7 +101,7 @@ def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: An
 
 
 def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
-    """The numbers of ``model`` that :func:`_read_out` asks it for."""
+    """Return the numbers that `_read_out` reads."""
     return {
         "superpixel_full_well_e": model.superpixel_full_well_e,
         "linearity": tuple(model.linearity),
@@ -140,35 +113,27 @@ def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | Non
 
 
 def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
-    """What a user of the frames ``dn`` of a ``model`` does: (DN - black level) / gain, in electrons.
-
-    Dark electrons stay in; noise may make values negative, and they stay so.
-    """
+    """Convert digital numbers to electrons, (DN - black level) / gain. Dark electrons and negative values remain."""
     return (np.asarray(dn, dtype=np.float64) - model.superpixel_black_level_dn) / model.gain_dn_per_e
 
 
 # -------- One specimen of a camera
 
 Map = npt.NDArray[np.float32]
-"""(rows, columns) numbers of seven digits, more than any is known to."""
+"""(rows, columns) float32, because no number is known to more than seven digits."""
 _MOST_MAPS = 2
-"""Specimens that are kept: frames of a run have one size, and a test's may have two."""
 
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """What is fixed in space of a camera; None is no difference between pixels.
+    """Fixed differences between the pixels of one camera; None without differences.
 
     Attributes
     ----------
-    offset_e
-        (rows, columns) what a pixel reads beyond the black level without charge [electrons]; mean 0.
-    response
-        (rows, columns) a pixel's response to light over the mean of undamaged ones; 0 is dead.
-    dark_e_per_s
-        (rows, columns) dark current at the sensor's temperature, hot pixels' too.
-    hot, dead
-        how many superpixels have a hot pixel, and a dead one.
+    offset_e : (rows, columns) reading beyond the black level without charge [electrons]; mean 0.
+    response : (rows, columns) response to light relative to the mean of undamaged pixels; 0 is dead.
+    dark_e_per_s : (rows, columns) dark current at the sensor's temperature, including hot pixels.
+    hot, dead : numbers of superpixels with a hot and with a dead pixel.
     """
 
     offset_e: Map | None
@@ -180,7 +145,10 @@ class Specimen:
 
 @lru_cache(maxsize=_MOST_MAPS)
 def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
-    """The specimen that ``model.pattern_seed`` names, for frames of ``shape`` (rows, columns)."""
+    """Return the specimen that ``model.pattern_seed`` names, for frames of ``shape`` (rows, columns).
+
+    It follows from seed and shape alone (EMVA 1288 4.0, "spatial nonuniformity"); numbers are per superpixel.
+    """
     hot, dead = (_defects(model, shape, kind) for kind in ("hot", "dead"))
     return Specimen(
         offset_e=_parts(model, shape, "offset", model.offset_parts),
@@ -192,7 +160,7 @@ def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
 
 
 def response_variance(model: SensorModel) -> float:
-    """Variance over pixels of the ``model``'s response, whose mean is that of undamaged pixels (1) less dead ones.
+    """Return the variance over pixels of the response, whose mean is that of undamaged pixels (1) less dead ones.
 
     With p of the pixels dead, b^2 in a superpixel: (1 + sum s^2) (q^2 + p q / b^2) - q^2, q = 1 - p.
     """
@@ -202,19 +170,18 @@ def response_variance(model: SensorModel) -> float:
 
 
 def dark_current_variance(model: SensorModel) -> float:
-    """Variance over superpixels of the ``model``'s dark current [(electrons/s)^2]: b^2 (s^2 + p (1 - p) h^2)."""
+    """Return the variance over superpixels of the dark current [(electrons/s)^2]: b^2 (s^2 + p (1 - p) h^2)."""
     hot = model.hot_pixels * (1 - model.hot_pixels) * model.hot_dark_current_e_per_s**2
     return (model.binning * model.dark_factor) ** 2 * (model.dark_current_spread_e_per_s**2 + hot)
 
 
 def mean_dark_current(model: SensorModel) -> float:
-    """Mean over superpixels of the ``model``'s dark current, hot pixels' too [electrons/s]."""
+    """Return the mean dark current of superpixels, including hot pixels [electrons/s]."""
     hot = model.hot_pixels * model.hot_dark_current_e_per_s * model.binning**2 * model.dark_factor
     return model.superpixel_dark_current_e_per_s + hot
 
 
 def _parts(model: SensorModel, shape: tuple[int, int], name: str, parts: tuple[float, float, float]) -> Map | None:
-    """Sum of independent normal parts by pixel, row and column, of these standard deviations; None without any."""
     if not any(parts):
         return None
     total = np.zeros(shape, dtype=np.float32)
@@ -234,7 +201,7 @@ def _response(model: SensorModel, shape: tuple[int, int], dead: Map | None) -> M
 
 
 def _dark_current(model: SensorModel, shape: tuple[int, int], hot: Map | None) -> Map | None:
-    """Gamma distributed, which is never below zero, and whose sums over the pixels that are binned are gamma too."""
+    """Draw dark currents from a gamma law, which is never negative and whose sums over binned pixels are gamma, too."""
     if not model.dark_current_spread_e_per_s and hot is None:
         return None
     mean, spread = model.dark_current_e_per_s, model.dark_current_spread_e_per_s
@@ -249,7 +216,7 @@ def _dark_current(model: SensorModel, shape: tuple[int, int], hot: Map | None) -
 
 
 def _defects(model: SensorModel, shape: tuple[int, int], kind: str) -> Map | None:
-    """How many pixels of each superpixel are ``hot`` or ``dead``; None where the model has none of this ``kind``."""
+    """Return how many pixels of each superpixel are hot or dead."""
     part = model.hot_pixels if kind == "hot" else model.dead_pixels
     if not part:
         return None
@@ -260,10 +227,7 @@ def _defects(model: SensorModel, shape: tuple[int, int], kind: str) -> Map | Non
 
 
 def neighbours(light: FloatArray, part: float) -> FloatArray:
-    """``light`` (rows, columns) of which each pixel's four neighbours have got a ``part``, a quarter each.
-
-    Beyond the edge lies what lies at the edge, so even light stays even.
-    """
+    """Move a part of each pixel's light to its neighbours; the edge is continued, so that even light stays even."""
     around = np.pad(light, 1, mode="edge")
     shared = around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:]
     return np.asarray((1 - part) * light + (part / 4) * shared)
@@ -273,15 +237,7 @@ def neighbours(light: FloatArray, part: float) -> FloatArray:
 
 
 def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> FloatArray:
-    """Expected photo- plus dark electrons, mu_e + mu_I t (EMVA 1288 4.0, "dark current"). Deterministic.
-
-    Parameters
-    ----------
-    expected_electrons
-        photoelectrons, any shape; ValueError where negative or NaN.
-    exposure_s, model
-        time and sensor.
-    """
+    """Add dark electrons to expected photoelectrons, mu_e + mu_I t (EMVA 1288 4.0, "dark current")."""
     expected = checked_light(expected_electrons, "expected_electrons")
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
 
@@ -289,17 +245,10 @@ def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model
 def mean_electrons(
     expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray | float]:
-    """Light after crosstalk and each pixel's response, and dark electrons: their sum is what is drawn. Deterministic.
+    """Return light after crosstalk and response, and dark electrons; their sum is the mean of the Poisson draw.
 
-    Of a camera without these: the light as it was, and one number of dark electrons. Charge that strays before it is
-    counted leaves the counts of pixels independent and Poisson, so crosstalk is of the mean.
-
-    Parameters
-    ----------
-    expected_electrons
-        photoelectrons, any shape, or (rows, columns) as :func:`expose` says; ValueError where negative or NaN.
-    exposure_s, model
-        time and sensor.
+    Crosstalk moves the mean only, because charge that strays before it is counted leaves counts independent and
+    Poisson.
     """
     light = checked_light(expected_electrons, "expected_electrons")
     dark: FloatArray | float = model.superpixel_dark_current_e_per_s * exposure_s
@@ -316,13 +265,7 @@ def mean_electrons(
 
 
 def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> float:
-    """Most electrons, dark ones too, that a pixel is expected to gather.
-
-    Parameters
-    ----------
-    expected_electrons, exposure_s, model
-        as :func:`mean_electrons` has them.
-    """
+    """Return the largest expected number of electrons of a pixel, including dark electrons."""
     if model.has_fixed_pattern or model.crosstalk:
         light, dark = mean_electrons(expected_electrons, exposure_s, model)
         return float((light + dark).max())
@@ -330,18 +273,9 @@ def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: Sens
 
 
 def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Generator | None) -> FloatArray | None:
-    """What is added to the charge of each pixel when it is read, flat [electrons]: fixed offset, and a row's noise.
+    """Return the fixed offset and a row's noise for each pixel, flat [electrons]; None if the camera has neither.
 
-    None where the camera has neither.
-
-    Parameters
-    ----------
-    shape
-        of the frame.
-    model
-        the sensor.
-    rng
-        whose child the row noise is drawn from; None: the offset alone.
+    The row noise is drawn from a child of `rng`; without `rng` it is left out.
     """
     fixed = specimen(model, _frame_shape(shape, model)).offset_e if any(model.offset_parts) else None
     offset = None if fixed is None else fixed.astype(np.float64)
@@ -354,18 +288,14 @@ def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Ge
 
 
 def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Poisson electrons, float64; mean and variance are both ``expected`` (any shape).
-
-    Exact below a mean of 64, and :func:`poisson_count` of normal deviates above. Above 2^53 = 9e15 not every whole
-    number is a float64. ``rng`` gives what is random.
-    """
+    """Draw Poisson electrons (float64): exact below a mean of 64, and `poisson_count` of normal deviates above."""
     flat = np.reshape(expected, -1)
     drawn = by_pixel(lambda _, *values: _electron_counts(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
     return np.asarray(drawn.reshape(np.shape(expected)))
 
 
 def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) -> FloatArray | None:
-    """Electrons of pixels that expect fewer than :data:`_MANY`, not a number elsewhere; None where no pixel does."""
+    """Draw the electrons of pixels that expect fewer than `_MANY`; NaN elsewhere, None without such pixels."""
     if not light.size or light.min() + np.min(dark) >= _MANY:
         return None
     expected = light + dark
@@ -377,18 +307,16 @@ def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) 
 
 
 def _electron_counts(expected: Any, few: Any, z: Any) -> Any:
-    """Electrons of pixels, drawn before where they are ``few``, and elsewhere as probable as ``z``."""
     many = poisson_count(expected, z)
     return many if few is None else operations(many).select(few == few, few, many)
 
 
 def poisson_count(expected: Any, z: Any) -> Any:
-    """Whole number of mean ``expected``, 64 or more, as probable as the normal deviate ``z``; both of one shape.
+    """Return the Poisson count of mean ``expected`` (64 or more) at the quantile of the normal deviate ``z``.
 
-    The expansion of the inverse Poisson distribution by Giles (2016, ACM Transactions on Mathematical Software 42,
-    algorithm 955, Q_N2): what :func:`poisson_quantile` has, and terms of 1/sqrt(mu) and 1/mu, which hold third and
-    fourth cumulants and the correction for rounding. Off the law by a total variation of 3e-6 at 64, 2e-7 at 256, 1e-8
-    at 1000; its variance by 7e-6 of it at 64, its third moment by 2e-6.
+    This is the expansion of the inverse Poisson distribution by Giles (2016, ACM Transactions on Mathematical Software
+    42, algorithm 955, Q_N2). Its total variation from the law is 3e-6 at 64, 2e-7 at 256 and 1e-8 at 1000; at 64 its
+    variance is off by 7e-6 and its third moment by 2e-6.
     """
     of, square = operations(expected), z * z
     root, part = of.sqrt(expected), 1 / expected
@@ -398,20 +326,17 @@ def poisson_count(expected: Any, z: Any) -> Any:
 
 
 def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
-    """Count of mean ``expected`` as probable as the normal deviate ``z``; Cornish and Fisher (1938)."""
+    """Return the real count of mean ``expected`` at the quantile of the deviate ``z`` (Cornish, Fisher, 1938)."""
     return np.asarray(expected + np.sqrt(expected) * z + (np.square(z) - 1) / 6)
 
 
 def clip_at_full_well(electrons: Any, model: Any) -> Any:
-    """``electrons`` less those above the full well of ``model``: min(N, F). Moments: `moments.clipped_moments`."""
+    """Clip electrons at the full well, min(N, F)."""
     return operations(electrons).minimum(electrons, model.superpixel_full_well_e)
 
 
 def bend(electrons: Any, model: Any) -> Any:
-    """What ``electrons`` (any shape) are read as by a ``model`` that is not linear: N (1 + sum c_k (N/F)^k).
-
-    Its moments: `moments.bent_moments`.
-    """
+    """Return the electrons that a nonlinear sensor reads, N (1 + sum c_k (N/F)^k)."""
     if not model.linearity:
         return electrons
     part = electrons / model.superpixel_full_well_e
@@ -422,30 +347,19 @@ def bend(electrons: Any, model: Any) -> Any:
 
 
 def add_read_noise(electrons: Any, model: Any, z: Any) -> Any:
-    """Electrons with normal noise added; mean unchanged, variance plus sigma_d^2.
-
-    Parameters
-    ----------
-    electrons
-        any shape.
-    model
-        whose read noise.
-    z
-        normal deviates of that shape.
-    """
+    """Add normal noise to electrons; ``z`` holds normal deviates."""
     return electrons + model.superpixel_read_noise_e * z
 
 
 def amplify(electrons: Any, model: Any) -> Any:
-    """``electrons`` times the gain K of ``model`` plus its black level, real-valued; variance times K^2."""
+    """Multiply electrons by the gain K and add the black level [DN]."""
     return electrons * model.gain_dn_per_e + model.superpixel_black_level_dn
 
 
 def quantise(signal_dn: Any, model: Any) -> Any:
-    """The ADC of ``model``: nearest code to ``signal_dn``, from 0 to the largest; without bits, the signal itself.
+    """Round to the nearest code of the ADC, from 0 to the largest; a model without bits returns the signal.
 
-    Mean unchanged and variance plus 1/12 DN^2 (EMVA 1288 4.0, "noise model"), away from both ends and for
-    noise above about half a code; elsewhere see `moments.frame_moments`.
+    Away from both ends, and with noise above half a code, rounding adds 1/12 DN^2 (EMVA 1288 4.0, "noise model").
     """
     if model.largest_dn is None:
         return signal_dn
@@ -458,7 +372,6 @@ def _electrons_per_joule_m2(model: SensorModel, wavelength_nm: float) -> float:
 
 
 def _frame_shape(shape: tuple[int, ...], model: SensorModel) -> tuple[int, int]:
-    """``shape`` of a frame; ValueError where it is none."""
     if len(shape) != 2:
         raise ValueError(
             f"expected_electrons: the shape is {shape}; sensor {model.name!r} has pixels that differ, or that share "
@@ -468,7 +381,7 @@ def _frame_shape(shape: tuple[int, ...], model: SensorModel) -> tuple[int, int]:
 
 
 def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
-    """``values`` as float64; ValueError where one is negative or not finite, with their ``name``."""
+    """Return values as float64; ValueError if one is negative or not finite."""
     array = np.asarray(values, dtype=np.float64)
     # Of no number, least and largest are none either.
     if array.size and not (array.min() >= 0 and array.max() < np.inf):
@@ -485,18 +398,17 @@ def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
 # so a lane of the kernel has four pixels, a quarter of a block apart. Deviates are float32, all else is float64.
 
 LANE = 4
-"""Pixels of a lane: the deviates that a counter gives."""
+"""Pixels of a lane: a counter gives four deviates."""
 _BLOCK = 2**22
-"""Pixels that go through the stages at a time: 32 MiB of each array, where a sensor may have 2^28."""
+"""Pixels that pass the stages together: 32 MiB of each array."""
 _turn = threading.Lock()
-"""Held while stages are described and run: threads that take turns at each operation take twice as long."""
+"""Lock held while stages run, because threads that take turns at each operation need twice as long."""
 
 Numbers = Mapping[str, float | tuple[float, ...] | None]
-"""What all pixels share, by name."""
 
 
 def operations(values: Any) -> ModuleType:
-    """Where minimum, sqrt, square, round and clip of ``values`` are: in numpy, or, for arrays of its own, in Dr.Jit."""
+    """Return the module with minimum, sqrt, round and clip for ``values``: numpy, or Dr.Jit for its own arrays."""
     return np if isinstance(values, np.ndarray | float) else compiled_arrays()[0]
 
 
@@ -507,21 +419,16 @@ def by_pixel(
     streams: Sequence[np.random.Generator],
     dtype: npt.DTypeLike = np.float64,
 ) -> npt.NDArray[Any]:
-    """(pixels,) what ``stages`` make of every pixel.
+    """Apply ``stages`` to every pixel and return (pixels,) results.
 
     Parameters
     ----------
-    stages
-        of a namespace of the numbers, a value of each of the arrays, and a normal deviate of each of the streams. It is
-        called with Dr.Jit's arrays and describes what to do; it need not be the same function twice.
-    numbers
-        what all pixels share; other values need no new kernel.
-    arrays
-        (pixels,) each, the first at least; or floats that all pixels share; None stays None.
-    streams
-        each gives the key of its deviates, in one draw.
-    dtype
-        of the result, np.uint32 or np.float64.
+    stages : function of a namespace of the numbers, a value of each array, and a normal deviate of each stream. It is
+        called with Dr.Jit arrays, and describes the computation.
+    numbers : values that all pixels share; other values need no new kernel.
+    arrays : (pixels,) each, at least the first; or floats that all pixels share; None stays None.
+    streams : each gives the key of its deviates in one draw.
+    dtype : of the result, np.uint32 or np.float64.
     """
     keys = [int(stream.bit_generator.random_raw()) for stream in streams]
     size = len(arrays[0])  # type: ignore[arg-type]
@@ -542,7 +449,7 @@ def _run(
     first: int,
     result: npt.NDArray[Any],
 ) -> None:
-    """Fill the ``result`` of one block, whose first lane is ``first``."""
+    """Fill the result of one block, whose first lane is ``first``."""
     dr, types = compiled_arrays()
     quarter = -(-len(result) // LANE)
 
@@ -590,20 +497,9 @@ def _run(
 
 
 def ripple_response(model: SensorModel, exposure_s: float, hertz: float, rows: int) -> npt.NDArray[np.complex128]:
-    """(rows,) A_r: amplitude and phase of a ripple of amplitude 1 in each row of a frame.
+    """Return (rows,) amplitude and phase A_r of a ripple of the light with amplitude 1 and frequency ``hertz``.
 
-    MitsimError for a rolling shutter whose line time is not known.
-
-    Parameters
-    ----------
-    model
-        the sensor.
-    exposure_s
-        T, for which each row is exposed [s].
-    hertz
-        f, frequency of the ripple [Hz].
-    rows
-        of the frame, of superpixels.
+    MitsimError for a rolling shutter with unknown line time.
     """
     summed = 1 if model.binning_on_chip else model.binning
     begins = model.known_line_time_s() * np.arange(rows * summed)
@@ -612,14 +508,9 @@ def ripple_response(model: SensorModel, exposure_s: float, hertz: float, rows: i
 
 
 def ripple_level(response: npt.NDArray[np.complex128], amplitude: float, phase: float) -> FloatArray:
-    """(rows, 1) level of the light in each row of one frame, 1 on average over all phases.
+    """Return (rows, 1) the level of the light in each row of one frame; its mean over all phases is 1.
 
-    Parameters
-    ----------
-    response
-        (rows,) of the shutter to the ripple.
-    amplitude, phase
-        c and phi [radians]; an amplitude of at most 1, so that no level is below 0.
+    ``amplitude`` is at most 1 and ``phase`` in radians.
     """
     return np.asarray(1 + amplitude * (response * np.exp(1j * phase)).real[:, None])
 
@@ -633,8 +524,7 @@ LIGHT_SPEED = 299_792_458.0
 
 
 def photon_energy(wavelength_nm: float) -> float:
-    """Energy of one photon [J], E = h c / lambda, at a vacuum wavelength ``wavelength_nm`` [nm]; ValueError unless that
-    is above 0."""
+    """Return the energy of one photon [J], E = h c / lambda, at a vacuum wavelength [nm] above 0."""
     if not wavelength_nm > 0:
         raise ValueError(f"photon_energy: wavelength_nm is {wavelength_nm}; it must be above 0")
     return PLANCK * LIGHT_SPEED / (wavelength_nm * 1e-9)
