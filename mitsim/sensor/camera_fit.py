@@ -404,19 +404,14 @@ class FoundCamera:
     sensor : model whose pixels are the frames' elements.
     errors : standard error of each measured field.
     transfer : fit of means and variances.
-    taken : sets of frames, with other pixels in place of defects.
-    uneven, surface : difference of the light over the frame, and its relative variances by row, column and pixel.
-    filled : fraction of hot pixels that are full in the longest dark frames.
+    pixels : differences between pixels, and the sets with other pixels in place of defects.
     notes : facts that the frames do not show.
     """
 
     sensor: SensorModel
     errors: dict[str, float]
     transfer: Transfer = field(repr=False)
-    taken: Sequence[Alike] = field(repr=False)
-    uneven: float
-    surface: FloatArray = field(repr=False)
-    filled: float
+    pixels: Pixels = field(repr=False)
     notes: tuple[str, ...]
 
     def toml(self) -> str:
@@ -449,11 +444,16 @@ def find_camera(
     MitsimError
         If the light is far from even, or a camera file cannot state the result.
     """
-    return _Pixels(taken, images, again).camera(stated)
+    return Pixels(taken, images, again).camera(stated)
 
 
-class _Pixels:
-    """Mean images with defect pixels replaced, and the fields of the camera that follow."""
+class Pixels:
+    """Mean images with defect pixels replaced, and the fields of the camera that follow.
+
+    `taken` are the sets without defects, `uneven` is the difference of the light over the frame and `surface` its
+    relative variances by row, column and pixel. `filled` is the fraction of pixels that are full in the longest dark
+    frames.
+    """
 
     def __init__(self, taken: Sequence[Alike], images: Images, again: Callable[[Places], Sequence[Alike]]) -> None:
         dark, self.bright = nonuniform(taken)
@@ -551,9 +551,7 @@ class _Pixels:
             errors["linearity"] = transfer.error("bend")
         fields |= {name: getattr(stated, name) for name in ("name", "pixel_pitch_um", "source", "bits")}
         sensor = validate(SensorModel, fields, "camera found")
-        return FoundCamera(
-            sensor, errors, transfer, self.taken, self.uneven, self.surface, self.filled, tuple(self.notes)
-        )
+        return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
     def _read(self) -> dict[str, Known]:
         """Return the noise of reading, the part that rows share, and the black level."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -43,6 +44,7 @@ _BIASED, _MISLEADS = 0.5, 1.0
 from the second it is flagged. Below, 98 of 100 figures are within three standard errors of the value set."""
 _DUST = 1e-10
 """Least standard error of a figure, above rounding errors of the arithmetic."""
+_OF_FIELDS = "name", "unit", "set", "found", "standard_error", "deviations"
 _WHOLE = 1e4
 """Number from which a headline shows whole numbers."""
 
@@ -97,7 +99,7 @@ def _nonuniformity(frames: Frames, kind: str, part: str) -> float:
 def _split(kind: str, unit: str) -> dict[str, EmvaFigure]:
     return {
         f"{kind}_{part}": EmvaFigure(
-            f"{kind.upper()}1288.{part}", unit, lambda frames, part=part: _nonuniformity(frames, kind, part), root=True
+            f"{kind.upper()}1288.{part}", unit, partial(_nonuniformity, kind=kind, part=part), root=True
         )
         for part in SPLIT
     }
@@ -149,33 +151,21 @@ FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
 
 @dataclass(frozen=True)
 class Row:
-    """A figure: its set value, and the expected value if the procedure finds another one.
+    """A figure, or a field of the camera that explains the frames; None if nothing is set.
 
-    `deviations` is found less expected (or set), and `bias` expected less set if the ADC's ends and steps cause it, in
-    standard errors.
+    `expected` is given if the procedure finds another figure than the set one. `deviations` is found less expected (or
+    set), and `bias` expected less set if the ADC's ends and steps cause it, in standard errors.
     """
 
     name: str
     symbol: str
     unit: str
-    set: float
+    set: float | None
     expected: float | None
     found: float
     standard_error: float
-    deviations: float
-    bias: float = 0.0
-
-
-@dataclass(frozen=True)
-class FieldRow:
-    """A field of the camera that explains the frames, and the value that the file sets, if there is one."""
-
-    name: str
-    unit: str
-    set: float | None
-    found: float
-    standard_error: float
     deviations: float | None
+    bias: float = 0.0
 
 
 def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
@@ -212,7 +202,7 @@ def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, b
     return Row(name, figure.symbol, figure.unit, scale * given, expected, scale * value, scale * spread, off, bias)
 
 
-def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, ...]:
+def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
     """Compare the camera that was found with the model that took the frames, if it is known."""
     rows = []
     for name, (unit, given) in FIELDS.items():
@@ -223,7 +213,7 @@ def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[FieldRow, 
         if value is not None and math.isfinite(value):
             set_value = None if model is None else given(model)
             off = None if set_value is None or not error else (value - set_value) / error
-            rows.append(FieldRow(name, unit, set_value, value, error, off))
+            rows.append(Row(name, "", unit, set_value, None, value, error, off))
     return tuple(rows)
 
 
@@ -253,7 +243,7 @@ class Characterisation:
     expected: Session = field(repr=False)
     rows: tuple[Row, ...]
     found: FoundCamera
-    fields: tuple[FieldRow, ...]
+    fields: tuple[Row, ...]
     asked: Mapping[str, Any]
     real: bool = False
     about: tuple[str, ...] = ()
@@ -276,7 +266,7 @@ class Characterisation:
             if row.deviations is None or abs(row.deviations) <= MOST_OFF:
                 continue
             off = f"{row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off"
-            if isinstance(row, Row):
+            if row.symbol:
                 against = row.set if row.expected is None else row.expected
                 lines.append(f"{row.name}: found {off} {against:.5g}; the procedure does not fit this camera")
             else:
@@ -291,9 +281,9 @@ class Characterisation:
             **self.asked,
             "exposure_s": float(self.frames.exposure_s[self.frames.dark]),
             "figures": [asdict(row) for row in self.rows],
-            "camera_found": [asdict(row) for row in self.fields],
+            "camera_found": [{name: getattr(row, name) for name in _OF_FIELDS} for row in self.fields],
             "light": {
-                "uneven": self.found.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
+                "uneven": self.found.pixels.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
                 "seen": transfer.light, "chi_square": transfer.chi_square, "freedom": transfer.freedom,
             },
             "notes": list(self.found.notes),
@@ -321,7 +311,7 @@ class Characterisation:
     def parts(self) -> tuple[Part, Part]:
         """Tables and plots of the page: the figures of EMVA 1288, and the camera that was found."""
 
-        def table(rows: Sequence[Row | FieldRow], columns: Mapping[str, str]) -> tuple[Any, Any]:
+        def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
             return tuple(columns), tuple(tuple(_cell(row, name) for name in columns.values()) for row in rows)
 
         found = {"found": "found", "std. error": "standard_error"}
@@ -354,7 +344,7 @@ class Characterisation:
         return lines[:-1]
 
 
-def _cell(row: Row | FieldRow, name: str) -> str:
+def _cell(row: Row, name: str) -> str:
     """Return a cell: found numbers to the digits that are known, deviations to a tenth, others to five digits."""
     value = getattr(row, name)
     if name in ("found", "standard_error"):
@@ -424,7 +414,7 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
     for name, axes in charts.items():
         axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left" if name == "photon_transfer.png" else "best")
     drawn = {name: axes.figure for name, axes in charts.items()}
-    return {"deviations.png": _deviations(done), **drawn}  # type: ignore[dict-item]
+    return {"deviations.png": _deviations(done), **drawn}
 
 
 def _deviations(done: Characterisation) -> Figure:
@@ -437,7 +427,7 @@ def _deviations(done: Characterisation) -> Figure:
     axes.plot(off, place, "o", color=BLUE, ms=7)
     names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
     axes.set_yticks(place, names, fontsize=FONT - 1)
-    far = sum(not abs(row.deviations) <= MOST_OFF for row in done.rows)
+    far = sum(not abs(row.deviations or 0.0) <= MOST_OFF for row in done.rows)
     verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
     axes.set_title(f"{verdict}\nmore than {MOST_OFF:g} standard errors off", fontsize=FONT)
     most = 1.2 * max(MOST_OFF, float(np.abs(off).max()))
@@ -521,9 +511,7 @@ def _compare(
 ) -> Characterisation:
     """Compute the figures of sets that were taken, and compare them with those of the camera of `frames`."""
     expected, sensor = frames.expect(), frames.sensor
-    session = frames.session(
-        (each.pair for each in taken), (taken[index].stack for index in (frames.dark, frames.bright))
-    )
+    session = frames.session((each.pair for each in taken), taken[frames.dark].stack, taken[frames.bright].stack)
     spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)
     bend = found.transfer.error("bend") if real else 0.0  # the error of a real camera's expected linearity
     rows = tuple(

@@ -99,7 +99,8 @@ class Frames:
         )
         return cls(
             found.sensor, taken[0].shape, light, transfer["response"] * light, time, counts, *nonuniform(taken),
-            saturation_of(taken)[1] is not None, lamp=(transfer.lamp, transfer.light_error), surface=found.surface,
+            saturation_of(taken)[1] is not None, lamp=(transfer.lamp, transfer.light_error),
+            surface=found.pixels.surface,
         )  # fmt: skip
 
     @property
@@ -127,10 +128,10 @@ class Frames:
         with job.clock.stage("frames"):
             return in_threads(taken, range(len(self.light)))
 
-    def session(self, pairs: Iterable[Pair], stacks: Iterable[Stack]) -> Session:
+    def session(self, pairs: Iterable[Pair], dark: Stack, bright: Stack) -> Session:
         """Return the statistics of all sets, and of the dark and bright stack, for figures."""
         return Session(
-            self.shape, self.light, self.exposure_s, pairs_of([*pairs]), self.dark, self.bright, *stacks,
+            self.shape, self.light, self.exposure_s, pairs_of([*pairs]), self.dark, self.bright, dark, bright,
             self.saturates, self.sensor.bits is not None,
         )  # fmt: skip
 
@@ -144,9 +145,9 @@ class Frames:
             slopes = self.offset_slope(index), self.slope(self.electrons[index])
             rows, columns, pixel = slopes[0] ** 2 * still + slopes[1] ** 2 * (parts - still)
             stacks.append(
-                Stack(np.float64(pairs[index].mean), rows + columns + pixel, rows + pixel / n, columns + pixel / m)
+                Stack(np.asarray(pairs[index].mean), rows + columns + pixel, rows + pixel / n, columns + pixel / m)
             )
-        return self.session(pairs, stacks)
+        return self.session(pairs, *stacks)
 
     def expected_pair(self, index: int, part: float = 1.0) -> Pair:
         """Return the expected statistics of a set whose light is a `part` of the nominal light."""

@@ -133,44 +133,40 @@ def _faults(sets: Sequence[FlatSet]) -> Iterator[str]:
         if said.light and signal <= _SURE * math.hypot(said.mean_error, still.mean_error):
             yield f"{each.name} is no brighter than the dark frames of its exposure; light it, or list it as dark"
         if said.light and said.flicker > _UNEQUAL * signal:
-            yield (
-                f"{each.name} differ by {100 * said.flicker / signal:.0f} % of their light; take the frames of a set "
-                "with one exposure, under a steady lamp"
-            )
+            what = f"{each.name} differ by {100 * said.flicker / signal:.0f} % of their light"
+            yield f"{what}; take the frames of a set with one exposure, under a steady lamp"
         if not said.light and said.flicker > _UNEQUAL * max(brightest - said.mean, 0.0):
-            yield (
-                f"{each.name} are listed as dark and differ by {said.flicker:.3g} DN; cover the camera, and take them "
-                "again"
-            )
-    if part := min(each.cut[1] for each in taken if each.light):
-        yield (
-            f"all sets under light hold saturated numbers, {100 * part:.3g} % of them at least; expose some for less"
-        )
-    amplitude, period, _ = _comb(taken)
-    if amplitude > _SCALED:
-        yield (
-            f"all numbers are {period:.3g} apart, so they were scaled after the ADC, or a bit of it is stuck; divide "
-            f"by {period:.3g}, and state the bits that are left of {sets[0].flats.listed.bits}"
-        )
-    mixed = float(np.median([_correlation(each) for each in taken]))
-    if mixed > _MIXED:
-        yield (
-            f"noise of neighbouring pixels is correlated by {mixed:.2g}, so frames were compressed, smoothed, scaled "
-            "or demosaiced, and tell no gain or noise of the camera; give raw frames"
-        )
-    means = [each.mean for each in taken]
+            what = f"{each.name} are listed as dark and differ by {said.flicker:.3g} DN"
+            yield f"{what}; cover the camera, and take them again"
+    if full := 100 * min(each.cut[1] for each in taken if each.light):
+        yield f"all sets under light hold saturated numbers, {full:.3g} % of them at least; expose some for less"
+    yield from (text for _, refused, text in _altered(sets, taken, taken) if refused)
+
+
+def _altered(sets: Sequence[FlatSet], taken: Sequence[Alike], used: Sequence[Alike]) -> list[tuple[bool, bool, str]]:
+    """Return signs that numbers were altered or sets exchanged: seen, so strong that frames are refused, and the text.
+
+    `taken` are statistics of all sets, and `used` those of sets whose noise is examined.
+    """
+    amplitude, period, combed = _comb(taken)
+    noises, means = [_correlation(each) for each in used], [each.mean for each in taken]
+    smooth, smoothed = max(noises), sets[[*taken].index(used[int(np.argmax(noises))])].name
     part = (means[saturation_of(taken)[0]] - min(means)) / (max(means) - min(means))
-    if part < _PEAK:
-        yield (
-            f"the variance is largest at {100 * part:.0f} % of the brightest signal, not near it, as after a gamma "
-            "curve, compression or too coarse codes; give raw frames of more bits, or of a higher gain"
-        )
-    for name, response, _ in _responses(sets, taken):
-        if not 1 / _SWAPPED < response < _SWAPPED:
-            yield (
-                f"{name} are {response:.3g} times as bright as most sets are at their exposures; correct exposure_s, "
-                "light or files of the list"
-            )
+    return [
+        (amplitude > _COMB, amplitude > _SCALED, f"codes are missing or too frequent with a period of {period:.3g} DN, "
+         f"by an amplitude of {amplitude:.2g} in {sets[combed].name}: numbers were scaled after the ADC, or a bit of "
+         "it is stuck; gain, noise, black level and dsnu_* are of those numbers; give raw frames, or divide by the "
+         "period and state fewer bits"),
+        (smooth > 0, float(np.median(noises)) > _MIXED, f"noise of neighbouring pixels is correlated by {smooth:.2g} "
+         f"in {smoothed}, so frames were compressed, smoothed, scaled or demosaiced, and gain and noise are of those "
+         "pictures; give raw frames"),
+        (part < _PEAK, part < _PEAK, f"the variance is largest at {100 * part:.0f} % of the brightest signal, not near "
+         "it, as after a gamma curve, compression or too coarse codes; give raw frames of more bits, or of a higher "
+         "gain"),
+        *((True, not 1 / _SWAPPED < ratio < _SWAPPED, f"{name} are {ratio:.3g} times as bright as the other sets are "
+           f"at their exposures{as_of}; correct exposure_s, light or files of the list, or leave the set out")
+          for name, ratio, as_of in _responses(sets, taken)),
+    ]  # fmt: skip
 
 
 def _responses(sets: Sequence[FlatSet], taken: Sequence[Alike]) -> list[tuple[str, float, str]]:
@@ -225,11 +221,9 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     transfer, size = found.transfer, math.prod(sets[0].taken.shape)
     used = [
         (each.name, abs(off), taken)
-        for each, off, taken in zip(sets, transfer.off, found.taken, strict=True) if np.isfinite(off[0])
+        for each, off, taken in zip(sets, transfer.off, found.pixels.taken, strict=True) if np.isfinite(off[0])
     ]  # fmt: skip
     darks = [each for each in used if not each[2].light]
-    smooth, smoothed = max((_correlation(said), name) for name, _, said in used)
-    amplitude, period, combed = _comb(found.taken)
     bent, curved = max(
         (off[1] * said.variance_error / max(said.variance, LEAST_DARK), name)
         for name, off, said in used if off[1] > _SURE or name is used[0][0]
@@ -237,49 +231,36 @@ def remarks(sets: Sequence[FlatSet], found: FoundCamera) -> tuple[str, ...]:
     moved, moving = max((off[0] * said.mean_error * (off[0] > _SURE), name) for name, off, said in darks)
     noise = math.sqrt(transfer["read"] ** 2 + max(transfer["spatial"], 0.0) + 1 / 12)
     cut, zero = max(said.cut[0] for *_, said in darks), scipy.special.ndtr((0.5 - transfer["black"]) / noise)
-    dead, filled, uneven, lamp = found.sensor.dead_pixels, found.filled, found.uneven, 100 * transfer.lamp
+    dead, filled, uneven, lamp = found.sensor.dead_pixels, found.pixels.filled, found.pixels.uneven, 100 * transfer.lamp
     widened = f"standard errors are widened by {math.sqrt(max(transfer.chi_square / max(transfer.freedom, 1), 1)):.2g}"
+    known = (
+        "gain and noise hold; quantum_efficiency, saturation_capacity and linearity are known to that, as their "
+        "standard errors say; take the frames again under a steady lamp"
+    )
     light = {
         "undecided": "means bend with exposure, and variances do not tell whether the camera bends or the lamp drifts: "
-        "linearity, gain, full_well and quantum_efficiency of the camera found have the difference in their standard "
-        "errors; take more frames in each set, or measure the lamp at each and list it as light",
+        "the standard errors of linearity, gain, full_well and quantum_efficiency include the difference; take more "
+        "frames in each set, or list the lamp's measured light",
         "drifts": "means bend with exposure and variances over means do not, so the lamp drifts or exposures are not "
-        f"as listed, by {lamp:.2g} %; ",
-    }.get(transfer.light, f"light scatters by {lamp:.2g} % about what exposures say; ")
-    if transfer.light != "undecided":
-        light += (
-            "gain and noise hold; quantum_efficiency, saturation_capacity and linearity are known to that, as their "
-            "standard errors say; take the frames again under a steady lamp"
-        )
-    exchanged = [
-        f"{name} are {ratio:.3g} times as bright as the other sets are at their exposures{as_of}: sets were exchanged "
-        "or repeated, or gain or lamp was another one; correct exposure_s, light or files of the list, or leave the "
-        "set out"
-        for name, ratio, as_of in _responses(sets, found.taken)
-    ]
+        f"as listed, by {lamp:.2g} %; {known}",
+    }.get(transfer.light, f"light scatters by {lamp:.2g} % about what exposures say; {known}")
     table = [
-        (smooth > 0, f"noise of neighbouring pixels is correlated by {smooth:.2g} in {smoothed}: frames were "
-         "compressed, smoothed, scaled or demosaiced, and gain and noise are of those pictures; give raw frames"),
-        (amplitude > _COMB, f"codes are missing or too frequent with a period of {period:.2g} DN, by an amplitude of "
-         f"{amplitude:.2g} in {sets[combed].name}: numbers were scaled after the ADC, or a bit of it is stuck; gain, "
-         "noise, black level and dsnu_* are of those numbers; give raw frames"),
-        *((True, text) for text in exchanged),
+        *((seen, text) for seen, _, text in _altered(sets, found.pixels.taken, [said for *_, said in used])),
         (bent > _STRAIGHT, f"variances do not rise with means as those of counted electrons: {curved} is off by "
          f"{100 * bent:.0f} %; a gamma curve, compression or automatic gain does that; {widened}"),
-        (moved > _STILL, f"dark means do not rise with exposure: {moving} is off by {moved:.2g} DN; the black level or "
-         "the temperature drifts, or frames are listed at another exposure; black_level_dn and dark_current_e_per_s "
-         f"are not to be trusted, {widened}"),
-        (cut - 1.1 * zero > _DARK_CUT, f"{100 * cut:.2g} % of dark readings are 0 DN, and {100 * zero:.2g} % would be "
-         "if pixels differed by a normal law: some have a black level below 0, which moves black_level_dn, "
-         "read_noise_e and dsnu_*; raise the black level of the camera"),
+        (moved > _STILL, f"dark means do not rise with exposure: {moving} is off by {moved:.2g} DN; black level or "
+         "temperature drifts, or exposures are listed wrongly; do not trust black_level_dn and dark_current_e_per_s; "
+         f"{widened}"),
+        (cut - 1.1 * zero > _DARK_CUT, f"{100 * cut:.2g} % of dark readings are 0 DN, and a normal law of pixels "
+         f"explains {100 * zero:.2g} %: some black levels are below 0, which moves black_level_dn, read_noise_e and "
+         "dsnu_*; raise the black level of the camera"),
         (filled > 0, f"{round(filled * size)} hot pixels ({100 * filled:.2g} %) are full in the longest dark frames: "
-         "the figures of EMVA 1288 have them; in the camera found they count as hot_pixels, with at least "
-         "hot_dark_current_e_per_s, or as dead_pixels if full at every exposure, and are in no other number"),
+         "the figures of EMVA 1288 include them; the camera found counts them as hot_pixels, or as dead_pixels if full "
+         "at every exposure, and its hot_dark_current_e_per_s is a lower limit"),
         (dead > _DEAD, f"{100 * dead:.2g} % of the pixels show less than half of the light of most: dead columns, "
          "dust, or light that does not fill the frame; the camera found counts them as dead_pixels"),
         (transfer.light in ("undecided", "drifts") or transfer.lamp > _STEADY, light),
         (uneven > _EVEN, f"light differs by {100 * uneven:.0f} % over the frame, and EMVA 1288 allows "
-         f"{100 * _EVEN:.0f} %: the figures prnu_* hold it; in the camera found a surface of second degree is taken "
-         "off"),
+         f"{100 * _EVEN:.0f} %: the figures prnu_* include it; the camera found is without a surface of second degree"),
     ]  # fmt: skip
     return tuple(text for said, text in table if said)
