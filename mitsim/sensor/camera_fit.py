@@ -1,8 +1,7 @@
 """The sensor model that explains lit and dark frames of a camera, each number with its standard error.
 
-EMVA 1288 reads gain and noise off straight lines, which readings cut at 0 and rounding to few codes bend. Therefore the
-closed-form moments of the whole chain (`mitsim.sensor.moments`) are fitted to the means and variances of all sets at
-once (`fit`). Mean images give the differences between pixels: offsets, responses, dark currents and defects.
+The closed-form moments of the whole chain (`mitsim.sensor.moments`) are fitted to the means and variances of all sets
+at once, because readings cut at 0 and rounding to few codes bend the straight lines of EMVA 1288.
 """
 
 from __future__ import annotations
@@ -25,56 +24,47 @@ from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2", "spatial")
-"""Fitted numbers: gain [DN/e-], noise of reading [DN], black level [DN], dark electrons per second, photoelectrons per
-unit of light, two coefficients of linearity, and the variance of the pixels' offsets [DN^2]."""
+"""Units: DN/e-, DN, DN, e-/s, photoelectrons per unit of light, 1, 1, and DN^2 (variance of the pixels' offsets)."""
 _DARK = NAMES.index("dark")
 _STEPS = np.array([1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-2])
-"""Relative steps of the numerical derivatives, which change moments by some of their errors."""
+"""Relative and least steps of the numerical derivatives."""
 _LEAST_STEPS = np.array([1e-15, 1e-3, 1e-2, 1e-4, 1e-15, 1e-3, 1e-3, 1e-5])
 _STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
 """Fractions of the straight lines' gain to start from: rounding of little noise raises variances up to twice."""
 _TRIED, _SOLVED = 10, 25
-"""Evaluations of a trial and of a solution: a camera of 8 bits that no numbers fit takes 10 s."""
+"""Evaluations of a trial and of a solution."""
 _DITHERED = 0.44
-"""Variance [DN^2] below which rounding moves means: noise of 0.6 DN leaves 2e-3 of an offset's error."""
+"""Variance [DN^2] below which rounding moves means."""
 _HALF = 0.5
-"""Codes to which an offset is known however small the noise is."""
 _NODES = 9
-"""Gauss-Hermite nodes, exact to the seventeenth power of the spread."""
 _AT_END = 1e-4
 """Fraction of numbers at the ADC's end from which a set is not below saturation."""
 _STEADY = 1e-5
-"""Least relative scatter of a lamp: below what means of a million pixels show."""
+"""Least relative scatter of a lamp."""
 _CHANCE = 1e-3
-"""Significance at which light is off by more than its known error."""
 _FITS = 2.0
 """Reduced chi-square from which other starts of the fit are tried."""
 _TELLS = 9.0
 """Difference of chi-square that decides between a bent camera and a drifting lamp: three standard errors."""
 _SATURATED, _FALLEN = 0.05, 0.5
-"""Fraction of the largest variance of light below which the brightest set is saturated; and the fraction that counts
-if the mean rises by less than the first fraction of the light's rise."""
+"""Fractions of the largest variance of light below which the brightest set is saturated, without and with a second set
+that is as bright.
+"""
 _DEAD = 0.5
-"""Response, relative to the median, below which a pixel is dead."""
 _HOT = 8.0
-"""Robust deviations above the median dark current from which a pixel is hot: few of a long tail reach it by chance."""
+"""Robust deviations above the median dark current."""
 _SURE = 4.0
-"""Standard errors from which an effect enters the camera: one in 3e4 by chance."""
+"""Standard errors from which an effect enters the camera."""
 _UNEVEN, _MOST_UNEVEN = 0.01, 0.25
-"""Differences of the light over the frame: a surface is divided out above the first, frames are refused above the
-second, because pixels at 0.8 of saturation would lose counts."""
+"""Differences of the light over the frame from which a surface is divided out, and from which frames are refused."""
 _ROBUST = 1.4826
-"""Standard deviation over median absolute deviation of a normal law."""
 _ROUNDED = 12**-0.5
-"""Standard deviation of the rounding error of a mean that no noise dithers [DN]."""
 _CUT = 1e-3
 """Fraction of dark readings at 0 from which lit frames determine the black level."""
 _FILLED = 0.9
-"""Fraction of the brightest mean from which a hot pixel is full."""
 _HIDES = 2.0
 """Ratio of the fitted to the observed error of offsets from which offsets count as hidden."""
 _MOST_RESPONSE = 0.1
-"""Largest relative spread of responses that a camera file states."""
 _BASE = SensorModel(
     name="fitted", pixel_pitch_um=1.0, full_well_e=math.inf, read_noise_e=0.0, gain_dn_per_e=1.0, source="frames"
 )
@@ -91,10 +81,7 @@ Known = tuple[float, float]
 
 
 def saturation_of(taken: Sequence[Alike]) -> tuple[int, int | None]:
-    """Return the set with the largest variance, and the saturated set (the brightest, if its variance is small).
-
-    If rounding leaves some variance, a set that is as bright under other light shows saturation, too.
-    """
+    """Return the set with the largest variance, and the saturated set: the brightest, if its variance is small."""
     light, mean, variance = np.array([(each.light, each.mean, each.variance) for each in taken]).T
     lit, still = np.flatnonzero(light > 0), variance[light == 0].min()
     peak, last = lit[variance[lit].argmax()], lit[mean[lit].argmax()]
@@ -109,10 +96,7 @@ def saturation_of(taken: Sequence[Alike]) -> tuple[int, int | None]:
 
 
 def nonuniform(taken: Sequence[Alike]) -> tuple[int, int]:
-    """Return the dark and the lit set that show nonuniformity, with nearly equal exposures.
-
-    The lit set has the most frames between three and seven tenths of saturation; of equals, the one nearest to half.
-    """
+    """Return the dark and the lit set that show nonuniformity: the lit set has most frames near half of saturation."""
     mean = np.array([each.mean for each in taken])
     dark = [index for index, each in enumerate(taken) if not each.light]
     lit = [index for index, each in enumerate(taken) if each.light and each.cut[1] < _AT_END]
@@ -132,14 +116,8 @@ def average_moments(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean and variance [DN] averaged over different pixels, and the variance of their means over pixels.
 
-    An offset acts as another black level. The average over a normal law is a Gauss-Hermite sum that shares its nodes
-    between offset and response, because offsets matter in the dark and responses at saturation.
-
-    Parameters
-    ----------
-    electrons : (...) expected photoelectrons.
-    exposure_s, model : exposure [s], and a sensor with equal pixels.
-    spread, response : standard deviations of the offsets [DN] and of the relative responses.
+    An offset acts as another black level. Offset and response share the nodes of a Gauss-Hermite sum, because offsets
+    matter in the dark and responses at saturation. `spread` and `response` are their standard deviations [DN] and [1].
     """
     light = np.asarray(electrons, dtype=np.float64)
     if not spread and not response:
@@ -163,15 +141,11 @@ class Transfer:
     Attributes
     ----------
     values, covariance : (8,) numbers by `NAMES` and (8, 8) covariance; 0 if not fitted.
-    saturation_dn : mean of saturated frames [DN]; None without such frames.
-    saturates : True if the full well saturates, and not the ADC.
+    saturation_dn, saturates : mean of saturated frames [DN], if any; True if the full well causes it, and not the ADC.
     lamp : relative scatter of the light of sets about their exposures.
-    light : "steady", "scatters" or "drifts". If means bend with exposure and variances do not show whether camera or
-        lamp is the cause, "undecided": the camera is bent, and the covariance includes the difference.
-    chi_square, freedom : of the fit.
-    off : (sets, 2) deviation of each set's mean and variance in standard errors; NaN for sets that were not used.
+    light : "undecided" if means bend with exposure and variances do not show whether camera or lamp is the cause.
+    off : (sets, 2) deviation of each set's mean and variance in standard errors; NaN for unused sets.
     scatter : relative deviation of the light from the fit.
-    variance_chi_square : chi-square of the variances of lit sets.
     worse : reduced chi-square of all sets, or of lit variances if larger, because readings of one code always fit.
     light_fits : True if the light is off by no more than its known error.
     """
@@ -195,7 +169,6 @@ class Transfer:
         return float(self.values[NAMES.index(name)])
 
     def error(self, name: str) -> float:
-        """Return the standard error of a fitted number."""
         index = NAMES.index(name)
         return math.sqrt(self.covariance[index, index])
 
@@ -205,7 +178,6 @@ class Transfer:
         return self.lamp if self.light in ("scatters", "drifts") else 0.0
 
     def under(self, light: Light) -> Transfer:
-        """Return the final fit under such light, with errors widened by the misfit."""
         done = replace(self, light=light, covariance=self.covariance * max(self.worse, 1.0))
         index = NAMES.index("response")
         done.covariance[index, index] += (done.light_error * done["response"]) ** 2
@@ -213,14 +185,7 @@ class Transfer:
 
 
 def fit(taken: Sequence[Alike], bits: int | None, still: int, spatial: Known) -> Transfer:
-    """Fit a camera to sets of frames.
-
-    Parameters
-    ----------
-    taken : sets of frames, at least one in the dark.
-    bits : bits of the ADC; None for real numbers.
-    still, spatial : a dark set, and the variance over pixels of its mean image [DN^2] with its standard error.
-    """
+    """Fit a camera to sets of frames; `spatial` is the variance over pixels [DN^2] of the dark set `still`."""
     problem = _Problem(taken, bits, still, spatial)
     steady = problem.begin()
     if steady.light_fits or problem.lit.sum() < 4:
@@ -238,8 +203,6 @@ def fit(taken: Sequence[Alike], bits: int | None, still: int, spatial: Known) ->
 
 
 class _Problem:
-    """Sets below saturation, and the level at which the other sets saturate."""
-
     def __init__(self, taken: Sequence[Alike], bits: int | None, still: int, spatial: Known) -> None:
         light, time, mean, variance, flicker = np.array(
             [(each.light, each.exposure_s, each.mean, each.variance, each.flicker) for each in taken]
@@ -300,10 +263,7 @@ class _Problem:
         return mean, noise, float(between[self.still]) * spatial / spread
 
     def begin(self) -> Transfer:
-        """Fit a linear camera from several starts if the first one fits badly.
-
-        With few codes variances rise and fall with the mean, so several cameras explain them if no dark noise is seen.
-        """
+        """Fit a linear camera, from several starts if several cameras may explain few codes."""
         found, hidden = [self.solve(self.start)], self.measured[1].min() < HIDDEN
         for part in _STARTS if self.measured[1].min() < LEAST_DARK else ():
             best = min(found, key=lambda each: each.chi_square)
@@ -328,8 +288,7 @@ class _Problem:
     def solve(self, start: FloatArray, bend: bool = False, lamp: float | None = None, most: int = _SOLVED) -> Transfer:
         """Fit means and variances by least squares if the light of sets scatters by a fraction `lamp`.
 
-        The light of a set moves its mean and variance together. Its best deviation follows from the residuals of both,
-        so that it is no parameter.
+        The light of a set moves its mean and variance together. Its best deviation follows from the residuals of both.
         """
         lit, lamp = self.lit, self.lamp if lamp is None else lamp
         # If all dark readings are one code and rarely the next, their mean shows no current.
@@ -397,16 +356,7 @@ class Stated:
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """The camera that frames show.
-
-    Attributes
-    ----------
-    sensor : model whose pixels are the frames' elements.
-    errors : standard error of each measured field.
-    transfer : fit of means and variances.
-    pixels : differences between pixels, and the sets with other pixels in place of defects.
-    notes : facts that the frames do not show.
-    """
+    """The camera that frames show, with the standard error of each measured field."""
 
     sensor: SensorModel
     errors: dict[str, float]
@@ -415,7 +365,6 @@ class FoundCamera:
     notes: tuple[str, ...]
 
     def toml(self) -> str:
-        """Return the camera file, with standard errors in comments."""
         lines = ["# Measured by `mitsim characterise`: numbers with their standard errors.", "#"]
         lines += [f"# {note}" for note in self.notes]
         lines.append("")
@@ -438,21 +387,15 @@ def find_camera(
     images : mean image of a set.
     stated : facts that frames do not show.
     again : statistics of the same sets with some pixels replaced.
-
-    Raises
-    ------
-    MitsimError
-        If the light is far from even, or a camera file cannot state the result.
     """
     return Pixels(taken, images, again).camera(stated)
 
 
 class Pixels:
-    """Mean images with defect pixels replaced, and the fields of the camera that follow.
+    """Differences between pixels, and the fields of the camera that follow.
 
-    `taken` are the sets without defects, `uneven` is the difference of the light over the frame and `surface` its
-    relative variances by row, column and pixel. `filled` is the fraction of pixels that are full in the longest dark
-    frames.
+    `taken` are the sets with defects replaced, `uneven` and `surface` the range of the light over the frame and its
+    relative variances by row, column and pixel, and `filled` the fraction of pixels that are full in the dark.
     """
 
     def __init__(self, taken: Sequence[Alike], images: Images, again: Callable[[Places], Sequence[Alike]]) -> None:
@@ -507,15 +450,12 @@ class Pixels:
         return sum(self.taken[index].variance / self.taken[index].count for index in sets)
 
     def _shared(self, *sets: int) -> float:
-        """Return its part that the pixels of a row share."""
         return sum(float(self.taken[index].pair.rows) / self.taken[index].count for index in sets)
 
     def _mean_variance(self, parts: FloatArray) -> float:
-        """Return the variance of the frame's mean that parts by pixel, row and column cause."""
         return max(float((parts / [self.size, *self.shape]).sum()), 0.0)
 
     def camera(self, stated: Stated) -> FoundCamera:
-        """Return the camera of what was stated and measured."""
         if self.uneven > _MOST_UNEVEN:
             raise MitsimError(
                 f"light differs by {100 * self.uneven:.0f} % over the frame; at most {100 * _MOST_UNEVEN:.0f} % is "
@@ -554,7 +494,6 @@ class Pixels:
         return FoundCamera(sensor, errors, transfer, self, tuple(self.notes))
 
     def _read(self) -> dict[str, Known]:
-        """Return the noise of reading, the part that rows share, and the black level."""
         transfer, gain, dark = self.transfer, self.gain, [each for each in self.taken if not each.light]
         read, error = transfer["read"], transfer.error("read")
         if min(each.variance for each in dark) < LEAST_DARK:
@@ -583,7 +522,6 @@ class Pixels:
         }
 
     def _dark(self) -> dict[str, Known]:
-        """Return the dark current, its spread, and hot pixels."""
         mean, error = self.transfer["dark"], self.transfer.error("dark")
         names = "dark_current_e_per_s", "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s"
         if self.excess is None:
@@ -612,10 +550,7 @@ class Pixels:
         return dict(zip(names, found, strict=True))
 
     def _offsets(self, seen: Known, spread: float) -> dict[str, Known]:
-        """Return the offsets by pixel, row and column [e-].
-
-        Rounding and the ADC's end change the spread of mean readings, therefore the fit determines the true spread.
-        """
+        """Return offsets [e-]; the fit gives their spread, because rounding changes the spread of mean readings."""
         true, error = self.transfer["spatial"], self.transfer.error("spatial")
         sure = seen[0] > _SURE * seen[1] and true > _SURE * error
         values = self.offsets[0] * (true / seen[0] if sure else 0.0)
@@ -635,7 +570,6 @@ class Pixels:
         return found
 
     def _responses(self) -> dict[str, Known]:
-        """Return the responses by pixel, row and column, and dead pixels."""
         transfer, full = self.transfer, 1.0
         if any(transfer.values[5:7]):
             b1, b2 = transfer.values[5:7]
@@ -649,7 +583,6 @@ class Pixels:
         }
 
     def _end(self, stated: Stated) -> dict[str, Known]:
-        """Return the full well: where frames saturate, or where the ADC does."""
         transfer = self.transfer
         top = None if stated.bits is None else 2.0**stated.bits - 1
         end = transfer.saturation_dn if transfer.saturates else top
@@ -670,10 +603,7 @@ class Pixels:
 
 
 def _spatial_parts(image: FloatArray, noise: float, rows: float) -> tuple[FloatArray, FloatArray]:
-    """Return spatial variances of an image by pixel, row and column, and their standard errors.
-
-    `noise` is the variance that temporal noise leaves in a pixel, and `rows` its part that a row shares.
-    """
+    """Return spatial variances of an image by pixel, row and column, and their standard errors."""
     m, n = image.shape
     rows *= 1 - 1 / m  # variances about the frame's mean contain a row of m less
     about = image - image.mean()

@@ -1,10 +1,9 @@
-"""The sensor chain after EMVA 1288 release 4.0, from irradiance to digital numbers, stage by stage.
+"""The sensor chain after EMVA 1288 release 4.0, from irradiance to digital numbers.
 
 The order is physics and must not change: irradiance x area x time -> photons -> quantum efficiency ->
 photoelectrons -> crosstalk -> response of each pixel -> + dark current -> Poisson -> full-well clip -> linearity ->
 + offset, row noise, read noise -> gain -> black level -> quantise. A stage that a camera does not name is left out.
-`mitsim.sensor.moments` has means and variances in closed form. All values are per superpixel (see `SensorModel`);
-arrays keep their shape and are float64 until the last stage.
+All values are per superpixel (see `SensorModel`).
 """
 
 from __future__ import annotations
@@ -29,18 +28,13 @@ from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
 _MANY = 64.0
-"""Mean electrons from which counts are quantiles of normal deviates. Three draws in a million differ from the Poisson
-law, fewer than 1e9 draws show; numpy's Poisson draw loses digits above 1e11.
-"""
+"""Mean electrons from which counts are quantiles of normal deviates; 3 of a million draws differ from Poisson's law."""
 
 
 def electrons_from_irradiance(
     irradiance: npt.ArrayLike, exposure_s: float, model: SensorModel, wavelength_nm: float
 ) -> FloatArray:
-    """Compute photoelectrons without dark current, mu_e = eta E A t / (h c / lambda) (EMVA 1288 4.0, "sensitivity").
-
-    `irradiance` [W m^-2] has any shape. ValueError for negative or NaN irradiance or exposure.
-    """
+    """Compute photoelectrons without dark current, mu_e = eta E A t / (h c / lambda) (EMVA 1288 4.0, "sensitivity")."""
     light = checked_light(irradiance, "irradiance")
     if not 0 <= exposure_s < math.inf:
         raise ValueError(f"electrons_from_irradiance: exposure_s is {exposure_s}; it must be finite and 0 or more")
@@ -48,10 +42,7 @@ def electrons_from_irradiance(
 
 
 def exposure_for_peak(peak_irradiance: float, fraction: float, model: SensorModel, wavelength_nm: float) -> float:
-    """Compute the exposure [s] after which light and dark current fill a fraction of the full well on average.
-
-    MitsimError without light or a full well, or if the fraction is not in (0, 1].
-    """
+    """Compute the exposure [s] after which light and dark current fill a fraction of the full well on average."""
     if not 0 < fraction <= 1:
         raise MitsimError(f"exposure: got fraction {fraction} of full well; allowed is above 0, up to 1")
     if not 0 < peak_irradiance < np.inf:
@@ -74,14 +65,13 @@ def expose(
     shot_rng: np.random.Generator,
     read_rng: np.random.Generator,
 ) -> Digital:
-    """Draw one noisy frame: uint32 DN, or float64 if the model has no bits. ValueError for negative or NaN electrons.
+    """Draw one noisy frame: uint32 DN, or float64 if the model has no bits.
 
     Parameters
     ----------
     expected_electrons : photoelectrons of any shape; (rows, columns) if pixels differ or share noise or light.
-    exposure_s, model : exposure [s], which adds dark electrons, and sensor. shot_rng, read_rng : separate streams, so
-    that one noise can be switched off without a change of the other. Row noise
-        is drawn from a child of `read_rng`.
+    exposure_s, model : exposure [s] and sensor.
+    shot_rng, read_rng : separate streams, so that one noise can be switched off without a change of the other.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     shape = np.shape(light)
@@ -101,7 +91,6 @@ def _read_out(model: Any, light: Any, dark: Any, few: Any, offset: Any, shot: An
 
 
 def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | None]:
-    """Return the numbers that `_read_out` reads."""
     return {
         "superpixel_full_well_e": model.superpixel_full_well_e,
         "linearity": tuple(model.linearity),
@@ -113,14 +102,13 @@ def _numbers_of(model: SensorModel) -> dict[str, float | tuple[float, ...] | Non
 
 
 def dn_to_electrons(dn: npt.ArrayLike, model: SensorModel) -> FloatArray:
-    """Convert digital numbers to electrons, (DN - black level) / gain. Dark electrons and negative values remain."""
+    """Convert digital numbers to electrons, (DN - black level) / gain, including dark electrons."""
     return (np.asarray(dn, dtype=np.float64) - model.superpixel_black_level_dn) / model.gain_dn_per_e
 
 
 # -------- One specimen of a camera
 
 Map = npt.NDArray[np.float32]
-"""(rows, columns) float32, because no number is known to more than seven digits."""
 _MOST_MAPS = 2
 
 
@@ -130,9 +118,9 @@ class Specimen:
 
     Attributes
     ----------
-    offset_e : (rows, columns) reading beyond the black level without charge [electrons]; mean 0.
-    response : (rows, columns) response to light relative to the mean of undamaged pixels; 0 is dead.
-    dark_e_per_s : (rows, columns) dark current at the sensor's temperature, including hot pixels.
+    offset_e : (rows, columns) reading beyond the black level [electrons]; mean 0.
+    response : (rows, columns) relative to the mean of undamaged pixels; 0 is dead.
+    dark_e_per_s : (rows, columns) dark current at the sensor's temperature.
     hot, dead : numbers of superpixels with a hot and with a dead pixel.
     """
 
@@ -145,10 +133,7 @@ class Specimen:
 
 @lru_cache(maxsize=_MOST_MAPS)
 def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
-    """Return the specimen that ``model.pattern_seed`` names, for frames of ``shape`` (rows, columns).
-
-    It follows from seed and shape alone (EMVA 1288 4.0, "spatial nonuniformity"); numbers are per superpixel.
-    """
+    """Return the specimen that ``model.pattern_seed`` names (EMVA 1288 4.0, "spatial nonuniformity")."""
     hot, dead = (_defects(model, shape, kind) for kind in ("hot", "dead"))
     return Specimen(
         offset_e=_parts(model, shape, "offset", model.offset_parts),
@@ -160,7 +145,7 @@ def specimen(model: SensorModel, shape: tuple[int, int]) -> Specimen:
 
 
 def response_variance(model: SensorModel) -> float:
-    """Return the variance over pixels of the response, whose mean is that of undamaged pixels (1) less dead ones.
+    """Return the variance over pixels of the response.
 
     With p of the pixels dead, b^2 in a superpixel: (1 + sum s^2) (q^2 + p q / b^2) - q^2, q = 1 - p.
     """
@@ -170,7 +155,7 @@ def response_variance(model: SensorModel) -> float:
 
 
 def dark_current_variance(model: SensorModel) -> float:
-    """Return the variance over superpixels of the dark current [(electrons/s)^2]: b^2 (s^2 + p (1 - p) h^2)."""
+    """Return the variance of superpixels' dark current [(electrons/s)^2]: b^2 (s^2 + p (1 - p) h^2)."""
     hot = model.hot_pixels * (1 - model.hot_pixels) * model.hot_dark_current_e_per_s**2
     return (model.binning * model.dark_factor) ** 2 * (model.dark_current_spread_e_per_s**2 + hot)
 
@@ -201,7 +186,7 @@ def _response(model: SensorModel, shape: tuple[int, int], dead: Map | None) -> M
 
 
 def _dark_current(model: SensorModel, shape: tuple[int, int], hot: Map | None) -> Map | None:
-    """Draw dark currents from a gamma law, which is never negative and whose sums over binned pixels are gamma, too."""
+    """Draw from a gamma law, which is never negative and whose sums over binned pixels are gamma, too."""
     if not model.dark_current_spread_e_per_s and hot is None:
         return None
     mean, spread = model.dark_current_e_per_s, model.dark_current_spread_e_per_s
@@ -216,7 +201,6 @@ def _dark_current(model: SensorModel, shape: tuple[int, int], hot: Map | None) -
 
 
 def _defects(model: SensorModel, shape: tuple[int, int], kind: str) -> Map | None:
-    """Return how many pixels of each superpixel are hot or dead."""
     part = model.hot_pixels if kind == "hot" else model.dead_pixels
     if not part:
         return None
@@ -237,7 +221,7 @@ def neighbours(light: FloatArray, part: float) -> FloatArray:
 
 
 def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> FloatArray:
-    """Add dark electrons to expected photoelectrons, mu_e + mu_I t (EMVA 1288 4.0, "dark current")."""
+    """Add dark electrons to expected photoelectrons, mu_e + mu_I t."""
     expected = checked_light(expected_electrons, "expected_electrons")
     return expected + model.superpixel_dark_current_e_per_s * exposure_s
 
@@ -245,11 +229,7 @@ def add_dark_current(expected_electrons: npt.ArrayLike, exposure_s: float, model
 def mean_electrons(
     expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray | float]:
-    """Return light after crosstalk and response, and dark electrons; their sum is the mean of the Poisson draw.
-
-    Crosstalk moves the mean only, because charge that strays before it is counted leaves counts independent and
-    Poisson.
-    """
+    """Return light after crosstalk and response, and dark electrons; their sum is the mean of the Poisson draw."""
     light = checked_light(expected_electrons, "expected_electrons")
     dark: FloatArray | float = model.superpixel_dark_current_e_per_s * exposure_s
     if model.crosstalk:
@@ -265,7 +245,7 @@ def mean_electrons(
 
 
 def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> float:
-    """Return the largest expected number of electrons of a pixel, including dark electrons."""
+    """Return the largest expected number of electrons of a pixel."""
     if model.has_fixed_pattern or model.crosstalk:
         light, dark = mean_electrons(expected_electrons, exposure_s, model)
         return float((light + dark).max())
@@ -273,10 +253,7 @@ def most_gathered(expected_electrons: FloatArray, exposure_s: float, model: Sens
 
 
 def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Generator | None) -> FloatArray | None:
-    """Return the fixed offset and a row's noise for each pixel, flat [electrons]; None if the camera has neither.
-
-    The row noise is drawn from a child of `rng`; without `rng` it is left out.
-    """
+    """Return the fixed offset and, with `rng`, a row's noise for each pixel, flat [electrons], or None."""
     fixed = specimen(model, _frame_shape(shape, model)).offset_e if any(model.offset_parts) else None
     offset = None if fixed is None else fixed.astype(np.float64)
     if model.row_noise_e and rng is not None:
@@ -288,14 +265,14 @@ def reading_offset(shape: tuple[int, ...], model: SensorModel, rng: np.random.Ge
 
 
 def draw_electrons(expected: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw Poisson electrons (float64): exact below a mean of 64, and `poisson_count` of normal deviates above."""
+    """Draw Poisson electrons."""
     flat = np.reshape(expected, -1)
     drawn = by_pixel(lambda _, *values: _electron_counts(*values), {}, (flat, _few(flat, 0.0, rng)), (rng,))
     return np.asarray(drawn.reshape(np.shape(expected)))
 
 
 def _few(light: FloatArray, dark: FloatArray | float, rng: np.random.Generator) -> FloatArray | None:
-    """Draw the electrons of pixels that expect fewer than `_MANY`; NaN elsewhere, None without such pixels."""
+    """Draw the electrons of pixels that expect few; NaN elsewhere, None without such pixels."""
     if not light.size or light.min() + np.min(dark) >= _MANY:
         return None
     expected = light + dark
@@ -314,9 +291,8 @@ def _electron_counts(expected: Any, few: Any, z: Any) -> Any:
 def poisson_count(expected: Any, z: Any) -> Any:
     """Return the Poisson count of mean ``expected`` (64 or more) at the quantile of the normal deviate ``z``.
 
-    This is the expansion of the inverse Poisson distribution by Giles (2016, ACM Transactions on Mathematical Software
-    42, algorithm 955, Q_N2). Its total variation from the law is 3e-6 at 64, 2e-7 at 256 and 1e-8 at 1000; at 64 its
-    variance is off by 7e-6 and its third moment by 2e-6.
+    Giles (2016, ACM Transactions on Mathematical Software 42, algorithm 955, Q_N2). Its total variation from the law is
+    3e-6 at 64, 2e-7 at 256 and 1e-8 at 1000.
     """
     of, square = operations(expected), z * z
     root, part = of.sqrt(expected), 1 / expected
@@ -331,7 +307,7 @@ def poisson_quantile(expected: FloatArray, z: FloatArray | float) -> FloatArray:
 
 
 def clip_at_full_well(electrons: Any, model: Any) -> Any:
-    """Clip electrons at the full well, min(N, F)."""
+    """Return min(N, F)."""
     return operations(electrons).minimum(electrons, model.superpixel_full_well_e)
 
 
@@ -347,7 +323,6 @@ def bend(electrons: Any, model: Any) -> Any:
 
 
 def add_read_noise(electrons: Any, model: Any, z: Any) -> Any:
-    """Add normal noise to electrons; ``z`` holds normal deviates."""
     return electrons + model.superpixel_read_noise_e * z
 
 
@@ -357,10 +332,7 @@ def amplify(electrons: Any, model: Any) -> Any:
 
 
 def quantise(signal_dn: Any, model: Any) -> Any:
-    """Round to the nearest code of the ADC, from 0 to the largest; a model without bits returns the signal.
-
-    Away from both ends, and with noise above half a code, rounding adds 1/12 DN^2 (EMVA 1288 4.0, "noise model").
-    """
+    """Round to the nearest code of the ADC, which adds 1/12 DN^2 away from both ends (EMVA 1288 4.0)."""
     if model.largest_dn is None:
         return signal_dn
     of = operations(signal_dn)
@@ -398,17 +370,16 @@ def checked_light(values: npt.ArrayLike, name: str) -> FloatArray:
 # so a lane of the kernel has four pixels, a quarter of a block apart. Deviates are float32, all else is float64.
 
 LANE = 4
-"""Pixels of a lane: a counter gives four deviates."""
 _BLOCK = 2**22
-"""Pixels that pass the stages together: 32 MiB of each array."""
+"""32 MiB of each array."""
 _turn = threading.Lock()
-"""Lock held while stages run, because threads that take turns at each operation need twice as long."""
+"""Threads that take turns at each operation need twice as long."""
 
 Numbers = Mapping[str, float | tuple[float, ...] | None]
 
 
 def operations(values: Any) -> ModuleType:
-    """Return the module with minimum, sqrt, round and clip for ``values``: numpy, or Dr.Jit for its own arrays."""
+    """Return numpy, or Dr.Jit for its own arrays."""
     return np if isinstance(values, np.ndarray | float) else compiled_arrays()[0]
 
 
@@ -423,12 +394,11 @@ def by_pixel(
 
     Parameters
     ----------
-    stages : function of a namespace of the numbers, a value of each array, and a normal deviate of each stream. It is
-        called with Dr.Jit arrays, and describes the computation.
+    stages : function of a namespace of the numbers, a value of each array, and a normal deviate of each stream.
     numbers : values that all pixels share; other values need no new kernel.
     arrays : (pixels,) each, at least the first; or floats that all pixels share; None stays None.
     streams : each gives the key of its deviates in one draw.
-    dtype : of the result, np.uint32 or np.float64.
+    dtype : np.uint32 or np.float64.
     """
     keys = [int(stream.bit_generator.random_raw()) for stream in streams]
     size = len(arrays[0])  # type: ignore[arg-type]
@@ -449,7 +419,6 @@ def _run(
     first: int,
     result: npt.NDArray[Any],
 ) -> None:
-    """Fill the result of one block, whose first lane is ``first``."""
     dr, types = compiled_arrays()
     quarter = -(-len(result) // LANE)
 
@@ -497,10 +466,7 @@ def _run(
 
 
 def ripple_response(model: SensorModel, exposure_s: float, hertz: float, rows: int) -> npt.NDArray[np.complex128]:
-    """Return (rows,) amplitude and phase A_r of a ripple of the light with amplitude 1 and frequency ``hertz``.
-
-    MitsimError for a rolling shutter with unknown line time.
-    """
+    """Return (rows,) amplitude and phase A_r of a ripple of the light with amplitude 1."""
     summed = 1 if model.binning_on_chip else model.binning
     begins = model.known_line_time_s() * np.arange(rows * summed)
     lines = np.exp(2j * np.pi * hertz * (begins + exposure_s / 2))
@@ -508,23 +474,20 @@ def ripple_response(model: SensorModel, exposure_s: float, hertz: float, rows: i
 
 
 def ripple_level(response: npt.NDArray[np.complex128], amplitude: float, phase: float) -> FloatArray:
-    """Return (rows, 1) the level of the light in each row of one frame; its mean over all phases is 1.
-
-    ``amplitude`` is at most 1 and ``phase`` in radians.
-    """
+    """Return (rows, 1) the level of the light in each row of one frame; its mean over all phases is 1."""
     return np.asarray(1 + amplitude * (response * np.exp(1j * phase)).real[:, None])
 
 
 # -------- Energy of a photon
 
 PLANCK = 6.62607015e-34
-"""Planck constant, J s (exact, SI 2019)."""
+"""J s (exact, SI 2019)."""
 LIGHT_SPEED = 299_792_458.0
-"""Speed of light in vacuum, m/s (exact, SI 2019)."""
+"""m/s (exact, SI 2019)."""
 
 
 def photon_energy(wavelength_nm: float) -> float:
-    """Return the energy of one photon [J], E = h c / lambda, at a vacuum wavelength [nm] above 0."""
+    """Return the energy of one photon [J], E = h c / lambda, at a vacuum wavelength [nm]."""
     if not wavelength_nm > 0:
         raise ValueError(f"photon_energy: wavelength_nm is {wavelength_nm}; it must be above 0")
     return PLANCK * LIGHT_SPEED / (wavelength_nm * 1e-9)

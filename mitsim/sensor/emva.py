@@ -1,8 +1,6 @@
 """The figures of EMVA 1288 release 4.0, from statistics of flat and dark frames, real or simulated.
 
-Photon transfer: flat frames over a ladder of light give the system gain, quantum efficiency, saturation and linearity;
-dark frames over a series of exposures give the dark current; stacks of dark and half-bright frames give the
-nonuniformity by rows, columns and pixels. Statistics may have leading axes, for many sessions at once.
+Statistics may have leading axes, for many sessions at once.
 """
 
 from __future__ import annotations
@@ -20,17 +18,18 @@ from mitsim.core.arrays import FloatArray
 QUANTISATION = 1 / 12
 """Variance of rounding [DN^2] (EMVA 1288, "noise model")."""
 LEAST_DARK = 0.24
-"""Least variance [DN^2] of dark frames; smaller ones count as this, because rounding hides their noise
-(EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
+"""Least variance [DN^2] of dark frames, because rounding hides less (EMVA 1288 4.0, "minimal temporal
+standard deviation").
+"""
 HIDDEN = 1e-3
-"""Variance [DN^2] of dark frames below which one reading in a thousand is another code, so that no current shows."""
+"""Variance [DN^2] of dark frames below which one reading in a thousand is another code."""
 MOST_FITTED, LINEAR = 0.7, (0.05, 0.95)
-"""Fractions of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
+"""Fractions of saturation for the fit of the gain and for linearity (EMVA 1288 4.0)."""
 LINE = 3
 """Least number of points that show how straight a line is."""
 SPLIT = ("total", "row", "column", "pixel")
 _CODES = 65_536
-"""Codes of a histogram; larger numbers are folded, which keeps the frequencies of rational factors."""
+"""Larger codes are folded, which keeps the frequencies of rational factors."""
 _BLURRED = 0.52
 """Standard deviations of noise in a period from which an even histogram holds less than 5e-3 of that period."""
 _QUIET = 0.99
@@ -58,8 +57,7 @@ class Stack:
     def parts(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return the variances (total, row, column, pixel) [DN^2] for frames of M rows and N columns.
 
-        The means of rows contain 1/N of a pixel's part, those of columns 1/M (EMVA 1288 4.0, "row, column and pixel
-        spatial variances").
+        The means of rows contain 1/N of a pixel's part, those of columns 1/M (EMVA 1288 4.0).
         """
         m, n = shape
         pixel = m * n / (m * n - m - n) * (self.total - self.rows - self.columns)
@@ -78,8 +76,7 @@ class Session:
     pairs : (..., S) means and temporal variances.
     dark, bright : sets for nonuniformity, in the dark and near half of saturation.
     dark_stack, bright_stack : spatial statistics of these sets.
-    saturates : True if the brightest set is saturated.
-    rounded : True if the frames are whole numbers.
+    saturates, rounded : True if the brightest set is saturated, and if the frames are whole numbers.
     """
 
     shape: tuple[int, int]
@@ -95,21 +92,16 @@ class Session:
 
     @property
     def lit(self) -> npt.NDArray[np.intp]:
-        """Sets under light, by light."""
         order = np.argsort(self.photons, kind="stable")
         return np.asarray(order[self.photons[order] > 0])
 
     @property
     def unlit(self) -> npt.NDArray[np.intp]:
-        """Sets in the dark, by exposure."""
         order = np.argsort(self.exposure_s, kind="stable")
         return np.asarray(order[self.photons[order] == 0])
 
     def transfer(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return photons (L,) of lit sets, and their signal and variance (..., L) less those of dark sets.
-
-        Each lit set has the dark set of its exposure; if several fit, the one for nonuniformity.
-        """
+        """Return photons (L,) of lit sets, and their signal and variance (..., L) less the dark of their exposure."""
         lit, unlit = self.lit, np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
         dark = unlit[np.abs(self.exposure_s[unlit] - self.exposure_s[lit][:, None]).argmin(axis=1)]
         mean, variance = self.pairs.mean, self.pairs.variance
@@ -122,17 +114,15 @@ class Alike:
 
     Attributes
     ----------
-    count, shape : number and size of the frames.
     pair, stack : temporal and spatial statistics.
-    variance_error : standard error of the temporal variance [DN^2], from its spread over the pixels.
+    variance_error : standard error of the temporal variance [DN^2].
     cut : fractions of all numbers that are 0, and that are the largest code.
     flicker : standard deviation of the frames' means beyond noise [DN].
-    neighbours : correlation of the noise of neighbours in a row and in a column; 0 where electrons are counted.
-    comb : largest amplitude of a periodic pattern in the histogram of codes that noise blurs in an even ADC, and its
-        period [DN]. If every other code is missing, the amplitude is 1.
+    neighbours : correlation of the noise of neighbours in a row and in a column.
+    comb : largest amplitude of a periodic pattern in the histogram of codes, 1 if every other code is missing, and its
+        period [DN].
     digests : checksum of each frame; empty for a frame with nearly all pixels at one code.
-    light : light on a pixel, in photons or in any unit; 0 in the dark.
-    exposure_s : exposure of each frame [s].
+    light, exposure_s : light on a pixel, in photons or in any unit, and exposure [s].
     """
 
     count: int
@@ -150,12 +140,10 @@ class Alike:
 
     @property
     def mean(self) -> float:
-        """Mean of all pixels [DN]."""
         return float(self.pair.mean)
 
     @property
     def variance(self) -> float:
-        """Temporal variance [DN^2]."""
         return float(self.pair.variance)
 
     @property
@@ -171,14 +159,8 @@ def alike(
 ) -> Alike:
     """Compute statistics of frames (M, N) [DN] that were taken alike, one frame at a time.
 
-    The temporal variance is that of each pixel about its mean, after each frame's mean is subtracted. Therefore fixed
-    patterns and drift of the light have no effect. For two frames it is <(a - b)^2>/2 - (<a> - <b>)^2/2.
-
-    Parameters
-    ----------
-    frames : two or more; ValueError for fewer.
-    largest : last code of the ADC.
-    light, exposure_s : light on a pixel and exposure [s], which are stored.
+    The temporal variance is that of each pixel about its mean, after each frame's mean is subtracted. For two frames it
+    is <(a - b)^2>/2 - (<a> - <b>)^2/2. `largest` is the last code of the ADC.
     """
     means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
     codes, digests = np.zeros(_CODES), list[bytes]()
@@ -225,8 +207,7 @@ def alike(
 def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
     """Return amplitude and period [DN] of the strongest pattern in a histogram (codes,) of readings with noise.
 
-    The characteristic function of readings with noise vanishes at high frequencies. Codes that never occur or occur
-    too often, as after scaling or with a stuck bit, bring it back.
+    The characteristic function vanishes at high frequencies, unless codes never occur or occur too often.
     """
     first = math.ceil(_BLURRED / noise * len(codes)) if noise else len(codes)
     if first > len(codes) // 2:
@@ -237,7 +218,6 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
 
 
 def _neighbours(noise: FloatArray) -> tuple[float, float]:
-    """Return correlations of neighbours in a row and in a column, without noise that rows and columns share."""
     noise = noise - noise.mean(axis=1, keepdims=True)
     noise -= noise.mean(axis=0)
     power = float(np.square(noise).mean())
@@ -247,18 +227,15 @@ def _neighbours(noise: FloatArray) -> tuple[float, float]:
 
 
 def pairs_of(pairs: Sequence[Pair]) -> Pair:
-    """Return pairs side by side, with arrays (count,)."""
     return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
 
 
 def figures(session: Session) -> dict[str, FloatArray]:
     """Compute the figures (...) of a session by name.
 
-    `system_gain` [DN/e-], `quantum_efficiency` [e-/photon], `dark_noise` [e-], `saturation_capacity` (at the largest
-    variance) and `full_well` (of the brightest frames) [e-], `linearity_min` and `linearity_max` [1], `dark_current`
-    (by means) and `dark_current_by_variance` [e-/s]. Variances `row_noise` [e-^2], `dsnu_PART` [e-^2] and `prnu_PART`
-    [1] for each PART of `SPLIT` may be negative. Figures that the frames do not determine are left out: saturation
-    without saturated frames, linearity of fewer than three steps, dark current of one exposure or of one code.
+    `row_noise` [e-^2], `dsnu_PART` [e-^2] and `prnu_PART` [1] are variances, which may be negative. `dark_current`
+    follows from means, `saturation_capacity` from the largest variance and `full_well` from the brightest frames.
+    Figures that the frames do not determine are left out.
     """
     photons, signal, noise = session.transfer()
     means, variance, unlit = session.pairs.mean, session.pairs.variance, session.unlit
@@ -300,14 +277,13 @@ def figures(session: Session) -> dict[str, FloatArray]:
 
 
 def _slope(x: FloatArray, y: FloatArray, used: npt.NDArray[np.bool_]) -> FloatArray:
-    """Return the slopes (...) of least-squares lines through the origin, of `y` over `x` (..., S)."""
     return np.asarray((x * y * used).sum(axis=-1) / (np.square(x) * used).sum(axis=-1))
 
 
 def _linearity(photons: FloatArray, signal: FloatArray, used: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Return the least and the largest relative deviation (...) of `signal` (..., S) from a line.
 
-    The line minimises squared relative deviations (EMVA 1288 4.0, "linearity"), with weights 1 / signal^2.
+    The line minimises squared relative deviations (EMVA 1288 4.0, "linearity").
     """
     weight = used / np.square(np.where(used, signal, 1.0))
     first = weight * photons

@@ -1,7 +1,6 @@
-"""Mean and variance of the sensor's output in closed form, beside each draw of `mitsim.sensor.chain`.
+"""Mean and variance of the sensor's output in closed form, after EMVA 1288 release 4.0.
 
-After EMVA 1288 release 4.0. Tails of the Poisson law and of the ADC's codes are sums and expansions that keep their
-digits from 1e-6 to 1e15 electrons (`tests/hard/test_hard_moments.py`).
+Tails of the Poisson law and of the ADC's codes keep their digits from 1e-6 to 1e15 electrons.
 """
 
 import math
@@ -26,21 +25,16 @@ from mitsim.sensor.chain import (
 )
 
 _FEW = 64.0
-"""Electrons below which moments are summed count by count: 150 counts hold nearly all of the law."""
+"""Electrons below which moments are summed count by count."""
 _SOME = 1e4
-"""Electrons below which moments are summed over the counts that occur. Above, 129 counts represent all to 1 % of the
-variance (tests/hard/test_hard_moments.py).
-"""
+"""Electrons below which moments are summed over the counts that occur. Above, 129 counts represent all to 1 %."""
 _CAN_SATURATE = 1e-3
-"""Chance of saturation in a frame from which a reading at the full well counts as saturated."""
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0
 """Standard deviation [DN] from which a sum over codes is an integral to 1e-4."""
 _STEP, _FINEST = 1 / 8, 1 / 64
-"""Distance of the offsets at which moments near the ADC's ends are formed, in deviations of the noise of reading
-(interpolation is linear to 1/500 of the noise), and the least distance [DN] without noise.
-"""
+"""Distance of interpolated offsets, in deviations of the noise of reading, and the least distance [DN]."""
 
 
 def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatArray, FloatArray]:
@@ -77,8 +71,7 @@ def _clip_moments(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, Flo
 def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return P(N >= count) and P(N < count) for Poisson N, as two tails, so that 1e-20 keeps its digits.
 
-    Large counts use Temme's uniform expansion (DLMF 8.12.8, one term, remainder 1/count), because scipy's sums stop
-    early beyond 4.5 deviations and give 3e-9 instead of 2.9e-7 at 1e12.
+    Large counts use Temme's uniform expansion (DLMF 8.12.8, one term), because scipy's sums stop early.
     """
     if count < 300_000:
         return scipy.special.pdtrc(count - 1, mean), scipy.special.pdtr(count - 1, mean)
@@ -109,20 +102,19 @@ def _poisson(count: int, mean: FloatArray) -> FloatArray:
 def frame_moments(
     expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean (DN) and variance (DN^2) of the output of `expose` (EMVA 1288 4.0, photon transfer).
+    """Return mean (DN) and variance (DN^2) of the output of `expose` for one specimen (EMVA 1288 4.0, photon transfer).
 
-    For one specimen: fixed patterns move means, and the variance contains the noise that each frame draws, including
-    row noise. Two pixels of a row have the variance of the row noise as covariance.
+    Fixed patterns move means. The variance includes row noise, which is the covariance of two pixels of a row.
 
     Parameters
     ----------
-    expected_electrons : photoelectrons of any shape, or (rows, columns) as for `expose`; ValueError if negative or NaN.
+    expected_electrons : photoelectrons of any shape, or (rows, columns) as for `expose`.
     exposure_s, model : exposure [s] and sensor.
 
     Notes
     -----
     Near an end of the ADC (eight deviations), or if too little noise dithers its codes, the moments are those of
-    rounded and clipped numbers: summed over the counts below 1e4 electrons, and averaged over 129 counts above.
+    rounded and clipped numbers.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     expected = np.asarray(light + dark)
@@ -138,7 +130,6 @@ def frame_moments(
 
 
 def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Return moments of ``expected`` electrons with offsets [electrons] and linearity."""
     level, spread = bent_moments(expected, model)
     mean = np.asarray(amplify(level if offset is None else level + offset, model))
     noise = np.asarray(_linear_variance(spread, model))
@@ -156,10 +147,7 @@ def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel
 def _cut_by_offset(
     expected: FloatArray, offset: FloatArray | float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    """Return moments of pixels with different offsets; an offset is another black level.
-
-    Moments are computed at closely spaced black levels and interpolated linearly.
-    """
+    """Interpolate moments between black levels, because an offset acts as another black level."""
     if not np.ptp(offset):
         return _cut(expected, _with_offset(model, float(np.mean(offset))))
     read = model.superpixel_reading_noise_e * model.gain_dn_per_e
@@ -234,7 +222,7 @@ def _linear_variance(expected: FloatArray | np.float64, model: SensorModel) -> F
 
 
 def _linear(model: SensorModel) -> tuple[float, float]:
-    """Return the least and most expected electrons between which moments are linear (most below least if nowhere).
+    """Return the least and most expected electrons between which moments are linear.
 
     The range is 12 deviations below the full well and 8 from both ends of the ADC, where the noise dithers its codes. A
     signal y [DN] of variance K (y - b) + r^2 is 8 deviations from 0 beyond the larger root of
@@ -292,7 +280,6 @@ def _sum_counts(
 
 
 def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Sum moments over all counts of few electrons."""
     most = float(expected.max())
     counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
     levels, variances = _read_out(counts, model)
@@ -306,7 +293,6 @@ def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArr
 
 
 def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Sum moments over the counts within 12 deviations, for some hundreds of electrons."""
     nodes = _grid(expected)
     reach = 12 * np.sqrt(nodes) + 20
     first, last = np.floor(nodes - reach).clip(0).astype(np.intp), np.ceil(nodes + reach).astype(np.intp)
@@ -325,7 +311,6 @@ def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
 
 
 def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Average moments over 129 quantiles, for many electrons."""
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
     weights = np.exp(-np.square(deviates) / 2)
@@ -341,8 +326,7 @@ def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
 def _grid(expected: FloatArray) -> FloatArray:
     """Return expected counts at which moments are computed: those of the pixels, or fewer to interpolate between.
 
-    Moments depend smoothly on the light: shot noise has a deviation of 1/2 in the root of the counts, and the steps are
-    1/20 of that root.
+    Shot noise has a deviation of 1/2 in the root of the counts, and the steps are 1/20 of that root.
     """
     roots = np.sqrt(expected)
     count = int(np.ptp(roots) * 20) + 2
@@ -367,7 +351,6 @@ def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, Fl
 
 
 def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of a normal signal (pixels,) rounded to the codes 0 .. `largest`, in DN."""
     first, second = np.empty_like(mean), np.empty_like(mean)
     wide = deviation >= _SMOOTH
     for part, moments in ((wide, _cut_moments), (~wide, _code_moments)):
@@ -377,11 +360,10 @@ def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tup
 
 
 def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """Return these moments for deviations of at least 2 DN.
+    """Return moments of a rounded normal signal for deviations of at least 2 DN.
 
-    The sum over codes of P(signal > code - 1/2) is the midpoint rule for an integral in closed form, that of a clipped
-    normal signal. Euler and Maclaurin's first term, -1/24 of the integrand's slope between the ends, gives 1/12 DN^2 if
-    nothing is clipped.
+    The sum over codes of P(signal > code - 1/2) is the midpoint rule for a closed-form integral. Euler and Maclaurin's
+    first term gives 1/12 DN^2 if nothing is clipped.
     """
     # Noise far wider than the ADC leaves its two ends, whatever its width; and 40 deviations beyond an end are enough.
     narrower = np.minimum(deviation, 1e4 * largest)
@@ -398,7 +380,7 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
 
 
 def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """Return these moments for deviations below 2 DN, code by code within eight deviations."""
+    """Return moments of a rounded normal signal for deviations below 2 DN, code by code."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():
         return nearest, np.zeros_like(mean)
@@ -418,8 +400,7 @@ def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tupl
 def saturated_pixels(digital: Digital, expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> int:
     """Count the pixels of a frame that reached the full well or the ADC's end.
 
-    A reading at the full well counts if the chance of saturation in the whole frame is 1e-3 or more; otherwise it is
-    read noise. ``expected_electrons`` is the argument of `mitsim.sensor.chain.expose`.
+    A reading at the full well counts if the chance of saturation in the whole frame is 1e-3 or more.
     """
     well, brightest = model.superpixel_full_well_e, float(digital.max())
     ends = math.inf if model.largest_dn is None else float(model.largest_dn)

@@ -1,9 +1,7 @@
 """Characterise a camera after EMVA 1288 release 4.0: figures, the camera file, a page and plots.
 
-Frames of a camera file are simulated, and their figures are compared with those that the file sets. Frames of a real
-camera give the camera that explains them (`mitsim.sensor.camera_fit`), and the figures are compared with the figures of
-that camera's frames. Standard errors are predicted: closed-form moments give the scatter of every statistic, and a
-thousand drawn sessions are evaluated as the frames are (GUM, supplement 1).
+Figures of simulated frames are compared with the camera file, and those of real frames with the camera that explains
+the frames. Standard errors are the scatter of a thousand drawn sessions (GUM, supplement 1).
 """
 
 from __future__ import annotations
@@ -38,15 +36,12 @@ from mitsim.studies.framework.run import study_folder, write_figures
 
 CAMERA_FILE = "camera.toml"
 MOST_OFF = 5.0
-"""Standard errors from which a figure is off: one of twenty figures is so by chance in 1e5 characterisations."""
+"""Standard errors from which a figure is off."""
 _BIASED, _MISLEADS = 0.5, 1.0
-"""Standard errors of the procedure's own bias by the ADC. From the first a figure is compared with its expected value,
-from the second it is flagged. Below, 98 of 100 figures are within three standard errors of the value set."""
+"""Standard errors of the procedure's own bias from which a figure is compared with its expected value, and flagged."""
 _DUST = 1e-10
-"""Least standard error of a figure, above rounding errors of the arithmetic."""
 _OF_FIELDS = "name", "unit", "set", "found", "standard_error", "deviations"
 _WHOLE = 1e4
-"""Number from which a headline shows whole numbers."""
 
 
 # ---- tables of the measured numbers ----------------------------------------------------------------------------------
@@ -59,9 +54,9 @@ class EmvaFigure:
     Attributes
     ----------
     symbol, unit : as in the standard.
-    set : value that the camera of some frames sets; a variance for figures that are found as variances.
+    set : value that the camera of some frames sets.
     root : True if a variance is found, which may be negative, and its root is shown.
-    method : True if the figure depends on the steps of light and their noise, so that no file sets it.
+    method : True if no file sets the figure, because it depends on the steps of light.
     """
 
     symbol: str
@@ -122,7 +117,6 @@ FIGURES: Mapping[str, EmvaFigure] = {
     **_split("dsnu", "e-"),
     **_split("prnu", "%"),
 }  # fmt: skip
-"""Figures of EMVA 1288 in the order in which they are shown."""
 FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
     "gain_dn_per_e": ("DN/e-", lambda model: model.gain_dn_per_e),
     "quantum_efficiency": ("e-/photon", lambda model: model.quantum_efficiency),
@@ -146,15 +140,15 @@ FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
     "linearity.0": ("1", lambda model: (*model.linearity, 0.0)[0]),
     "linearity.1": ("1", lambda model: (*model.linearity, 0.0, 0.0)[1]),
 }  # fmt: skip
-"""Measured fields of a camera file: unit, and the value that a model sets for a camera of its superpixels."""
+"""Measured fields of a camera file: unit, and the value that a model sets for its superpixels."""
 
 
 @dataclass(frozen=True)
 class Row:
     """A figure, or a field of the camera that explains the frames; None if nothing is set.
 
-    `expected` is given if the procedure finds another figure than the set one. `deviations` is found less expected (or
-    set), and `bias` expected less set if the ADC's ends and steps cause it, in standard errors.
+    `expected` is given if the procedure finds another figure than the set one. `deviations` and `bias` are differences
+    in standard errors.
     """
 
     name: str
@@ -171,12 +165,7 @@ class Row:
 def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
     """Compare a figure with its set or expected value.
 
-    Parameters
-    ----------
-    frames : frames that show it.
-    name, found : the figure.
-    sessions : (count,) the figure of drawn sessions, for its error.
-    bend : standard error of the expected linearity.
+    `sessions` (count,) are figures of drawn sessions, and `bend` is the standard error of the expected linearity.
     """
     sensor, figure = frames.sensor, FIGURES[name]
     value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
@@ -222,20 +211,7 @@ def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Characterisation:
-    """A camera's figures.
-
-    Attributes
-    ----------
-    camera : name of the camera.
-    frames : frames and the camera in them, which for real frames is the camera that was found.
-    session, expected : statistics of the frames, and their expectation by closed forms.
-    rows, fields : figures, and fields of the camera that explains the frames.
-    found : this camera.
-    asked : the request, for JSON.
-    real : True for frames of a real camera.
-    about : remarks on the frames.
-    output : folder of page, plots, JSON and the camera file, if one was asked for.
-    """
+    """A camera's figures (`rows`), the camera that explains its frames (`fields`), and closed forms (`expected`)."""
 
     camera: str
     frames: Frames
@@ -251,7 +227,6 @@ class Characterisation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Remarks on real frames, figures that the procedure cannot find, and figures off by five standard errors."""
         lines, sensor = [*self.about], self.frames.sensor
         if biased := [row for row in self.rows if abs(row.bias) > _MISLEADS]:
             of = "the camera" if self.real else "what is set"
@@ -274,7 +249,6 @@ class Characterisation:
         return tuple(lines)
 
     def payload(self) -> dict[str, Any]:
-        """Return the JSON object of the command line."""
         transfer = self.found.transfer
         return {
             "camera": self.camera,
@@ -293,7 +267,6 @@ class Characterisation:
 
     @property
     def message(self) -> str:
-        """Headline: gain, read noise and full well of the camera found."""
         found = {row.name: row for row in self.fields}
         named = {"Gain": "gain_dn_per_e", "read noise": "read_noise_e", "full well": "full_well_e"}
         rows = {name: found[each] for name, each in named.items() if each in found}
@@ -303,13 +276,12 @@ class Characterisation:
 
     @property
     def where(self) -> str:
-        """Size and number of the frames."""
         (m, n), lit, unlit = self.frames.shape, len(self.session.lit), len(self.session.unlit)
         return f"{m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"
 
     @property
     def parts(self) -> tuple[Part, Part]:
-        """Tables and plots of the page: the figures of EMVA 1288, and the camera that was found."""
+        """Tables and plots of the page."""
 
         def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
             return tuple(columns), tuple(tuple(_cell(row, name) for name in columns.values()) for row in rows)
@@ -335,7 +307,6 @@ class Characterisation:
         )  # fmt: skip
 
     def lines(self) -> list[str]:
-        """Return the text of the command line."""
         lines = [f"{self.camera}: {self.where}"]
         if self.output:
             lines.append(f"Page, plots, JSON and the camera found, camera.toml: {self.output}")
@@ -345,7 +316,6 @@ class Characterisation:
 
 
 def _cell(row: Row, name: str) -> str:
-    """Return a cell: found numbers to the digits that are known, deviations to a tenth, others to five digits."""
     value = getattr(row, name)
     if name in ("found", "standard_error"):
         return round_to_error(value, row.standard_error)
@@ -418,7 +388,6 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
 
 
 def _deviations(done: Characterisation) -> Figure:
-    """Draw the deviation of each figure in standard errors."""
     figure, axes = figure_of(0.9 + 0.26 * len(done.rows), COLUMN)
     place = np.arange(len(done.rows))[::-1]
     off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
@@ -446,16 +415,7 @@ def characterise(
 ) -> Characterisation:
     """Run EMVA 1288's procedure on simulated frames of a camera.
 
-    Parameters
-    ----------
-    sensor, procedure : camera, sizes and seed.
-    output : folder for page, plots, JSON and the camera file: new, empty, or of an earlier characterisation.
-    job : clock, progress and limits.
-
-    Raises
-    ------
-    MitsimError
-        If light never saturates the camera, a wavelength is outside its curve, or the folder holds something else.
+    `output` is a folder for page, plots, JSON and the camera file: new, empty, or of an earlier characterisation.
     """
     procedure, job = procedure or Procedure(), job or Job()
     frames = Frames.of(sensor, procedure, capacity_of(sensor))
@@ -477,18 +437,7 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames under even light and in the dark.
-
-    Parameters
-    ----------
-    listed : the frames (`mitsim.devices.flatlist.load_flats`).
-    output, job : as for `characterise`.
-
-    Raises
-    ------
-    MitsimError
-        If frames cannot be read, are not as listed, or show nothing of the camera.
-    """
+    """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.flatlist.load_flats`)."""
     job, facts = job or Job(), listed.listed
     stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
 
@@ -509,7 +458,6 @@ def characterise_frames(
 def _compare(
     frames: Frames, taken: list[Alike], found: FoundCamera, real: bool = False, **facts: Any
 ) -> Characterisation:
-    """Compute the figures of sets that were taken, and compare them with those of the camera of `frames`."""
     expected, sensor = frames.expect(), frames.sensor
     session = frames.session((each.pair for each in taken), taken[frames.dark].stack, taken[frames.bright].stack)
     spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)

@@ -1,9 +1,4 @@
-"""The frames that characterise a camera, their statistics, and what closed forms expect of them.
-
-A test bench takes pairs under even light from dark to beyond saturation, pairs in the dark over a series of exposures,
-and stacks in the dark and at half of saturation. The frames of a real camera are as its list states. Closed-form
-moments (`mitsim.sensor.moments`) give the expected statistics and their standard errors.
-"""
+"""The frames that characterise a camera, their statistics, and what closed forms expect of them."""
 
 from __future__ import annotations
 
@@ -26,9 +21,8 @@ from mitsim.sensor.emva import MOST_FITTED, SPLIT, Alike, Pair, Session, Stack, 
 from mitsim.sensor.moments import frame_moments
 
 _TO = 1.15
-"""Light of the brightest step, relative to saturation: 7 steps of 50 saturate, so the largest variance is inside."""
+"""Light of the brightest step, relative to saturation, so that the largest variance is inside."""
 _DARK_STEPS = 6
-"""Exposures of the dark series: the least number of EMVA 1288 4.0."""
 _DARK_FILL, _DARK_ELECTRONS = 0.4, 2000.0
 """Dark electrons at the longest exposure: a fraction of saturation, or enough for a current to a permille."""
 _LONGEST_S = 10.0
@@ -37,7 +31,6 @@ _FILLED_BY_DARK = 0.01
 _DITHERED, _CLEAR = 0.6, 8.0
 """Noise of reading [DN], and deviations from 0, from which mean readings follow offsets."""
 _SESSIONS = 1000
-"""Drawn sessions: they give a standard error to 2 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +39,9 @@ class Frames:
 
     Attributes
     ----------
-    sensor, shape : camera, rows and columns.
     light, electrons : (S,) light on a pixel, in photons or in any unit, and in photoelectrons; 0 in the dark.
     exposure_s, counts : (S,) exposure [s] and number of the frames of each set.
     dark, bright : sets for nonuniformity.
-    saturates : True if the brightest set is saturated.
-    seed : root of every draw.
     lamp : relative errors of the light of each set, and of all sets.
     surface : relative variances of uneven light by row, column and pixel.
     """
@@ -118,7 +108,7 @@ class Frames:
             yield image if places is None else image.flat[places]
 
     def take(self, job: Job, places: Places | None = None) -> list[Alike]:
-        """Simulate the frames of all sets, with the pixel at `places` in place of each pixel."""
+        """Simulate the frames of all sets."""
         largest = math.inf if self.sensor.largest_dn is None else float(self.sensor.largest_dn)
 
         def taken(index: int) -> Alike:
@@ -129,7 +119,6 @@ class Frames:
             return in_threads(taken, range(len(self.light)))
 
     def session(self, pairs: Iterable[Pair], dark: Stack, bright: Stack) -> Session:
-        """Return the statistics of all sets, and of the dark and bright stack, for figures."""
         return Session(
             self.shape, self.light, self.exposure_s, pairs_of([*pairs]), self.dark, self.bright, dark, bright,
             self.saturates, self.sensor.bits is not None,
@@ -150,7 +139,7 @@ class Frames:
         return self.session(pairs, *stacks)
 
     def expected_pair(self, index: int, part: float = 1.0) -> Pair:
-        """Return the expected statistics of a set whose light is a `part` of the nominal light."""
+        """Return the expected statistics of a set at a part of its light."""
         sensor, light = self.sensor, np.array([part * self.electrons[index], 0.0])
         response = math.hypot(*sensor.response_parts) if light[0] > MOST_FITTED * capacity_of(sensor) else 0.0
         moments = average_moments(light, float(self.exposure_s[index]), self.equal, self.spread, response)[:2]
@@ -161,7 +150,7 @@ class Frames:
 
     @property
     def equal(self) -> SensorModel:
-        """The sensor with equal pixels of the same mean dark current, lit evenly."""
+        """The sensor with equal pixels of the same mean dark current."""
         names = (
             *(f"dsnu_{part}_e" for part in SPLIT[1:]), *(f"prnu_{part}" for part in SPLIT[1:]),
             "dark_current_spread_e_per_s", "hot_pixels", "hot_dark_current_e_per_s", "dead_pixels", "crosstalk",

@@ -1,8 +1,4 @@
-"""A real camera's flat and dark frames: their statistics, and tests whether a camera can have taken them.
-
-Frames that show nothing of the camera are refused: unequal light in a set, saturation, smoothing, scaling. Every other
-misfit with the camera that was found is reported with its size.
-"""
+"""A real camera's flat and dark frames: their statistics, and tests whether a camera can have taken them."""
 
 from __future__ import annotations
 
@@ -24,35 +20,33 @@ from mitsim.sensor.camera_fit import FoundCamera, Places, saturation_of
 from mitsim.sensor.emva import LEAST_DARK, LINEAR, MOST_FITTED, Alike, alike
 
 _LEAST_SIDE = 16
-"""Rows and columns that separate a frame's rows, columns and surface."""
 _SURE = 6.0
 """Standard errors from which a difference is not chance, among thousands of comparisons."""
 _UNEQUAL = 0.1
 """Standard deviation of the light in a set from which the lamp was off or the exposure was different."""
 _WHITE = 0.02
-"""Correlation of neighbours' noise that charge between pixels may cause (1 to 2 % in infrared arrays)."""
+"""Correlation of neighbours' noise that charge between pixels may cause."""
 _OUT, _SWAPPED = 0.02, 1.5
 """Response relative to the other sets from which a set is reported, and from which frames are refused."""
 _MIXED, _SCALED, _PEAK = 0.1, 0.99, 0.6
 """Limits of refusals: correlation of neighbours' noise, amplitude of a pattern in the codes, and the least fraction of
-the brightest signal with the largest variance (cameras have 0.8 or more, and a soft full well somewhat less)."""
+the brightest signal with the largest variance.
+"""
 _COMB, _EVEN, _STEADY, _STRAIGHT, _STILL, _DARK_CUT, _DEAD = 0.05, 0.03, 0.01, 0.05, 0.1, 0.01, 0.01
-"""Limits of remarks: amplitude of a pattern in the codes, unevenness (EMVA 1288 4.0), scatter of the light, misfit of
-a variance, misfit of a dark mean [DN], unexplained fraction of dark readings at 0, and fraction of dead pixels."""
+"""Limits of remarks: pattern in the codes, unevenness (EMVA 1288 4.0), scatter of the light, misfits of a variance and
+of a dark mean [DN], unexplained dark readings at 0, and dead pixels.
+"""
 _FLOATS = 9
 """Arrays of the frame's size in double precision that a set needs."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlatSet:
-    """Frames that were taken alike, as listed, and their statistics."""
-
     flats: FlatFrames
     listed: DarkSet
     taken: Alike
 
     def mean_image(self) -> FloatArray:
-        """Return the mean (M, N) [DN] of the frames, which are read again."""
         total = 0.0 + sum(
             read_image(self.flats.folder / name, self.flats.wanted).astype(np.float64) for name in self.listed.files
         )
@@ -60,19 +54,11 @@ class FlatSet:
 
     @property
     def name(self) -> str:
-        """Names of the first and the last file."""
         return f"{self.listed.files[0]} to {self.listed.files[-1]}"
 
 
 def read_sets(flats: FlatFrames, job: Job) -> list[FlatSet]:
-    """Compute the statistics of every set, frame by frame.
-
-    Raises
-    ------
-    MitsimError
-        If frames cannot be read or differ in size, the list does not explain their numbers, frames of a set are not
-        alike, a frame occurs twice, or no set is below saturation.
-    """
+    """Compute the statistics of every set; MitsimError if the frames show nothing of the camera."""
     where = f"frames {flats.folder}"
     shape = image_size(flats.folder / flats.sets[0].files[0], flats.wanted)
     if min(shape) < _LEAST_SIDE:
@@ -144,16 +130,13 @@ def _faults(sets: Sequence[FlatSet]) -> Iterator[str]:
 
 
 def _altered(sets: Sequence[FlatSet], taken: Sequence[Alike], used: Sequence[Alike]) -> list[tuple[bool, bool, str]]:
-    """Return signs that numbers were altered or sets exchanged: seen, so strong that frames are refused, and the text.
-
-    `taken` are statistics of all sets, and `used` those of sets whose noise is examined.
-    """
+    """Return signs that numbers were altered or sets exchanged: seen, refused, and the text."""
     amplitude, period, combed = _comb(taken)
     noises, means = [_correlation(each) for each in used], [each.mean for each in taken]
     smooth, smoothed = max(noises), sets[[*taken].index(used[int(np.argmax(noises))])].name
     part = (means[saturation_of(taken)[0]] - min(means)) / (max(means) - min(means))
     return [
-        (amplitude > _COMB, amplitude > _SCALED, f"codes are missing or too frequent with a period of {period:.3g} DN, "
+        (amplitude > _COMB, amplitude > _SCALED, f"codes are missing or too frequent with a period of {period:.2g} DN, "
          f"by an amplitude of {amplitude:.2g} in {sets[combed].name}: numbers were scaled after the ADC, or a bit of "
          "it is stuck; gain, noise, black level and dsnu_* are of those numbers; give raw frames, or divide by the "
          "period and state fewer bits"),
