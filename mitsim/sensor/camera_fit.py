@@ -24,13 +24,13 @@ from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
 
 NAMES = ("gain", "read", "black", "dark", "response", "bend", "bend_2", "spatial")
-"""Units: DN/e-, DN, DN, e-/s, photoelectrons per unit of light, 1, 1, and DN^2 (variance of the pixels' offsets)."""
+"""Units: DN/e-, DN, DN, e-/s, e- per unit of light, 1, 1, and DN^2 (variance of offsets)."""
 _DARK = NAMES.index("dark")
 _STEPS = np.array([1e-3, 1e-2, 0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-2])
 """Relative and least steps of the numerical derivatives."""
 _LEAST_STEPS = np.array([1e-15, 1e-3, 1e-2, 1e-4, 1e-15, 1e-3, 1e-3, 1e-5])
 _STARTS = (1.0, 0.9, 0.8, 0.65, 0.5)
-"""Fractions of the straight lines' gain to start from: rounding of little noise raises variances up to twice."""
+"""Rounding of little noise raises variances up to twice."""
 _TRIED, _SOLVED = 10, 25
 """Evaluations of a trial and of a solution."""
 _DITHERED = 0.44
@@ -40,19 +40,14 @@ _NODES = 9
 _AT_END = 1e-4
 """Fraction of numbers at the ADC's end from which a set is not below saturation."""
 _STEADY = 1e-5
-"""Least relative scatter of a lamp."""
 _CHANCE = 1e-3
 _FITS = 2.0
 """Reduced chi-square from which other starts of the fit are tried."""
 _TELLS = 9.0
 """Difference of chi-square that decides between a bent camera and a drifting lamp: three standard errors."""
 _SATURATED, _FALLEN = 0.05, 0.5
-"""Fractions of the largest variance of light below which the brightest set is saturated, without and with a second set
-that is as bright.
-"""
 _DEAD = 0.5
 _HOT = 8.0
-"""Robust deviations above the median dark current."""
 _SURE = 4.0
 """Standard errors from which an effect enters the camera."""
 _UNEVEN, _MOST_UNEVEN = 0.01, 0.25
@@ -116,8 +111,8 @@ def average_moments(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean and variance [DN] averaged over different pixels, and the variance of their means over pixels.
 
-    An offset acts as another black level. Offset and response share the nodes of a Gauss-Hermite sum, because offsets
-    matter in the dark and responses at saturation. `spread` and `response` are their standard deviations [DN] and [1].
+    Offset (`spread` [DN], another black level) and relative `response` share the nodes of a Gauss-Hermite sum, because
+    offsets matter in the dark and responses at saturation.
     """
     light = np.asarray(electrons, dtype=np.float64)
     if not spread and not response:
@@ -140,14 +135,12 @@ class Transfer:
 
     Attributes
     ----------
-    values, covariance : (8,) numbers by `NAMES` and (8, 8) covariance; 0 if not fitted.
-    saturation_dn, saturates : mean of saturated frames [DN], if any; True if the full well causes it, and not the ADC.
-    lamp : relative scatter of the light of sets about their exposures.
-    light : "undecided" if means bend with exposure and variances do not show whether camera or lamp is the cause.
-    off : (sets, 2) deviation of each set's mean and variance in standard errors; NaN for unused sets.
-    scatter : relative deviation of the light from the fit.
-    worse : reduced chi-square of all sets, or of lit variances if larger, because readings of one code always fit.
-    light_fits : True if the light is off by no more than its known error.
+    values, covariance : numbers by `NAMES` and their covariance; 0 if not fitted.
+    saturation_dn, saturates : mean of saturated frames [DN]; True if the full well causes it, and not the ADC.
+    lamp, scatter : relative scatter of the light, assumed and found.
+    light : "undecided" if means bend and variances do not show whether camera or lamp is the cause.
+    off : (sets, 2) deviation of mean and variance in standard errors; NaN for unused sets.
+    worse : reduced chi-square, also of lit variances, because readings of one code always fit.
     """
 
     values: FloatArray
@@ -379,14 +372,8 @@ def find_camera(
 ) -> FoundCamera:
     """Find the camera that explains frames.
 
-    Hot and dead pixels are counted and then replaced by other pixels, so that they affect no other number.
-
-    Parameters
-    ----------
-    taken : sets of frames, some in the dark with the exposures of the lit ones.
-    images : mean image of a set.
-    stated : facts that frames do not show.
-    again : statistics of the same sets with some pixels replaced.
+    Hot and dead pixels are counted and then replaced, so that they affect no other number. `images` returns the mean
+    image of a set, and `again` statistics of the sets with some pixels replaced.
     """
     return Pixels(taken, images, again).camera(stated)
 
@@ -394,8 +381,8 @@ def find_camera(
 class Pixels:
     """Differences between pixels, and the fields of the camera that follow.
 
-    `taken` are the sets with defects replaced, `uneven` and `surface` the range of the light over the frame and its
-    relative variances by row, column and pixel, and `filled` the fraction of pixels that are full in the dark.
+    `uneven` and `surface` are the range of the light over the frame and its relative variances by row, column and
+    pixel.
     """
 
     def __init__(self, taken: Sequence[Alike], images: Images, again: Callable[[Places], Sequence[Alike]]) -> None:

@@ -28,7 +28,7 @@ from mitsim.devices.sensor import SensorModel
 
 Digital = FloatArray | npt.NDArray[np.uint32]
 _MANY = 64.0
-"""Mean electrons from which counts are quantiles of normal deviates; 3 of a million draws differ from Poisson's law."""
+"""Mean electrons from which counts are quantiles of normal deviates."""
 
 
 def electrons_from_irradiance(
@@ -67,11 +67,8 @@ def expose(
 ) -> Digital:
     """Draw one noisy frame: uint32 DN, or float64 if the model has no bits.
 
-    Parameters
-    ----------
-    expected_electrons : photoelectrons of any shape; (rows, columns) if pixels differ or share noise or light.
-    exposure_s, model : exposure [s] and sensor.
-    shot_rng, read_rng : separate streams, so that one noise can be switched off without a change of the other.
+    `expected_electrons` is (rows, columns) if pixels differ or share noise or light. The streams are separate, so that
+    one noise can be switched off without a change of the other.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     shape = np.shape(light)
@@ -114,14 +111,10 @@ _MOST_MAPS = 2
 
 @dataclass(frozen=True, eq=False)
 class Specimen:
-    """Fixed differences between the pixels of one camera; None without differences.
+    """Fixed differences between the pixels of one camera, (rows, columns) each; None without differences.
 
-    Attributes
-    ----------
-    offset_e : (rows, columns) reading beyond the black level [electrons]; mean 0.
-    response : (rows, columns) relative to the mean of undamaged pixels; 0 is dead.
-    dark_e_per_s : (rows, columns) dark current at the sensor's temperature.
-    hot, dead : numbers of superpixels with a hot and with a dead pixel.
+    `offset_e` is the reading beyond the black level, `response` is relative to undamaged pixels, and `hot` and `dead`
+    count superpixels.
     """
 
     offset_e: Map | None
@@ -291,8 +284,7 @@ def _electron_counts(expected: Any, few: Any, z: Any) -> Any:
 def poisson_count(expected: Any, z: Any) -> Any:
     """Return the Poisson count of mean ``expected`` (64 or more) at the quantile of the normal deviate ``z``.
 
-    Giles (2016, ACM Transactions on Mathematical Software 42, algorithm 955, Q_N2). Its total variation from the law is
-    3e-6 at 64, 2e-7 at 256 and 1e-8 at 1000.
+    Giles (2016, ACM Transactions on Mathematical Software 42, algorithm 955, Q_N2); total variation 3e-6 at 64.
     """
     of, square = operations(expected), z * z
     root, part = of.sqrt(expected), 1 / expected
@@ -392,13 +384,8 @@ def by_pixel(
 ) -> npt.NDArray[Any]:
     """Apply ``stages`` to every pixel and return (pixels,) results.
 
-    Parameters
-    ----------
-    stages : function of a namespace of the numbers, a value of each array, and a normal deviate of each stream.
-    numbers : values that all pixels share; other values need no new kernel.
-    arrays : (pixels,) each, at least the first; or floats that all pixels share; None stays None.
-    streams : each gives the key of its deviates in one draw.
-    dtype : np.uint32 or np.float64.
+    ``stages`` is a function of a namespace of the ``numbers`` (which all pixels share), a value of each of the
+    ``arrays`` ((pixels,), or shared floats), and a normal deviate of each of the ``streams``.
     """
     keys = [int(stream.bit_generator.random_raw()) for stream in streams]
     size = len(arrays[0])  # type: ignore[arg-type]

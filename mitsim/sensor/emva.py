@@ -70,12 +70,9 @@ class Session:
 
     Attributes
     ----------
-    shape : rows and columns of the frames.
-    photons : (S,) mean photons on a pixel, or light in any unit; 0 in the dark.
-    exposure_s : (S,) exposure of each set [s].
+    photons, exposure_s : (S,) photons on a pixel, or light in any unit, and exposure [s].
     pairs : (..., S) means and temporal variances.
     dark, bright : sets for nonuniformity, in the dark and near half of saturation.
-    dark_stack, bright_stack : spatial statistics of these sets.
     saturates, rounded : True if the brightest set is saturated, and if the frames are whole numbers.
     """
 
@@ -114,15 +111,12 @@ class Alike:
 
     Attributes
     ----------
-    pair, stack : temporal and spatial statistics.
     variance_error : standard error of the temporal variance [DN^2].
     cut : fractions of all numbers that are 0, and that are the largest code.
     flicker : standard deviation of the frames' means beyond noise [DN].
     neighbours : correlation of the noise of neighbours in a row and in a column.
-    comb : largest amplitude of a periodic pattern in the histogram of codes, 1 if every other code is missing, and its
-        period [DN].
+    comb : amplitude and period [DN] of a pattern in the codes; 1 if every other code is missing.
     digests : checksum of each frame; empty for a frame with nearly all pixels at one code.
-    light, exposure_s : light on a pixel, in photons or in any unit, and exposure [s].
     """
 
     count: int
@@ -159,8 +153,8 @@ def alike(
 ) -> Alike:
     """Compute statistics of frames (M, N) [DN] that were taken alike, one frame at a time.
 
-    The temporal variance is that of each pixel about its mean, after each frame's mean is subtracted. For two frames it
-    is <(a - b)^2>/2 - (<a> - <b>)^2/2. `largest` is the last code of the ADC.
+    The temporal variance of two frames is <(a - b)^2>/2 - (<a> - <b>)^2/2, so that fixed patterns and drift have no
+    effect.
     """
     means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
     codes, digests = np.zeros(_CODES), list[bytes]()

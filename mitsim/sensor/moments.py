@@ -25,9 +25,7 @@ from mitsim.sensor.chain import (
 )
 
 _FEW = 64.0
-"""Electrons below which moments are summed count by count."""
 _SOME = 1e4
-"""Electrons below which moments are summed over the counts that occur. Above, 129 counts represent all to 1 %."""
 _CAN_SATURATE = 1e-3
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
@@ -104,17 +102,8 @@ def frame_moments(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (DN) and variance (DN^2) of the output of `expose` for one specimen (EMVA 1288 4.0, photon transfer).
 
-    Fixed patterns move means. The variance includes row noise, which is the covariance of two pixels of a row.
-
-    Parameters
-    ----------
-    expected_electrons : photoelectrons of any shape, or (rows, columns) as for `expose`.
-    exposure_s, model : exposure [s] and sensor.
-
-    Notes
-    -----
-    Near an end of the ADC (eight deviations), or if too little noise dithers its codes, the moments are those of
-    rounded and clipped numbers.
+    Fixed patterns move means. The variance includes row noise, which is the covariance of two pixels of a row. Near an
+    end of the ADC, or if too little noise dithers its codes, the moments are those of rounded and clipped numbers.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     expected = np.asarray(light + dark)
@@ -362,8 +351,7 @@ def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tup
 def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
     """Return moments of a rounded normal signal for deviations of at least 2 DN.
 
-    The sum over codes of P(signal > code - 1/2) is the midpoint rule for a closed-form integral. Euler and Maclaurin's
-    first term gives 1/12 DN^2 if nothing is clipped.
+    The sum over codes is the midpoint rule for a closed-form integral, with Euler and Maclaurin's first term.
     """
     # Noise far wider than the ADC leaves its two ends, whatever its width; and 40 deviations beyond an end are enough.
     narrower = np.minimum(deviation, 1e4 * largest)

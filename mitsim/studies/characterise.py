@@ -51,12 +51,8 @@ _WHOLE = 1e4
 class EmvaFigure:
     """A figure of EMVA 1288, which `mitsim.sensor.emva.figures` finds by its name.
 
-    Attributes
-    ----------
-    symbol, unit : as in the standard.
-    set : value that the camera of some frames sets.
-    root : True if a variance is found, which may be negative, and its root is shown.
-    method : True if no file sets the figure, because it depends on the steps of light.
+    `set` is the value that a camera sets, `root` is True if a variance is found, and `method` if no file sets the
+    figure.
     """
 
     symbol: str

@@ -39,8 +39,7 @@ class Frames:
 
     Attributes
     ----------
-    light, electrons : (S,) light on a pixel, in photons or in any unit, and in photoelectrons; 0 in the dark.
-    exposure_s, counts : (S,) exposure [s] and number of the frames of each set.
+    light, electrons : (S,) light on a pixel, in any unit, and in photoelectrons; 0 in the dark.
     dark, bright : sets for nonuniformity.
     lamp : relative errors of the light of each set, and of all sets.
     surface : relative variances of uneven light by row, column and pixel.
