@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from mitsim.core.configuration import shipped_path
+from mitsim.devices.flatlist import Procedure
 from mitsim.devices.sensor import SensorModel, load_sensor
-from mitsim.studies.characterise import characterise
-from mitsim.studies.emva_options import Procedure
-from mitsim.studies.emva_results import Row
+from mitsim.studies.characterise import Row, characterise
 
 SHOWN = {"system_gain": "K [DN/e-]", "quantum_efficiency": "eta", "dark_noise": "sigma_d [e-]", "full_well": "F [e-]"}
 """Figures that have a column of their own."""

@@ -56,9 +56,9 @@ if TYPE_CHECKING:
     from mitsim.light.light import SampledLight
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
+    from mitsim.studies.characterise import Characterisation
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.emva_options import ProcedureKeys
-    from mitsim.studies.emva_results import Characterisation
     from mitsim.studies.framework.experiment import Scope
     from mitsim.studies.framework.run import StudyResult
 
@@ -549,7 +549,7 @@ def characterise(
     >>> import mitsim as ms
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
-    from mitsim.studies.emva_options import capacity_of, efficiency_of
+    from mitsim.devices.flatlist import capacity_of, load_flats
     from mitsim.studies.framework.run import check_study_folder
 
     asked = Procedure(**options)
@@ -559,8 +559,6 @@ def characterise(
                 "characterise: got no camera; give one to simulate, or as frames the folder of a real one"
             )
         asked.refuse(asked.given, "on frames of a real camera")
-        from mitsim.devices.flatlist import load_flats
-
         listed = load_flats(Path(frames))
         if output is not None:
             check_study_folder(output, "characterise")
@@ -574,7 +572,7 @@ def characterise(
         asked.refuse(["wavelength"], f"on {camera}, whose file has no curve of quantum efficiency")
     done = Procedure(frames=frames, **options)
     capacity_of(sensor)
-    efficiency_of(sensor, done)
+    done.efficiency(sensor)
     if output is not None:
         check_study_folder(output, "characterise")
     from mitsim.studies.characterise import characterise as run_characterise

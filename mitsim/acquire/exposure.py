@@ -26,9 +26,8 @@ from mitsim.light.settings import Estimate
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.optics.speckle import add_speckle
-from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose
+from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose, specimen
 from mitsim.sensor.moments import mean_variance, saturated_pixels
-from mitsim.sensor.specimen import specimen
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 

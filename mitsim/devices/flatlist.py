@@ -1,10 +1,11 @@
-"""What frames of a camera under even light and in the dark are of: a folder with its list in, checked sets of them out.
+"""Frames that characterise a camera: the checked list of a real camera's frames, or the sizes of a simulation.
 
-The list is `session.toml` or `session.json`, as that of a calibration; none of its frames is opened.
+The list is `session.toml` or `session.json`, as that of a calibration. No frame is opened, and numpy is not imported.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,9 +17,25 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Raw, Wanted
 from mitsim.core.manifests import FileName
 from mitsim.devices.framelist import read_list
+from mitsim.devices.sensor import SensorModel
 
 _MOST_SETS, _MOST_FRAMES = 4096, 10_000
 """Of a list, and frames of a set: ten times what EMVA 1288's longest procedures take."""
+_LIMITS = {"pixels": (32, 4096), "steps": (20, 1000), "frames": (2, 10_000)}
+"""Below 32 rows a row's part is known to a quarter. EMVA 1288 takes at least 50 steps and 16 frames."""
+
+
+def capacity_of(sensor: SensorModel) -> float:
+    """Return the electrons that saturate a pixel: its full well, or the ADC's end; MitsimError without either."""
+    full = sensor.superpixel_full_well_e
+    if sensor.largest_dn is not None:
+        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
+    if not math.isfinite(full):
+        raise MitsimError(
+            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
+            "give full_well_e or bits"
+        )
+    return full
 
 
 class DarkSet(Configuration):

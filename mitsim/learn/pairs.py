@@ -178,7 +178,7 @@ class _Maker:
     def __init__(self, opening: Opening, asked: PairsRequest, job: Job) -> None:
         self._opening, self._asked, self._job = opening, asked, job
         self._groups, seed = asked.groups(), asked.capture.seed
-        self._pictures = DrawnPictures(seed) if asked.folder is None else FolderPictures(asked.folder, seed)
+        self._pictures = DrawnPictures(seed) if asked.pictures is None else FolderPictures(Path(asked.pictures), seed)
         self._open: tuple[dict[str, str], Bench, Plan] | None = None
         self._white: tuple[Bench, WhitePrints] | None = None
         self.bench, self._plan = self._bench_of(0)

@@ -42,8 +42,7 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
 from mitsim.report import EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
-from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.sensor.specimen import response_variance
+from mitsim.sensor.chain import electrons_from_irradiance, response_variance
 
 # -------- Light of a scene and a camera in
 

@@ -1,1 +1,1 @@
-"""The image sensor: irradiance in, digital numbers out (EMVA 1288 release 4.0)."""
+"""The image sensor: irradiance, noise, digital numbers, and how they are measured (EMVA 1288 release 4.0)."""

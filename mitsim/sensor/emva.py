@@ -1,8 +1,6 @@
-"""Flat and dark frames of a camera in, the figures of EMVA 1288 release 4.0 out; frames may be real or simulated.
+"""The figures of EMVA 1288 release 4.0, from statistics of flat and dark frames, real or simulated.
 
-Photon transfer: pairs of flat frames over a ladder of light tell the system gain, quantum efficiency, saturation and
-linearity; pairs of dark frames over a series of exposures the dark current; stacks of dark and of half-bright frames
-the nonuniformity, split into rows, columns and pixels. Statistics may have leading axes: many sessions at once.
+Statistics may have leading axes, for many sessions at once.
 """
 
 from __future__ import annotations
@@ -20,28 +18,27 @@ from mitsim.core.arrays import FloatArray
 QUANTISATION = 1 / 12
 """Variance of rounding [DN^2] (EMVA 1288, "noise model")."""
 LEAST_DARK = 0.24
-"""Variance [DN^2] of dark frames below which rounding hides their noise: it counts as this much, an upper limit of
-0.4 DN for the noise (EMVA 1288 4.0, "limit for minimal temporal standard deviation")."""
+"""Least variance [DN^2] of dark frames, because rounding hides less (EMVA 1288 4.0, "minimal temporal
+standard deviation").
+"""
 HIDDEN = 1e-3
-"""Variance [DN^2] of all dark frames below which one reading in a thousand is another code, and none tells a current:
-chosen below what any camera of 0.2 DN of noise has."""
+"""Variance [DN^2] of dark frames below which one reading in a thousand is another code."""
 MOST_FITTED, LINEAR = 0.7, (0.05, 0.95)
-"""Parts of saturation: gain and responsivity are fitted up to 70 %, linearity from 5 to 95 % (EMVA 1288 4.0)."""
+"""Fractions of saturation for the fit of the gain and for linearity (EMVA 1288 4.0)."""
 LINE = 3
-"""Least points of a line that tell how straight it is."""
+"""Least number of points that show how straight a line is."""
+SPLIT = ("total", "row", "column", "pixel")
 _CODES = 65_536
-"""Codes of a histogram; numbers of more bits are folded, which keeps the frequencies that rational factors make."""
+"""Larger codes are folded, which keeps the frequencies of rational factors."""
 _BLURRED = 0.52
 """Standard deviations of noise in a period from which an even histogram holds less than 5e-3 of that period."""
 _QUIET = 0.99
-"""Part of a frame's pixels of one code from which two frames may be equal by chance."""
-SPLIT = ("total", "row", "column", "pixel")
-"""Parts of a nonuniformity."""
+"""Fraction of pixels at one code from which two frames may be equal by chance."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Of two frames under the same light: mean (...) [DN], temporal variance, and its part that rows share [DN^2]."""
+    """Mean [DN], temporal variance [DN^2] and its part that rows share, of frames under the same light, all (...)."""
 
     mean: FloatArray
     variance: FloatArray
@@ -50,17 +47,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Stack:
-    """Of the mean of L frames, all (...).
-
-    Attributes
-    ----------
-    mean
-        of all pixels [DN].
-    total
-        spatial variance of all pixels [DN^2], as all variances without what is left of temporal noise.
-    rows, columns
-        variance of the means of rows, and of columns.
-    """
+    """Mean [DN] of averaged frames, and spatial variances [DN^2] of pixels, of the means of rows and of columns."""
 
     mean: FloatArray
     total: FloatArray
@@ -68,10 +55,9 @@ class Stack:
     columns: FloatArray
 
     def parts(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Variances (total, row, column, pixel) [DN^2] for frames of a ``shape`` of M rows and N columns.
+        """Return the variances (total, row, column, pixel) [DN^2] for frames of M rows and N columns.
 
-        A pixel's part is left in the means of rows as 1/N of it, and of columns as 1/M (EMVA 1288 4.0, "row, column and
-        pixel spatial variances").
+        The means of rows contain 1/N of a pixel's part, those of columns 1/M (EMVA 1288 4.0).
         """
         m, n = shape
         pixel = m * n / (m * n - m - n) * (self.total - self.rows - self.columns)
@@ -80,26 +66,14 @@ class Stack:
 
 @dataclass(frozen=True)
 class Session:
-    """What the frames of one characterisation say, in S sets that were taken alike.
+    """Statistics of one characterisation: S sets of frames.
 
     Attributes
     ----------
-    shape
-        rows and columns of the frames.
-    photons
-        (S,) mean photons that fall on a pixel, or light in any unit; 0 in the dark.
-    exposure_s
-        (S,) of each set [s].
-    pairs
-        (..., S) means and temporal variances.
-    dark, bright
-        which sets tell nonuniformity: one in the dark, one near half of saturation.
-    dark_stack, bright_stack
-        of these.
-    saturates
-        whether the brightest set is saturated.
-    rounded
-        whether the frames are whole numbers.
+    photons, exposure_s : (S,) photons on a pixel, or light in any unit, and exposure [s].
+    pairs : (..., S) means and temporal variances.
+    dark, bright : sets for nonuniformity, in the dark and near half of saturation.
+    saturates, rounded : True if the brightest set is saturated, and if the frames are whole numbers.
     """
 
     shape: tuple[int, int]
@@ -115,54 +89,34 @@ class Session:
 
     @property
     def lit(self) -> npt.NDArray[np.intp]:
-        """Sets under light, by light."""
         order = np.argsort(self.photons, kind="stable")
         return np.asarray(order[self.photons[order] > 0])
 
     @property
     def unlit(self) -> npt.NDArray[np.intp]:
-        """Sets in the dark, by exposure."""
         order = np.argsort(self.exposure_s, kind="stable")
         return np.asarray(order[self.photons[order] == 0])
 
-    @property
-    def partners(self) -> npt.NDArray[np.intp]:
-        """For each set under light, one in the dark of its exposure: that of the nonuniformity where it is."""
-        unlit = np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
-        off = np.abs(self.exposure_s[unlit] - self.exposure_s[self.lit][:, None])
-        return np.asarray(unlit[off.argmin(axis=1)])
-
     def transfer(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the sets under light, by light: photons (L,), and signal (..., L) [DN] and variance
-        [DN^2] less the dark."""
-        lit, dark = self.lit, self.partners
+        """Return photons (L,) of lit sets, and their signal and variance (..., L) less the dark of their exposure."""
+        lit, unlit = self.lit, np.array([self.dark, *(index for index in self.unlit if index != self.dark)])
+        dark = unlit[np.abs(self.exposure_s[unlit] - self.exposure_s[lit][:, None]).argmin(axis=1)]
         mean, variance = self.pairs.mean, self.pairs.variance
         return self.photons[lit], mean[..., lit] - mean[..., dark], variance[..., lit] - variance[..., dark]
 
 
 @dataclass(frozen=True, eq=False)
 class Alike:
-    """What frames say that were taken alike: same light, same exposure.
+    """Statistics of frames that were taken alike.
 
     Attributes
     ----------
-    count, shape
-        of the frames.
-    pair, stack
-        temporal and spatial statistics.
-    variance_error
-        standard error of the temporal variance [DN^2], from how it varies over the pixels.
-    cut
-        parts of all numbers that are 0, and that are the largest code.
-    flicker
-        standard deviation of the frames' means beyond what noise makes [DN].
-    neighbours
-        correlation of the noise of neighbours in a row, and in a column: 0 where electrons are counted.
-    comb
-        largest amplitude of a periodic pattern in the histogram of codes, of periods that noise blurs in an even ADC,
-        and that period [DN]. Every other code missing has an amplitude of 1.
-    digests
-        checksum of each frame; empty for a frame with nearly all pixels at one code.
+    variance_error : standard error of the temporal variance [DN^2].
+    cut : fractions of all numbers that are 0, and that are the largest code.
+    flicker : standard deviation of the frames' means beyond noise [DN].
+    neighbours : correlation of the noise of neighbours in a row and in a column.
+    comb : amplitude and period [DN] of a pattern in the codes; 1 if every other code is missing.
+    digests : checksum of each frame; empty for a frame with nearly all pixels at one code.
     """
 
     count: int
@@ -173,29 +127,34 @@ class Alike:
     cut: tuple[float, float]
     flicker: float
     neighbours: tuple[float, float]
-    comb: tuple[float, float] = (0.0, 1.0)
-    digests: tuple[bytes, ...] = ()
+    comb: tuple[float, float]
+    digests: tuple[bytes, ...]
+    light: float
+    exposure_s: float
+
+    @property
+    def mean(self) -> float:
+        return float(self.pair.mean)
+
+    @property
+    def variance(self) -> float:
+        return float(self.pair.variance)
 
     @property
     def mean_error(self) -> float:
-        """Standard error of the mean that noise makes [DN]."""
+        """Standard error of the mean due to noise [DN]."""
         rows = max(float(self.pair.rows), 0.0)
-        own = max(float(self.pair.variance) - rows, 0.0)
+        own = max(self.variance - rows, 0.0)
         return math.sqrt((own / math.prod(self.shape) + rows / self.shape[0]) / self.count)
 
 
-def alike(frames: Iterable[npt.ArrayLike], largest: float = math.inf) -> Alike:
-    """Statistics of ``frames`` (M, N) [DN] that were taken alike; they are looked at one after the other.
+def alike(
+    frames: Iterable[npt.ArrayLike], largest: float = math.inf, light: float = 0.0, exposure_s: float = 0.0
+) -> Alike:
+    """Compute statistics of frames (M, N) [DN] that were taken alike, one frame at a time.
 
-    The temporal variance is that of each pixel about its mean, of frames less their own means: free of all that is
-    fixed in space, and of a drift of the light. Of two frames it is <(a - b)^2>/2 - (<a> - <b>)^2/2.
-
-    Parameters
-    ----------
-    frames
-        two or more; ValueError for fewer.
-    largest
-        code of the ADC's end.
+    The temporal variance of two frames is <(a - b)^2>/2 - (<a> - <b>)^2/2, so that fixed patterns and drift have no
+    effect.
     """
     means, lines, ends = list[float](), list[FloatArray](), np.zeros(2)
     codes, digests = np.zeros(_CODES), list[bytes]()
@@ -226,25 +185,23 @@ def alike(frames: Iterable[npt.ArrayLike], largest: float = math.inf) -> Alike:
     about = first + total / count
     about -= about.mean()
     parts = np.square(about).sum() / (m * n - 1), *(np.square(about.mean(axis=k)).mean() for k in (1, 0))
-    stack = Stack(
-        pair.mean, *(np.asarray(part - variance / count / k) for part, k in zip(parts, (1, n, m), strict=True))
-    )
+    left = (np.asarray(part - variance / count / k) for part, k in zip(parts, (1, n, m), strict=True))
     rows = max(shared, 0.0)
-    # Of the pixels' variances, which rows that share noise move together (see `mitsim.studies.emva_frames`).
+    noise = math.sqrt(max(variance - rows, 0.0))
+    # Spread over the pixels' variances, which noise that rows share moves together (see `mitsim.studies.emva_frames`).
     spread = float(own.var()) + (4 * max(variance - rows, 0.0) * rows + 2 * rows**2 * n) / (count - 1)
     drift = float(np.var(means, ddof=1)) - (variance - rows) / (m * n) - rows / m
     return Alike(
-        count, (m, n), pair, stack, math.sqrt(spread / (m * n)), (ends[0] / count / m / n, ends[1] / count / m / n),
-        math.sqrt(max(drift, 0.0)), _neighbours(difference),
-        _comb(codes, math.sqrt(max(variance - rows, 0.0))) if math.isfinite(largest) else (0.0, 1.0), tuple(digests),
+        count, (m, n), pair, Stack(pair.mean, *left), math.sqrt(spread / (m * n)),
+        (ends[0] / count / m / n, ends[1] / count / m / n), math.sqrt(max(drift, 0.0)), _neighbours(difference),
+        _comb(codes, noise) if math.isfinite(largest) else (0.0, 1.0), tuple(digests), light, exposure_s,
     )  # fmt: skip
 
 
 def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
-    """Return amplitude and period [DN] of the strongest pattern in a histogram (codes,) of readings with a ``noise``.
+    """Return amplitude and period [DN] of the strongest pattern in a histogram (codes,) of readings with noise.
 
-    The characteristic function of readings with noise vanishes at high frequencies. Codes that never occur or occur
-    too often, as after scaling or with a stuck bit, bring it back.
+    The characteristic function vanishes at high frequencies, unless codes never occur or occur too often.
     """
     first = math.ceil(_BLURRED / noise * len(codes)) if noise else len(codes)
     if first > len(codes) // 2:
@@ -255,7 +212,6 @@ def _comb(codes: FloatArray, noise: float) -> tuple[float, float]:
 
 
 def _neighbours(noise: FloatArray) -> tuple[float, float]:
-    """Correlation of neighbours in a row, and in a column, of ``noise`` less what rows and columns share."""
     noise = noise - noise.mean(axis=1, keepdims=True)
     noise -= noise.mean(axis=0)
     power = float(np.square(noise).mean())
@@ -265,52 +221,47 @@ def _neighbours(noise: FloatArray) -> tuple[float, float]:
 
 
 def pairs_of(pairs: Sequence[Pair]) -> Pair:
-    """``pairs`` side by side, (count,) each."""
     return Pair(*(np.array([getattr(pair, name) for pair in pairs]) for name in ("mean", "variance", "rows")))
 
 
 def figures(session: Session) -> dict[str, FloatArray]:
-    """The figures (...) of a ``session``, by name; variances may come out below zero, where there is nothing to find.
+    """Compute the figures (...) of a session by name.
 
-    `system_gain` [DN/e-], `quantum_efficiency` [e-/photon], `dark_noise` [e-], `saturation_capacity` (at the largest
-    variance) and `full_well` (of the brightest frames) [e-], `linearity_min` and `linearity_max` [1], `dark_current`
-    (by means) and `dark_current_by_variance` [e-/s]; as variances `row_noise` [e-^2], `dsnu_PART` [e-^2] and
-    `prnu_PART` [1] for each PART of :data:`SPLIT`. What the frames do not tell is left out: saturation where nothing is
-    saturated, linearity of fewer than three steps, dark current of one exposure or all one code.
+    `row_noise` [e-^2], `dsnu_PART` [e-^2] and `prnu_PART` [1] are variances, which may be negative. `dark_current`
+    follows from means, `saturation_capacity` from the largest variance and `full_well` from the brightest frames.
+    Figures that the frames do not determine are left out.
     """
     photons, signal, noise = session.transfer()
-    variance, unlit = session.pairs.variance, session.unlit
-    dark = Pair(*(getattr(session.pairs, name)[..., session.dark] for name in ("mean", "variance", "rows")))
+    means, variance, unlit = session.pairs.mean, session.pairs.variance, session.unlit
+    full = np.full(1, np.inf)
     peak = variance[..., session.lit].argmax(axis=-1)
-    full = np.take_along_axis(signal, peak[..., None], axis=-1) if session.saturates else np.full(1, np.inf)
+    if session.saturates:
+        full = np.take_along_axis(signal, peak[..., None], axis=-1)
     fitted = signal <= MOST_FITTED * full
     gain = _slope(signal, noise, fitted)
     efficiency = _slope(np.broadcast_to(photons, signal.shape), signal, fitted) / gain
     times = session.exposure_s[unlit]
     about = times - times.mean()
-    slopes = [
-        (values[..., unlit] * about).sum(axis=-1) / max(np.square(about).sum(), 1e-300)
-        for values in (session.pairs.mean, variance)
-    ]
-    still = dark.variance
+    current, rise = ((each[..., unlit] * about).sum(axis=-1) / max(np.square(about).sum(), 1e-300)
+                     for each in (means, variance))  # fmt: skip
+    still = variance[..., session.dark]
     if len(np.unique(session.exposure_s[session.lit])) >= LINE:
-        still = variance[..., unlit].mean(axis=-1) - slopes[1] * times.mean()
+        still = variance[..., unlit].mean(axis=-1) - rise * times.mean()
     still = np.maximum(still, LEAST_DARK) - QUANTISATION if session.rounded else np.maximum(still, 0)
     found = {
         "system_gain": gain,
         "quantum_efficiency": efficiency,
         "dark_noise": np.sqrt(still) / gain,
-        "row_noise": dark.rows / gain**2,
+        "row_noise": session.pairs.rows[..., session.dark] / gain**2,
     }
     if session.saturates:
         found |= {"saturation_capacity": efficiency * photons[peak], "full_well": signal[..., -1] / gain}
     top = full if session.saturates else signal[..., -1:]
     used = (signal >= LINEAR[0] * top) & (signal <= (LINEAR[1] if session.saturates else 1) * top)
     if used.sum(axis=-1).min() >= LINE:
-        low, high = _linearity(photons, signal, used)
-        found |= {"linearity_min": low, "linearity_max": high}
+        found["linearity_min"], found["linearity_max"] = _linearity(photons, signal, used)
     if np.ptp(times) > 0 and variance[..., unlit].max() > HIDDEN:
-        found |= {"dark_current": slopes[0] / gain, "dark_current_by_variance": slopes[1] / gain**2}
+        found |= {"dark_current": current / gain, "dark_current_by_variance": rise / gain**2}
     dim, bright = session.dark_stack, session.bright_stack
     contrast = bright.mean - dim.mean
     for name, off, on in zip(SPLIT, dim.parts(session.shape), bright.parts(session.shape), strict=True):
@@ -320,19 +271,20 @@ def figures(session: Session) -> dict[str, FloatArray]:
 
 
 def _slope(x: FloatArray, y: FloatArray, used: npt.NDArray[np.bool_]) -> FloatArray:
-    """Slope (...) of the least squares line from the origin of ``y`` over ``x`` (..., S), where they are ``used``."""
     return np.asarray((x * y * used).sum(axis=-1) / (np.square(x) * used).sum(axis=-1))
 
 
 def _linearity(photons: FloatArray, signal: FloatArray, used: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Least and largest relative deviation (...) of ``signal`` from a line over ``photons``, where they are ``used``.
+    """Return the least and the largest relative deviation (...) of `signal` (..., S) from a line.
 
-    The line's squared *relative* deviations are least (EMVA 1288 4.0, "linearity"): weights 1 / signal^2.
+    The line minimises squared relative deviations (EMVA 1288 4.0, "linearity").
     """
     weight = used / np.square(np.where(used, signal, 1.0))
-    total, first = weight.sum(axis=-1), (weight * photons).sum(axis=-1)
-    second, value = (weight * photons**2).sum(axis=-1), (weight * signal).sum(axis=-1)
-    cross = (weight * photons * signal).sum(axis=-1)
+    first = weight * photons
+    total, second, value, cross = (
+        part.sum(axis=-1) for part in (weight, weight * photons**2, weight * signal, first * signal)
+    )
+    first = first.sum(axis=-1)
     slope = (total * cross - first * value) / (total * second - first**2)
     line = ((value - slope * first) / total)[..., None] + slope[..., None] * photons
     off = np.where(used, (signal - line) / np.where(used, line, 1.0), 0.0)

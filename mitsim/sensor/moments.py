@@ -1,7 +1,6 @@
-"""Mean and variance of what the sensor makes of light, in closed form: beside every draw of `chain` stands its law.
+"""Mean and variance of the sensor's output in closed form, after EMVA 1288 release 4.0.
 
-After EMVA 1288 release 4.0. Tails of the Poisson law and of the ADC's codes are sums and expansions that keep their
-digits from 1e-6 to 1e15 electrons (`tests/hard/test_hard_moments.py`).
+Tails of the Poisson law and of the ADC's codes keep their digits from 1e-6 to 1e15 electrons.
 """
 
 import math
@@ -26,28 +25,23 @@ from mitsim.sensor.chain import (
 )
 
 _FEW = 64.0
-"""Electrons below which moments behind the ADC are summed count by count; chosen: some 150 counts hold all."""
 _SOME = 1e4
-"""Electrons below which they are summed over the counts that occur, on a grid of expected counts; chosen: above, 129
-counts stand for all to 1 % of the variance (tests/hard/test_hard_moments.py)."""
 _CAN_SATURATE = 1e-3
-"""Chance of saturation anywhere in a frame from which a reading at the full well counts as saturation."""
 _DITHERED = 0.8
 """Noise [DN] from which the variance of rounding is 1/12 to 1e-5 of the whole."""
 _SMOOTH = 2.0
 """Standard deviation [DN] from which a sum over codes is an integral to 1e-4."""
 _STEP, _FINEST = 1 / 8, 1 / 64
-"""Distance of the offsets at which moments near the ADC's ends are formed, in deviations of the noise of reading, which
-smooths them: linear between them to 1/500 of it; and the least one [DN], for readings without noise."""
+"""Distance of interpolated offsets, in deviations of the noise of reading, and the least distance [DN]."""
 
 
 def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of min(N, F) for Poisson N with mean ``expected`` (any shape) and full well F, ``full_well_e``.
+    """Return mean and variance of min(N, F) for Poisson N with mean ``expected`` (any shape) and full well F.
 
     With k P(N=k) = mu P(N=k-1), K = ceil(F), Q = P(N >= K), d = mu - F and e = mu P(N = K-1), the loss L = (N - F)^+
     has E[L] = d Q + e and E[L^2] = (d^2 + mu) Q + (mu + K - 2F) e. Below the full well, as L (F - min(N, F)) is 0,
-    E[min] = mu - E[L] and Var[min] = mu - E[L^2] - E[L]^2 + 2 E[L] d; above it the same of the room D = (F - N)^+,
-    E[D] = e - d (1 - Q) and E[D^2] = mu + d^2 - E[L^2], where less cancels: E[min] = F - E[D], Var[min] = Var[D].
+    E[min] = mu - E[L] and Var[min] = mu - E[L^2] - E[L]^2 + 2 E[L] d. Above it the room D = (F - N)^+ cancels less:
+    E[D] = e - d (1 - Q), E[D^2] = mu + d^2 - E[L^2], E[min] = F - E[D] and Var[min] = Var[D].
     """
     mean = checked_light(expected, "expected")
     clipped, variance = mean.copy(), mean.copy()
@@ -59,7 +53,6 @@ def clipped_moments(expected: npt.ArrayLike, full_well_e: float) -> tuple[FloatA
 
 
 def _clip_moments(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, FloatArray]:
-    """:func:`clipped_moments` without short cuts."""
     step = math.ceil(full_well_e)
     over = mean - full_well_e
     above, below = _tails(step, mean)
@@ -74,10 +67,9 @@ def _clip_moments(mean: FloatArray, full_well_e: float) -> tuple[FloatArray, Flo
 
 
 def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """P(N >= count) and P(N < count) for Poisson N, each as a tail of its own, so that 1e-20 still has its digits.
+    """Return P(N >= count) and P(N < count) for Poisson N, as two tails, so that 1e-20 keeps its digits.
 
-    Large counts by Temme's uniform expansion (DLMF 8.12.8, one term: 1/count is left), because scipy's sums stop early
-    beyond 4.5 deviations: 3e-9 instead of 2.9e-7 at 1e12.
+    Large counts use Temme's uniform expansion (DLMF 8.12.8, one term), because scipy's sums stop early.
     """
     if count < 300_000:
         return scipy.special.pdtrc(count - 1, mean), scipy.special.pdtr(count - 1, mean)
@@ -93,7 +85,7 @@ def _tails(count: int, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _poisson(count: int, mean: FloatArray) -> FloatArray:
-    """P(N = count) for Poisson N, by Loader's saddle point expansion (2000), which keeps its digits up to 1e15."""
+    """Return P(N = count) for Poisson N by Loader's saddle point expansion (2000), with full digits up to 1e15."""
     if count == 0:
         return np.exp(-mean)
     if count < 32:
@@ -108,22 +100,10 @@ def _poisson(count: int, mean: FloatArray) -> FloatArray:
 def frame_moments(
     expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (DN) and variance (DN^2) of `expose`'s output (EMVA 1288 4.0, photon transfer).
+    """Return mean (DN) and variance (DN^2) of the output of `expose` for one specimen (EMVA 1288 4.0, photon transfer).
 
-    Of one specimen: what is fixed in space moves means, and what is drawn anew in every frame is in the variance. Row
-    noise is in it too; the covariance of two pixels of a row is its variance.
-
-    Parameters
-    ----------
-    expected_electrons
-        photoelectrons, any shape, or (rows, columns) as `expose` says; ValueError where negative or NaN.
-    exposure_s, model
-        time and sensor.
-
-    Notes
-    -----
-    Where an end of the ADC is within eight deviations, or too little noise dithers its codes, the moments are those of
-    rounded and cut numbers: summed over the counts below 1e4 electrons, and averaged over 129 of them above.
+    Fixed patterns move means. The variance includes row noise, which is the covariance of two pixels of a row. Near an
+    end of the ADC, or if too little noise dithers its codes, the moments are those of rounded and clipped numbers.
     """
     light, dark = mean_electrons(expected_electrons, exposure_s, model)
     expected = np.asarray(light + dark)
@@ -139,7 +119,6 @@ def frame_moments(
 
 
 def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """:func:`frame_moments` of ``expected`` electrons, dark ones too, with ``offset`` [electrons] and linearity."""
     level, spread = bent_moments(expected, model)
     mean = np.asarray(amplify(level if offset is None else level + offset, model))
     noise = np.asarray(_linear_variance(spread, model))
@@ -157,10 +136,7 @@ def _general(expected: FloatArray, offset: FloatArray | None, model: SensorModel
 def _cut_by_offset(
     expected: FloatArray, offset: FloatArray | float, model: SensorModel
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`_cut` of pixels (pixels,) whose offsets differ: an offset is another black level.
-
-    Moments are formed at black levels that are close to each other, and linear between two of them.
-    """
+    """Interpolate moments between black levels, because an offset acts as another black level."""
     if not np.ptp(offset):
         return _cut(expected, _with_offset(model, float(np.mean(offset))))
     read = model.superpixel_reading_noise_e * model.gain_dn_per_e
@@ -179,17 +155,16 @@ def _cut_by_offset(
 
 
 def _with_offset(model: SensorModel, offset: float) -> SensorModel:
-    """The ``model`` with a black level higher by an ``offset`` [electrons] of its superpixels; it may be below 0."""
     black = model.black_level_dn + offset * model.gain_dn_per_e / model.codes
     return model.model_copy(update={"black_level_dn": black})
 
 
 def bent_moments(expected: npt.ArrayLike, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance [electrons] of `chain.bend` of Poisson counts of mean ``expected`` (any shape), unclipped.
+    """Return mean and variance [electrons] of `chain.bend` of unclipped Poisson counts with mean ``expected``.
 
-    With g the polynomial of the ``model``, a_j = g^(j)(mu) / j! and m_j the central moments of the Poisson law,
+    With g the polynomial of the model, a_j = g^(j)(mu) / j! and m_j the central moments of the Poisson law,
     m_{j+1} = mu (m_j' + j m_{j-1}) (Kendall and Stuart): E = sum a_j m_j and Var = sum a_i a_j (m_{i+j} - m_i m_j), i
-    and j from 1. The differences are formed as polynomials in mu, so no digits cancel.
+    and j from 1. The differences are formed as polynomials in mu, so that no digits cancel.
     """
     mean = checked_light(expected, "expected")
     if not model.linearity:
@@ -209,7 +184,6 @@ def bent_moments(expected: npt.ArrayLike, model: SensorModel) -> tuple[FloatArra
 
 
 def _central_moments(most: int) -> list[np.polynomial.Polynomial]:
-    """Central moments 0 .. ``most`` of the Poisson law, as polynomials in its mean."""
     mu = np.polynomial.Polynomial([0.0, 1.0])
     found = [np.polynomial.Polynomial([1.0]), np.polynomial.Polynomial([0.0])]
     for j in range(1, most):
@@ -218,13 +192,7 @@ def _central_moments(most: int) -> list[np.polynomial.Polynomial]:
 
 
 def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: SensorModel) -> float:
-    """Mean over pixels of the variance (DN^2) that :func:`frame_moments` gives; at once where the noise is linear.
-
-    Parameters
-    ----------
-    expected_electrons, exposure_s, model
-        as there.
-    """
+    """Return the mean over pixels of the variance (DN^2) of `frame_moments`; fast if the noise is linear."""
     if model.has_fixed_pattern or model.linearity or model.crosstalk:
         return float(frame_moments(expected_electrons, exposure_s, model)[1].mean())
     light = checked_light(expected_electrons, "expected_electrons")
@@ -238,17 +206,16 @@ def mean_variance(expected_electrons: npt.ArrayLike, exposure_s: float, model: S
 
 
 def _linear_variance(expected: FloatArray | np.float64, model: SensorModel) -> FloatArray:
-    """Variance [DN^2] of counts and read noise, rounded, where nothing is cut."""
     read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     return np.asarray(expected * gain**2 + (read**2 + (0.0 if model.largest_dn is None else 1 / 12)))
 
 
 def _linear(model: SensorModel) -> tuple[float, float]:
-    """Expected electrons, from least to most, between which the moments are linear; most below least where none are.
+    """Return the least and most expected electrons between which moments are linear.
 
-    That is 12 deviations below the full well, 8 from both ends of the ADC, and where the noise dithers its codes. A
-    signal y [DN] of variance K (y - b) + r^2 is 8 deviations from 0 beyond the larger root of y^2 - 64 K y + 64 (K b -
-    r^2), and from M below the smaller one of (M - y)^2 - 64 (K y - K b + r^2).
+    The range is 12 deviations below the full well and 8 from both ends of the ADC, where the noise dithers its codes. A
+    signal y [DN] of variance K (y - b) + r^2 is 8 deviations from 0 beyond the larger root of
+    y^2 - 64 K y + 64 (K b - r^2), and from M below the smaller root of (M - y)^2 - 64 (K y - K b + r^2).
     """
     well, top = model.superpixel_full_well_e, model.largest_dn
     last = well - 12 * math.sqrt(well) if math.isfinite(well) else math.inf
@@ -267,7 +234,7 @@ def _linear(model: SensorModel) -> tuple[float, float]:
 
 
 def _cut(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """:func:`frame_moments` of expected electrons (pixels,), dark ones among them, without short cuts."""
+    """Return moments of expected electrons (pixels,) without short cuts."""
     clipped, variance = clipped_moments(expected, model.superpixel_full_well_e)
     read, gain = model.superpixel_reading_noise_e * model.gain_dn_per_e, model.gain_dn_per_e
     mean, noise = np.asarray(amplify(clipped, model)), np.asarray(variance * gain**2 + read**2)
@@ -293,7 +260,6 @@ def _sum_counts(
     moments: tuple[FloatArray, FloatArray],
     model: SensorModel,
 ) -> tuple[FloatArray, FloatArray]:
-    """`moments` with those of the `hard` pixels summed over counts; `few`: which are dim, and which have some."""
     (dim, some), (mean, total) = few, moments
     for part, found in ((dim, _sum_over_counts), (some, _sum_about_mean), (~dim & ~some, _average_counts)):
         part = hard & part
@@ -303,7 +269,6 @@ def _sum_counts(
 
 
 def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """:func:`frame_moments` as a sum over electron counts; `expected` (pixels,) of few electrons."""
     most = float(expected.max())
     counts = np.arange(int(most + 12 * math.sqrt(most)) + 20, dtype=np.float64)
     levels, variances = _read_out(counts, model)
@@ -317,7 +282,6 @@ def _sum_over_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArr
 
 
 def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """:func:`frame_moments` as a sum over the counts within 12 deviations, for some hundreds of electrons."""
     nodes = _grid(expected)
     reach = 12 * np.sqrt(nodes) + 20
     first, last = np.floor(nodes - reach).clip(0).astype(np.intp), np.ceil(nodes + reach).astype(np.intp)
@@ -336,7 +300,6 @@ def _sum_about_mean(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
 
 
 def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """:func:`frame_moments` as a mean over 129 electron counts, for many electrons."""
     nodes = _grid(expected)
     deviates = np.linspace(-8, 8, 129)
     weights = np.exp(-np.square(deviates) / 2)
@@ -350,10 +313,9 @@ def _average_counts(expected: FloatArray, model: SensorModel) -> tuple[FloatArra
 
 
 def _grid(expected: FloatArray) -> FloatArray:
-    """Expected counts at which moments are formed: those of the pixels, or fewer to interpolate between.
+    """Return expected counts at which moments are computed: those of the pixels, or fewer to interpolate between.
 
-    Moments depend on the light alone, and smoothly: shot noise has a deviation of 1/2 in the root of the counts, and
-    the steps are 1/20 of that root.
+    Shot noise has a deviation of 1/2 in the root of the counts, and the steps are 1/20 of that root.
     """
     roots = np.sqrt(expected)
     count = int(np.ptp(roots) * 20) + 2
@@ -370,7 +332,6 @@ def _between(
 
 
 def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance [DN] of what the ADC makes of known electrons (pixels,), before the full well."""
     signal = amplify(bend(clip_at_full_well(electrons, model), model), model)
     read = np.full(signal.shape, model.superpixel_reading_noise_e * model.gain_dn_per_e)
     if model.largest_dn is None:
@@ -379,7 +340,6 @@ def _read_out(electrons: FloatArray, model: SensorModel) -> tuple[FloatArray, Fl
 
 
 def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance of a normal signal (pixels,) rounded to the codes 0 .. `largest`, all in DN."""
     first, second = np.empty_like(mean), np.empty_like(mean)
     wide = deviation >= _SMOOTH
     for part, moments in ((wide, _cut_moments), (~wide, _code_moments)):
@@ -389,11 +349,9 @@ def _round_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tup
 
 
 def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """:func:`_round_moments` for deviations of at least 2 DN.
+    """Return moments of a rounded normal signal for deviations of at least 2 DN.
 
-    The number is the sum over its codes of P(signal > code - 1/2), the midpoint rule for an integral in closed form:
-    that of a cut normal signal. Euler and Maclaurin's first term, -1/24 of the integrand's slope between the ends, is
-    1/12 DN^2 where nothing is cut.
+    The sum over codes is the midpoint rule for a closed-form integral, with Euler and Maclaurin's first term.
     """
     # Noise far wider than the ADC leaves its two ends, whatever its width; and 40 deviations beyond an end are enough.
     narrower = np.minimum(deviation, 1e4 * largest)
@@ -410,7 +368,7 @@ def _cut_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple
 
 
 def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tuple[FloatArray, FloatArray]:
-    """:func:`_round_moments` for deviations below 2 DN: code by code within eight deviations of the nearest one."""
+    """Return moments of a rounded normal signal for deviations below 2 DN, code by code."""
     nearest = np.clip(np.rint(mean), 0, largest)
     if not deviation.any():
         return nearest, np.zeros_like(mean)
@@ -428,17 +386,9 @@ def _code_moments(mean: FloatArray, deviation: FloatArray, largest: int) -> tupl
 
 
 def saturated_pixels(digital: Digital, expected_electrons: FloatArray, exposure_s: float, model: SensorModel) -> int:
-    """Pixels of a frame that reached the full well or the ADC's end.
+    """Count the pixels of a frame that reached the full well or the ADC's end.
 
-    A reading at the full well counts where the light can have filled it: with a chance of 1e-3 in the whole frame.
-    Elsewhere it is read noise.
-
-    Parameters
-    ----------
-    digital
-        the frame's numbers.
-    expected_electrons, exposure_s, model
-        as :func:`mitsim.sensor.chain.expose` took them.
+    A reading at the full well counts if the chance of saturation in the whole frame is 1e-3 or more.
     """
     well, brightest = model.superpixel_full_well_e, float(digital.max())
     ends = math.inf if model.largest_dn is None else float(model.largest_dn)

@@ -1,74 +1,432 @@
-"""A camera's file, or frames of a real camera, in; its figures after EMVA 1288 release 4.0 and its file out.
+"""Characterise a camera after EMVA 1288 release 4.0: figures, the camera file, a page and plots.
 
-Of a file, frames are simulated, and what they show is held against what is set. Real frames show the camera that
-explains them (`mitsim.sensor.found_camera`), and figures are held against what that camera's frames would show. Each
-figure's standard error is predicted: closed-form moments tell how far every statistic may be off, and a thousand
-sessions of such statistics are evaluated as that of the frames is (GUM, supplement 1).
+Figures of simulated frames are compared with the camera file, and those of real frames with the camera that explains
+the frames. Standard errors are the scatter of a thousand drawn sessions (GUM, supplement 1).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
-from mitsim.devices.flatlist import FlatFrames
+from mitsim.devices.flatlist import FlatFrames, capacity_of
 from mitsim.devices.sensor import SensorModel
-from mitsim.report.pages import written_figure
-from mitsim.sensor import emva
-from mitsim.sensor.found_camera import FoundCamera, Stated, find_camera
-from mitsim.sensor.photon_transfer import Taken
+from mitsim.report.pages import round_to_error, typeset, written_figure
+from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, TITLE_LETTERS, VERMILION, figure_of, label_axes
+from mitsim.sensor.camera_fit import FoundCamera, Stated, find_camera
+from mitsim.sensor.chain import mean_dark_current
+from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, QUANTISATION, SPLIT, Alike, Session, figures
 from mitsim.studies.emva_frames import Frames, draw_sessions
-from mitsim.studies.emva_options import Procedure, capacity_of, efficiency_of
-from mitsim.studies.emva_plots import figures_of
-from mitsim.studies.emva_results import UNITS, Characterisation, fields_of, row_of
+from mitsim.studies.emva_options import Procedure
 from mitsim.studies.flat_frames import read_again, read_sets, remarks
-from mitsim.studies.framework.page import build_findings
+from mitsim.studies.framework.page import Part, build_findings, text_table
 from mitsim.studies.framework.run import study_folder, write_figures
 
 CAMERA_FILE = "camera.toml"
-"""The camera that was found."""
+MOST_OFF = 5.0
+"""Standard errors from which a figure is off."""
+_BIASED, _MISLEADS = 0.5, 1.0
+"""Standard errors of the procedure's own bias from which a figure is compared with its expected value, and flagged."""
+_DUST = 1e-10
+_OF_FIELDS = "name", "unit", "set", "found", "standard_error", "deviations"
+_WHOLE = 1e4
+
+
+# ---- tables of the measured numbers ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EmvaFigure:
+    """A figure of EMVA 1288, which `mitsim.sensor.emva.figures` finds by its name.
+
+    `set` is the value that a camera sets, `root` is True if a variance is found, and `method` if no file sets the
+    figure.
+    """
+
+    symbol: str
+    unit: str
+    set: Callable[[Frames], float]
+    root: bool = False
+    method: bool = False
+
+
+def _dark_noise(frames: Frames) -> float:
+    """Return the noise in the dark [e-]; at no exposure if the light varies by exposure."""
+    sensor, ladder = frames.sensor, len(np.unique(frames.exposure_s[frames.light > 0])) >= LINE
+    dark = 0.0 if ladder else mean_dark_current(sensor) * float(frames.exposure_s[frames.dark])
+    return math.sqrt(sensor.superpixel_reading_noise_e**2 + dark)
+
+
+def _brightest(frames: Frames, values: FloatArray) -> float:
+    return float(values[int(frames.light.argmax())])
+
+
+def _full_well(frames: Frames) -> float:
+    sensor = frames.sensor
+    dark = mean_dark_current(sensor) * _brightest(frames, frames.exposure_s)
+    return (capacity_of(sensor) - dark) * (1 - sensor.dead_pixels)
+
+
+def _nonuniformity(frames: Frames, kind: str, part: str) -> float:
+    values = frames.parts(frames.dark)
+    if kind == "prnu":
+        alive = float(frames.electrons[frames.bright]) * (1 - frames.sensor.dead_pixels)
+        values = (frames.parts(frames.bright) - values) / alive**2
+    return float(dict(zip(SPLIT, (values.sum(), *values), strict=True))[part])
+
+
+def _split(kind: str, unit: str) -> dict[str, EmvaFigure]:
+    return {
+        f"{kind}_{part}": EmvaFigure(
+            f"{kind.upper()}1288.{part}", unit, partial(_nonuniformity, kind=kind, part=part), root=True
+        )
+        for part in SPLIT
+    }
+
+
+FIGURES: Mapping[str, EmvaFigure] = {
+    "system_gain": EmvaFigure("K", "DN/e-", lambda frames: frames.sensor.gain_dn_per_e),
+    "quantum_efficiency": EmvaFigure(
+        "eta", "e-/photon", lambda frames: _brightest(frames, frames.electrons) / _brightest(frames, frames.light)
+        * (1 - frames.sensor.dead_pixels)
+    ),
+    "dark_noise": EmvaFigure("sigma_d", "e-", _dark_noise),
+    "row_noise": EmvaFigure("sigma_row", "e-", lambda frames: frames.sensor.superpixel_row_noise_e**2, root=True),
+    "saturation_capacity": EmvaFigure("mu_e.sat", "e-", lambda frames: capacity_of(frames.sensor), method=True),
+    "full_well": EmvaFigure("F", "e-", _full_well),
+    "linearity_min": EmvaFigure("LE_min", "%", lambda frames: 0.0, method=True),
+    "linearity_max": EmvaFigure("LE_max", "%", lambda frames: 0.0, method=True),
+    "dark_current": EmvaFigure("mu_I.mean", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
+    "dark_current_by_variance": EmvaFigure("mu_I.var", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
+    **_split("dsnu", "e-"),
+    **_split("prnu", "%"),
+}  # fmt: skip
+FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
+    "gain_dn_per_e": ("DN/e-", lambda model: model.gain_dn_per_e),
+    "quantum_efficiency": ("e-/photon", lambda model: model.quantum_efficiency),
+    "read_noise_e": ("e-", lambda model: model.superpixel_read_noise_e),
+    "row_noise_e": ("e-", lambda model: model.superpixel_row_noise_e),
+    "black_level_dn": ("DN", lambda model: model.superpixel_black_level_dn),
+    "full_well_e": ("e-", capacity_of),
+    "dark_current_e_per_s": ("e-/s", lambda model: model.superpixel_dark_current_e_per_s),
+    "dark_current_spread_e_per_s": (
+        "e-/s", lambda model: model.binning * model.dark_factor * model.dark_current_spread_e_per_s
+    ),
+    "dsnu_row_e": ("e-", lambda model: model.offset_parts[1]),
+    "dsnu_column_e": ("e-", lambda model: model.offset_parts[2]),
+    "dsnu_pixel_e": ("e-", lambda model: model.offset_parts[0]),
+    "prnu_row": ("1", lambda model: model.response_parts[1]),
+    "prnu_column": ("1", lambda model: model.response_parts[2]),
+    "prnu_pixel": ("1", lambda model: model.response_parts[0]),
+    "hot_pixels": ("1", lambda model: model.hot_pixels if model.binning == 1 else None),
+    "hot_dark_current_e_per_s": ("e-/s", lambda model: model.hot_dark_current_e_per_s if model.binning == 1 else None),
+    "dead_pixels": ("1", lambda model: model.dead_pixels if model.binning == 1 else None),
+    "linearity.0": ("1", lambda model: (*model.linearity, 0.0)[0]),
+    "linearity.1": ("1", lambda model: (*model.linearity, 0.0, 0.0)[1]),
+}  # fmt: skip
+"""Measured fields of a camera file: unit, and the value that a model sets for its superpixels."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure, or a field of the camera that explains the frames; None if nothing is set.
+
+    `expected` is given if the procedure finds another figure than the set one. `deviations` and `bias` are differences
+    in standard errors.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    set: float | None
+    expected: float | None
+    found: float
+    standard_error: float
+    deviations: float | None
+    bias: float = 0.0
+
+
+def row_of(frames: Frames, name: str, found: FloatArray, sessions: FloatArray, bend: float = 0.0) -> Row:
+    """Compare a figure with its set or expected value.
+
+    `sessions` (count,) are figures of drawn sessions, and `bend` is the standard error of the expected linearity.
+    """
+    sensor, figure = frames.sensor, FIGURES[name]
+    value, spread, centre = float(found), max(float(sessions.std()), _DUST), float(sessions.mean())
+    given = figure.set(frames)
+    # A linear method does not find the set value of a bent camera, or of nonuniformity under noise that rows share.
+    method = figure.method or bool(sensor.linearity)
+    method |= bool(sensor.row_noise_e) and name.startswith(("dsnu", "prnu"))
+    bias = 0.0 if method or sensor.bits is None else (centre - given) / spread
+    method |= abs(bias) > _BIASED
+    if name == "dark_noise" and (given * sensor.gain_dn_per_e) ** 2 + QUANTISATION < LEAST_DARK:
+        bias = 0.0  # the standard's limit is found, as it should be
+    spread = math.hypot(spread, bend if name.startswith("linearity") else 0.0)
+    if name == "saturation_capacity":
+        spread = math.hypot(spread, frames.step / math.sqrt(12))
+    against = centre if method else given
+    off = (value - against) / spread
+    if figure.root:
+        root = math.sqrt(max(against, 0.0))
+        spread = spread / (2 * max(root, math.sqrt(spread)))
+        given, value, centre = (math.copysign(math.sqrt(abs(square)), square) for square in (given, value, centre))
+    scale = 100.0 if figure.unit == "%" else 1.0
+    expected = scale * centre if method else None
+    return Row(name, figure.symbol, figure.unit, scale * given, expected, scale * value, scale * spread, off, bias)
+
+
+def fields_of(found: FoundCamera, model: SensorModel | None) -> tuple[Row, ...]:
+    """Compare the camera that was found with the model that took the frames, if it is known."""
+    rows = []
+    for name, (unit, given) in FIELDS.items():
+        value, error = getattr(found.sensor, name, None), found.errors.get(name, 0.0)
+        if name.startswith("linearity") and found.sensor.linearity:
+            power = int(name[-1])
+            value, error = found.sensor.linearity[power], found.transfer.error(("bend", "bend_2")[power])
+        if value is not None and math.isfinite(value):
+            set_value = None if model is None else given(model)
+            off = None if set_value is None or not error else (value - set_value) / error
+            rows.append(Row(name, "", unit, set_value, None, value, error, off))
+    return tuple(rows)
+
+
+# ---- results ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Characterisation:
+    """A camera's figures (`rows`), the camera that explains its frames (`fields`), and closed forms (`expected`)."""
+
+    camera: str
+    frames: Frames
+    session: Session = field(repr=False)
+    expected: Session = field(repr=False)
+    rows: tuple[Row, ...]
+    found: FoundCamera
+    fields: tuple[Row, ...]
+    asked: Mapping[str, Any]
+    real: bool = False
+    about: tuple[str, ...] = ()
+    output: str | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        lines, sensor = [*self.about], self.frames.sensor
+        if biased := [row for row in self.rows if abs(row.bias) > _MISLEADS]:
+            of = "the camera" if self.real else "what is set"
+            found = ", ".join(f"{row.name} {row.expected:.5g} {row.unit} for {row.set:.5g}" for row in biased)
+            noise = sensor.superpixel_reading_noise_e * sensor.gain_dn_per_e
+            lines.append(
+                f"the procedure does not find {of}, but {found}: a black level of "
+                f"{sensor.superpixel_black_level_dn:.3g} DN and rounding to whole DN hide part of a noise of "
+                f"{noise:.2g} DN; raise black_level_dn or gain_dn_per_e"
+            )
+        for row in (*self.rows, *self.fields):
+            if row.deviations is None or abs(row.deviations) <= MOST_OFF:
+                continue
+            off = f"{row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off"
+            if row.symbol:
+                against = row.set if row.expected is None else row.expected
+                lines.append(f"{row.name}: found {off} {against:.5g}; the procedure does not fit this camera")
+            else:
+                lines.append(f"{row.name} of the camera found: {off} {row.set:.5g}, which is set")
+        return tuple(lines)
+
+    def payload(self) -> dict[str, Any]:
+        transfer = self.found.transfer
+        return {
+            "camera": self.camera,
+            **self.asked,
+            "exposure_s": float(self.frames.exposure_s[self.frames.dark]),
+            "figures": [asdict(row) for row in self.rows],
+            "camera_found": [{name: getattr(row, name) for name in _OF_FIELDS} for row in self.fields],
+            "light": {
+                "uneven": self.found.pixels.uneven, "scatter": transfer.lamp, "drifts": transfer.light == "drifts",
+                "seen": transfer.light, "chi_square": transfer.chi_square, "freedom": transfer.freedom,
+            },
+            "notes": list(self.found.notes),
+            "warnings": list(self.warnings),
+            "output": self.output,
+        }  # fmt: skip
+
+    @property
+    def message(self) -> str:
+        found = {row.name: row for row in self.fields}
+        named = {"Gain": "gain_dn_per_e", "read noise": "read_noise_e", "full well": "full_well_e"}
+        rows = {name: found[each] for name, each in named.items() if each in found}
+        return ", ".join(
+            f"{name} {row.found:{'.4g' if row.found < _WHOLE else '.0f'}} {row.unit}" for name, row in rows.items()
+        )
+
+    @property
+    def where(self) -> str:
+        (m, n), lit, unlit = self.frames.shape, len(self.session.lit), len(self.session.unlit)
+        return f"{m} x {n} pixels, {lit} sets of frames under light, {unlit} in the dark"
+
+    @property
+    def parts(self) -> tuple[Part, Part]:
+        """Tables and plots of the page."""
+
+        def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
+            return tuple(columns), tuple(tuple(_cell(row, name) for name in columns.values()) for row in rows)
+
+        found = {"found": "found", "std. error": "standard_error"}
+        off, given = {"off by": "deviations"}, {} if self.real else {"set": "set"}
+        figure = {"figure": "name", "symbol": "symbol", "unit": "unit", "camera" if self.real else "set": "set"}
+        camera = {"camera found": "name", "unit": "unit", **given, **found, **({} if self.real else off)}
+        which = "the camera has" if self.real else "the one set"
+        note = f"expected: where the procedure finds another figure than {which}, at these steps and frames"
+        return (
+            Part(
+                "Figures of EMVA 1288",
+                "What the standard's procedure finds, with its standard error, and by how many of these it is off.",
+                *table(self.rows, {**figure, "expected": "expected", **found, **off}),
+                ("deviations.png", "photon_transfer.png", "linearity.png", "dark_current.png"),
+                (note,) if any(row.expected is not None for row in self.rows) else (),
+            ),
+            Part(
+                "The camera that explains the frames", "The fields of camera.toml, which --camera takes.",
+                *table(self.fields, camera), notes=tuple(self.found.notes),
+            ),
+        )  # fmt: skip
+
+    def lines(self) -> list[str]:
+        lines = [f"{self.camera}: {self.where}"]
+        if self.output:
+            lines.append(f"Page, plots, JSON and the camera found, camera.toml: {self.output}")
+        for part in self.parts:
+            lines += [*text_table(part.head, part.rows), *part.notes, ""]
+        return lines[:-1]
+
+
+def _cell(row: Row, name: str) -> str:
+    value = getattr(row, name)
+    if name in ("found", "standard_error"):
+        return round_to_error(value, row.standard_error)
+    if value is None or isinstance(value, str):
+        return value or ""
+    return f"{value:{'.1f' if name == 'deviations' else '.5g'}}"
+
+
+# ---- plots -----------------------------------------------------------------------------------------------------------
+
+
+def figures_of(done: Characterisation) -> Mapping[str, Figure]:
+    """Draw the plots by file name; plots of figures that the frames do not show are left out."""
+    rows, saturates = {row.name: row for row in done.rows}, done.session.saturates
+
+    def text(row: Row) -> str:
+        error = round_to_error(row.standard_error, row.standard_error)
+        unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
+        beside = f"{'camera found' if done.real else 'set'} {row.set:.5g}"
+        return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, {beside}")
+
+    def chart(points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str) -> Axes:
+        axes = figure_of(3.3, COLUMN)[1]
+        label = "camera found" if done.real else "closed form"
+        axes.plot(*points(done.expected), color=GREY, lw=1.5, label=label)
+        axes.plot(*points(done.session), color=BLUE, lw=0, marker="o", ms=5, label="pairs of frames")
+        axes.set_title(fill(title, TITLE_LETTERS), fontsize=FONT)
+        label_axes(axes, x, y)
+        return axes
+
+    def transfer(session: Session) -> tuple[FloatArray, FloatArray]:
+        return session.transfer()[1:]
+
+    def straightness(session: Session) -> tuple[FloatArray, FloatArray]:
+        photons, signal, noise = session.transfer()
+        top = float(signal[int(noise.argmax())]) if session.saturates else float(signal.max()) / LINEAR[1]
+        used = (signal >= LINEAR[0] * top) & (signal <= LINEAR[1] * top * (1 + 1e-12))
+        slope, start = np.polyfit(photons[used], signal[used], 1, w=1 / signal[used])
+        return photons[used], 100 * (signal[used] / (start + slope * photons[used]) - 1)
+
+    def darkness(session: Session) -> tuple[FloatArray, FloatArray]:
+        signal = session.pairs.mean[session.unlit] - done.frames.sensor.superpixel_black_level_dn
+        return session.exposure_s[session.unlit], signal / rows["system_gain"].found
+
+    title = f"Photon transfer: EMVA 1288 finds a gain of {text(rows['system_gain'])}"
+    axes = chart(transfer, title, "signal less dark signal [DN]", "variance less dark variance [DN$^2$]")
+    signal, noise = transfer(done.session)
+    full = float(signal[int(noise.argmax())]) if saturates else float(signal.max())
+    line = np.array([0.0, MOST_FITTED * full if saturates else full])
+    label = "fit to 70 %" if saturates else "fit"
+    axes.plot(line, rows["system_gain"].found * line, color=VERMILION, lw=2, ls="--", label=label)
+    if saturates:
+        axes.axvline(full, color=ORANGE, lw=1.5, ls=":", label="saturation")
+        axes.set_xlim(right=1.1 * float(signal.max()))
+    charts = {"photon_transfer.png": axes}
+    if "linearity_min" in rows:
+        light = "photons on a pixel [1]" if done.frames.sensor.states_efficiency else "light on a pixel [a.u.]"
+        least, most = rows["linearity_min"].found, rows["linearity_max"].found
+        title = f"Linearity: {typeset(f'{least:.2g}')} to {typeset(f'{most:+.2g}')} % off a line"
+        charts["linearity.png"] = chart(straightness, title, light, "deviation from a line [%]")
+        charts["linearity.png"].axhline(0, color=BLACK, lw=1)
+    if "dark_current" in rows:
+        title = f"EMVA 1288 finds a dark current of {text(rows['dark_current'])}"
+        y = "dark signal less black level [e$^-$]"
+        charts["dark_current.png"] = chart(darkness, title, "exposure time [s]", y)
+    for name, axes in charts.items():
+        axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left" if name == "photon_transfer.png" else "best")
+    drawn = {name: axes.figure for name, axes in charts.items()}
+    return {"deviations.png": _deviations(done), **drawn}
+
+
+def _deviations(done: Characterisation) -> Figure:
+    figure, axes = figure_of(0.9 + 0.26 * len(done.rows), COLUMN)
+    place = np.arange(len(done.rows))[::-1]
+    off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
+    axes.axvspan(-MOST_OFF, MOST_OFF, color="#eef2f7", zorder=0)
+    axes.axvline(0, color=BLACK, lw=1)
+    axes.plot(off, place, "o", color=BLUE, ms=7)
+    names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
+    axes.set_yticks(place, names, fontsize=FONT - 1)
+    far = sum(not abs(row.deviations or 0.0) <= MOST_OFF for row in done.rows)
+    verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
+    axes.set_title(f"{verdict}\nmore than {MOST_OFF:g} standard errors off", fontsize=FONT)
+    most = 1.2 * max(MOST_OFF, float(np.abs(off).max()))
+    axes.set_xlim(-most, most)
+    of = "the camera's" if done.real else "set"
+    label = f"found less {of} or expected\n[standard errors]; shaded: within {MOST_OFF:g}"
+    label_axes(axes, label, "", grid="x")
+    return figure
+
+
+# ---- characterisation ------------------------------------------------------------------------------------------------
 
 
 def characterise(
     sensor: SensorModel, procedure: Procedure | None = None, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Run EMVA 1288's procedure on frames of a camera, and write page, plots, JSON and the camera found where a folder
-    is given.
+    """Run EMVA 1288's procedure on simulated frames of a camera.
 
-    Parameters
-    ----------
-    sensor
-        the camera.
-    procedure
-        sizes and seed.
-    output
-        new or empty folder, or one of an earlier characterisation, which is replaced.
-    job
-        told how far it is.
-
-    Raises
-    ------
-    MitsimError
-        for a camera that light never saturates, a wavelength outside its curve, or a folder that holds something else.
+    `output` is a folder for page, plots, JSON and the camera file: new, empty, or of an earlier characterisation.
     """
     procedure, job = procedure or Procedure(), job or Job()
     frames = Frames.of(sensor, procedure, capacity_of(sensor))
+    bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
+    source = f"simulated frames of {sensor.name}"
+    stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
 
     def measure(folder: str | None) -> Characterisation:
         taken = frames.take(job)
-        efficiency_of(sensor, procedure)
-        bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
-        source = f"simulated frames of {sensor.name}"
-        stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
-        images = lambda index: np.mean([*frames.images(index)], axis=0)  # noqa: E731
-        found = find_camera(taken, images, stated, lambda places: frames.take(job, places))
-        return _hold_against(frames, taken, found, {"asked": procedure.stated, "camera": sensor.name}, folder)
+        found = find_camera(
+            taken, lambda index: np.mean([*frames.images(index)], axis=0), stated,
+            lambda places: frames.take(job, places),
+        )  # fmt: skip
+        return _compare(frames, taken, found, asked=procedure.stated, camera=sensor.name, output=folder)
 
     return _write(measure, output)
 
@@ -76,72 +434,53 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames, and write page, plots, JSON and the camera's file where a folder is given.
-
-    Parameters
-    ----------
-    listed
-        frames under even light and in the dark (:func:`mitsim.devices.flatlist.load_flats`).
-    output
-        new or empty folder, or one of an earlier characterisation, which is replaced.
-    job
-        told how far it is.
-
-    Raises
-    ------
-    MitsimError
-        for frames that cannot be read, that are not what the list says, or that tell nothing of the camera.
-    """
-    job = job or Job()
+    """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.flatlist.load_flats`)."""
+    job, facts = job or Job(), listed.listed
+    stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
 
     def measure(folder: str | None) -> Characterisation:
         sets = read_sets(listed, job)
         taken = [each.taken for each in sets]
-        facts = listed.listed
-        stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
+        shape = taken[0].shape
         found = find_camera(
-            taken, lambda index: sets[index].mean_image(), stated,
-            lambda places: read_again(listed, places, taken[0].said.shape),
-        )  # fmt: skip
-        frames = Frames.as_taken(taken, found)
-        asked = {"folder": str(listed.folder), "shape": frames.shape, "sets": len(sets)}
-        about = remarks(sets, found)
-        return _hold_against(
-            frames, taken, found, {"asked": asked, "camera": facts.name, "real": True, "about": about}, folder
+            taken, lambda index: sets[index].mean_image(), stated, lambda places: read_again(listed, places, shape)
         )
+        asked = {"folder": str(listed.folder), "shape": shape, "sets": len(sets)}
+        frames, about = Frames.as_taken(taken, found), remarks(sets, found)
+        return _compare(frames, taken, found, asked=asked, camera=facts.name, output=folder, real=True, about=about)
 
     return _write(measure, output)
 
 
-def _hold_against(
-    frames: Frames, taken: list[Taken], found: FoundCamera, what: Mapping[str, Any], output: str | None
+def _compare(
+    frames: Frames, taken: list[Alike], found: FoundCamera, real: bool = False, **facts: Any
 ) -> Characterisation:
-    """Figures of sets that were ``taken``, beside those of the sensor of ``frames``, which real frames have found."""
-    expected, session = frames.expect(), frames.session(taken)
-    spread, figures = emva.figures(draw_sessions(frames, expected)), emva.figures(session)
-    # Without a quantum efficiency light is counted in electrons, and there is none to find.
-    sensor = frames.sensor
-    names = [name for name in UNITS if name in figures and name in spread]
-    names = [name for name in names if sensor.states_efficiency or name != "quantum_efficiency"]
-    bend = found.transfer.error("bend") if what.get("real") else 0.0  # what is expected is then known to that
-    rows = tuple(row_of(frames, name, figures[name], spread[name], bend) for name in names)
-    fields = fields_of(found, None if what.get("real") else sensor)
+    expected, sensor = frames.expect(), frames.sensor
+    session = frames.session((each.pair for each in taken), taken[frames.dark].stack, taken[frames.bright].stack)
+    spread, of_frames = figures(draw_sessions(frames, expected)), figures(session)
+    bend = found.transfer.error("bend") if real else 0.0  # the error of a real camera's expected linearity
+    rows = tuple(
+        row_of(frames, name, of_frames[name], spread[name], bend)
+        for name in FIGURES
+        # Without a quantum efficiency light is counted in electrons, so there is none to find.
+        if name in of_frames and name in spread and (sensor.states_efficiency or name != "quantum_efficiency")
+    )
+    fields = fields_of(found, None if real else sensor)
     return Characterisation(
-        frames=frames, session=session, expected=expected, rows=rows, found=found, fields=fields, output=output, **what
+        frames=frames, session=session, expected=expected, rows=rows, found=found, fields=fields, real=real, **facts
     )
 
 
 def _write(measure: Callable[[str | None], Characterisation], output: Path | str | None) -> Characterisation:
-    """What is measured, written to the folder ``output`` where there is one."""
     if output is None:
         return measure(None)
     with study_folder(output, "characterise") as folder:
         done = measure(str(folder))
-        results = folder / "characterise.json"  # last, so that a folder with it is whole
+        results = folder / "characterise.json"  # written last, so that a folder with it is complete
         results.unlink(missing_ok=True)
-        figures = write_figures(folder, figures_of(done))
-        pictures = {name: written_figure(figure, folder / name) for name, figure in figures.items()}
-        titles = done.title, done.message
+        drawn = write_figures(folder, figures_of(done))
+        pictures = {name: written_figure(figure, folder / name) for name, figure in drawn.items()}
+        titles = f"{done.camera} after EMVA 1288", done.message
         page = build_findings("characterise", titles, done.where, done.parts, pictures, done.warnings)
         write_text(folder / "characterise.html", page)
         write_text(folder / CAMERA_FILE, done.found.toml())

@@ -44,8 +44,7 @@ from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.pages import Value
-from mitsim.sensor.chain import electrons_from_irradiance, ripple_response
-from mitsim.sensor.specimen import specimen
+from mitsim.sensor.chain import electrons_from_irradiance, ripple_response, specimen
 from mitsim.studies.framework.claims import Gain, choose_rows, distinct, mean_of
 from mitsim.studies.framework.experiment import (
     IMAGE,

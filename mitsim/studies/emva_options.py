@@ -1,11 +1,8 @@
-"""A camera and the sizes of a characterisation in; what EMVA 1288 needs of both out, or a refusal, without numpy."""
+"""Options of a simulated characterisation; importing them does not import numpy."""
 
 from __future__ import annotations
 
-import math
-
 from mitsim.bench.request import Lit, Seeded, SeedKeys
-from mitsim.core.errors import MitsimError
 from mitsim.core.options import option
 from mitsim.devices.sensor import SensorModel
 
@@ -34,6 +31,10 @@ class Procedure(Lit, Seeded):
         sizes = {name: getattr(self, name) for name in ("pixels", "steps", "frames", "seed")}
         return {**sizes, "wavelength_nm": self.wavelength}
 
+    def efficiency(self, sensor: SensorModel) -> float:
+        """Return electrons per photon; 1 if the sensor states none or has filters, because electrons are counted."""
+        return sensor.efficiency(self.wavelength) if sensor.states_efficiency else 1.0
+
 
 class ProcedureKeys(SeedKeys, total=False):
     """Keywords of :class:`Procedure`, without the frames."""
@@ -41,24 +42,3 @@ class ProcedureKeys(SeedKeys, total=False):
     pixels: int
     steps: int
     wavelength: float
-
-
-def efficiency_of(sensor: SensorModel, procedure: Procedure) -> float:
-    """Electrons per photon of a ``sensor`` at the ``procedure``'s wavelength.
-
-    1 where the camera states none, or has colour filters: light is counted in electrons.
-    """
-    return sensor.efficiency(procedure.wavelength_nm) if sensor.states_efficiency else 1.0
-
-
-def capacity_of(sensor: SensorModel) -> float:
-    """Electrons that saturate a pixel of a ``sensor``: its full well, or the ADC's end; MitsimError without either."""
-    full = sensor.superpixel_full_well_e
-    if sensor.largest_dn is not None:
-        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
-    if not math.isfinite(full):
-        raise MitsimError(
-            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
-            "give full_well_e or bits"
-        )
-    return full

@@ -11,9 +11,8 @@ from mitsim.core.configuration import shipped_path
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import moments
-from mitsim.sensor.chain import poisson_quantile
-from mitsim.sensor.photon_transfer import average_moments
-from mitsim.sensor.specimen import specimen
+from mitsim.sensor.camera_fit import average_moments
+from mitsim.sensor.chain import poisson_quantile, specimen
 from tests.invented import sensor
 
 

@@ -14,7 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.sensor import chain, moments
-from mitsim.sensor.specimen import (
+from mitsim.sensor.chain import (
     dark_current_variance,
     mean_dark_current,
     neighbours,
