@@ -21,8 +21,6 @@ from mitsim.devices.sensor import SensorModel
 
 _MOST_SETS, _MOST_FRAMES = 4096, 10_000
 """Of a list, and frames of a set: ten times what EMVA 1288's longest procedures take."""
-_LIMITS = {"pixels": (32, 4096), "steps": (20, 1000), "frames": (2, 10_000)}
-"""Below 32 rows a row's part is known to a quarter. EMVA 1288 takes at least 50 steps and 16 frames."""
 
 
 def capacity_of(sensor: SensorModel) -> float:

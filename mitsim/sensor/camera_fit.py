@@ -16,9 +16,8 @@ import numpy.typing as npt
 import scipy
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.configuration import validate
+from mitsim.core.configuration import toml_value, validate
 from mitsim.core.errors import MitsimError
-from mitsim.core.field_docs import toml_value
 from mitsim.devices.sensor import SensorModel
 from mitsim.sensor.emva import HIDDEN, LEAST_DARK, MOST_FITTED, Alike
 from mitsim.sensor.moments import frame_moments
