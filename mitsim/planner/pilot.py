@@ -112,8 +112,7 @@ class PilotRuns:
         self.occluded: PenumbraRuns | None = None
         for run in RUNS:
             self._measure(run)
-        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2)
-        if few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * accuracy:
+        if self._rough:
             self._look_for_occluded()
 
     def _look_for_occluded(self) -> None:
@@ -170,6 +169,12 @@ class PilotRuns:
         repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
         return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
+    @property
+    def _rough(self) -> bool:
+        """True if a few anchors may leave too much error."""
+        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2)
+        return few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * self.accuracy
+
     def heavy(self, samples: int) -> dict[str, SampleCost]:
         """Measure sample costs of light from the camera's side with more ``samples``, by pass."""
         found = {
@@ -197,7 +202,7 @@ class PilotRuns:
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
             others = sample, tolerance, seed, self.fine.judging, lit
             self.followed = FollowedRuns(bench, self._everything, *others)
-            self.followed.coarse = np.divide(self.switched.coarse, self._tolerance())
+            self.followed.coarse = self._over_tolerance(self.switched.coarse)
         elif run == "occluded":
             if base.occluded:
                 self.occluded = PenumbraRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
@@ -205,10 +210,13 @@ class PilotRuns:
             self.anchored = AnchorRuns(bench, base, sample, self._tolerance(), seed, self.fine.judging)
             if sample.anchored == self.samples["cells"].anchored:
                 self.anchored.take_over({1: self.fine.first})
-            self.anchored.coarse = np.divide(self.fine.coarse, self._tolerance())
+            self.anchored.coarse = self._over_tolerance(self.fine.coarse)
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
         return part * self.accuracy * self.switched.light
+
+    def _over_tolerance(self, parts: tuple[float, float]) -> tuple[float, float]:
+        return parts[0] / self._tolerance(), parts[1] / self._tolerance()
 
     @property
     def _everything(self) -> Settings:
