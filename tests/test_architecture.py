@@ -568,7 +568,7 @@ SIZES = {
     "metrics": (1, 81),
     "mitsim": (1, 104),
     "optics": (12, 2145),
-    "planner": (9, 2188),
+    "planner": (7, 2133),
     "reconstruct": (35, 7726),
     "report": (14, 2696),
     "scene": (10, 1873),

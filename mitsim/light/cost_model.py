@@ -17,7 +17,16 @@ from mitsim.bench.effects import names
 from mitsim.core.arrays import FloatArray
 from mitsim.devices.plate import FEW
 from mitsim.light.passes import PASSES
-from mitsim.light.settings import GROUPS, Forming, Number, PilotResult, SampleCost, Settings
+from mitsim.light.settings import (
+    CELLS_OF_COARSE,
+    FOLLOWED_WIDTH,
+    GROUPS,
+    Forming,
+    Number,
+    PilotResult,
+    SampleCost,
+    Settings,
+)
 from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
 from mitsim.optics.forming import PROBES
 from mitsim.optics.frames import formed_frames, mixes
@@ -115,16 +124,14 @@ SHARED_COST = 6
 
 @dataclass(frozen=True)
 class Numbers:
-    """The numbers of settings that cost depends on, one choice or (m,) of them at once; the first eight are chosen."""
+    """Numbers of settings that cost depends on, of one choice or of (m,) choices; the first six are chosen."""
 
     anchors: Number
     layers: Number
     cells: Number
     followed_anchors: Number
     occluded_anchors: Number
-    followed_width: Number
-    coarse_cells: Number
-    all_layers: Number
+    coarse_layers: Number
     """Whether coarse light has all layers, or one."""
     waves: float = 1.0
     indirect: float = 0.0
@@ -135,31 +142,33 @@ class Numbers:
     """Along a pixel, where frames are correlations by choice; 0: sums, or as few cells as a raster has."""
 
     @property
-    def coarse_layers(self) -> FloatArray:
-        """Layers of coarse light."""
-        return np.where(np.asarray(self.all_layers) > 0, self.layers, 1.0)
+    def coarse(self) -> tuple[FloatArray, FloatArray]:
+        """Cells a side of a projector pixel, and layers, of coarse light."""
+        several = np.asarray(self.coarse_layers) > 0
+        return np.where(several, np.maximum(self.cells // CELLS_OF_COARSE, 1.0), 1.0), np.where(
+            several, self.layers, 1.0
+        )
 
     @property
-    def of_followed(self) -> tuple[FloatArray, FloatArray]:
-        """Cells a side of a projector pixel, and layers, for what anchors see of followed light."""
-        width = np.asarray(self.followed_width)
-        return np.where(width > 1, 1 / width, self.coarse_cells), np.where(width > 1, 1.0, self.coarse_layers)
+    def cells_of_followed(self) -> FloatArray:
+        """Cells a side of a projector pixel for what anchors see of followed light, which has one layer."""
+        return self.coarse[0] / FOLLOWED_WIDTH
 
     @classmethod
     def coarsest(cls) -> Numbers:
         """One of everything, and a wave-optical shadow."""
-        return cls(*[1.0] * 8)
+        return cls(*[1.0] * 6)
 
     @classmethod
     def of_counts(
         cls, counts: Sequence[Number], effects: frozenset[str], occluded: int = 0, raster_cells: int = 0
     ) -> Numbers:
-        """Those of the eight that are chosen, with ``effects``.
+        """Those of the six that are chosen, with ``effects``.
 
         Parameters
         ----------
         counts
-            the first eight numbers.
+            the first six numbers.
         effects
             that are on.
         occluded, raster_cells
@@ -171,39 +180,16 @@ class Numbers:
     @classmethod
     def of(cls, settings: Settings) -> Numbers:
         """Those of ``settings``."""
-        of_direct = settings.anchors, len(settings.depths), settings.subdivision
-        of_few = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
-        counts = [float(each) for each in (*of_direct, *of_few, settings.coarse_cells, settings.coarse_layers)]
-        return cls.of_counts(counts, settings.effects, len(settings.with_own_anchors), settings.raster_cells)
+        direct = settings.anchors, len(settings.depths), settings.subdivision
+        counts = *direct, settings.followed_anchors, settings.occluded_anchors, settings.coarse_layers
+        return cls.of_counts(
+            [float(count) for count in counts], settings.effects, len(settings.with_own_anchors), settings.raster_cells
+        )
 
 
 def in_waves(effects: frozenset[str]) -> bool:
     """Whether the mask's shadow is wave-optical with these ``effects``."""
     return bool(effects & names(lambda effect: effect.in_shadow))
-
-
-def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
-    """Those that the ``pilot_result`` measured, where it measured any."""
-    # All that processors do with matrices is as much slower or faster as their products.
-    slower = (pilot_result.forming.product or FIXED.product) / FIXED.product
-    measured = {
-        name: sample_cost.seconds for name, sample_cost in pilot_result.sample_costs.items() if sample_cost.seconds
-    }
-    return UnitCosts(
-        passes={**FIXED.passes, **measured},
-        frame=slower * FIXED.frame,
-        product=slower * FIXED.product,
-        entry=slower * FIXED.entry,
-        accumulated=slower * FIXED.accumulated,
-        ray=pilot_result.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray,
-        pixel=slower * FIXED.pixel,
-    )
-
-
-def costly_effects() -> frozenset[str]:
-    """Names of effects that take time; to have the others on costs nothing."""
-    traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
-    return traced | names(lambda effect: effect.in_shadow) | {MIXING}
 
 
 def sample_costs(pilot_result: PilotResult, effects: frozenset[str]) -> dict[str, SampleCost]:
@@ -259,8 +245,8 @@ def _products(
 def _entries(forming: Forming, numbers: Numbers) -> Number:
     """Entries of all shadows that are prepared, as many as wave-optical ones take as long."""
     coarse = (np.asarray(numbers.anchors) > 1) + numbers.indirect
-    followed = (np.asarray(numbers.followed_anchors) > 1) * math.prod(numbers.of_followed)
-    sides = numbers.cells * numbers.layers + coarse * numbers.coarse_cells * numbers.coarse_layers + followed
+    followed = (np.asarray(numbers.followed_anchors) > 1) * numbers.cells_of_followed
+    sides = numbers.cells * numbers.layers + coarse * math.prod(numbers.coarse) + followed
     if _by_fft(forming, numbers):
         return cast(Number, 0.0 * sides)
     many = forming.geometric_terms > FEW
@@ -289,14 +275,14 @@ def forming_seconds(forming: Forming, numbers: Numbers, frames: Number, costs: U
     costs
         of this machine, or the fixed ones.
     """
-    lit, every, coarse = (forming.lit, forming.lit), (1.0, 1.0), (numbers.coarse_cells, numbers.coarse_layers)
+    lit, every, coarse = (forming.lit, forming.lit), (1.0, 1.0), numbers.coarse
     of_occluded = _lit_by_occluded(forming, numbers)
     by_grid = (
         (1.0, lit, numbers.cells, numbers.layers, 1.0),
         (np.asarray(numbers.anchors) > 1, lit, *coarse, numbers.anchors),
         (np.asarray(numbers.occluded_anchors) > 1, of_occluded, *coarse, numbers.occluded_anchors),
         (numbers.indirect, every, *coarse, 1.0),
-        (np.asarray(numbers.followed_anchors) > 1, every, *numbers.of_followed, numbers.followed_anchors),
+        (np.asarray(numbers.followed_anchors) > 1, every, numbers.cells_of_followed, 1.0, numbers.followed_anchors),
     )
     products = sum(formed * _products(forming, numbers, *grid) for formed, *grid in by_grid)
     if mixes(forming.classes, forming.shots, forming.pixels):
@@ -420,17 +406,17 @@ def entries(pixels: int, classes: int, numbers: Numbers, samples: Settings | Map
         row = PASSES[name]
         return row.whole(row.predicted_samples(samples) if isinstance(samples, Settings) else samples.get(name, 1.0))
 
-    coarse, layers = np.square(numbers.coarse_cells), np.minimum(numbers.coarse_layers, _SPLIT)
+    coarse, coarse_layers = np.square(numbers.coarse[0]), numbers.coarse[1]
+    layers = np.minimum(coarse_layers, _SPLIT)
 
     def at(anchors: Number, name: str, part: Number = 1.0) -> Number:
         seen = _EDGES * np.minimum(of(name), coarse) * layers
         return part * (np.asarray(anchors) > 1) * _EDGES * np.square(anchors) * seen
 
     # Pixels of the projector, not of all cells: light from beyond its window is a small part.
-    places = classes * coarse * numbers.coarse_layers
-    cells, seen_in = numbers.of_followed
+    places = classes * coarse * coarse_layers
     most = np.maximum(of("indirect_residual"), of("camera_residual"))
-    followed = np.minimum(_SPLIT * most, classes * np.square(cells) * seen_in)
+    followed = np.minimum(_SPLIT * most, classes * np.square(numbers.cells_of_followed))
     found = (
         np.minimum(of("direct"), _EDGES * np.square(numbers.cells)) * np.minimum(numbers.layers, _SPLIT)
         + at(numbers.anchors, "anchor_residual")
@@ -451,7 +437,8 @@ def accumulation_seconds(forming: Forming, numbers: Numbers, entries_of_group: N
     entries_of_group
         of one group's light.
     """
-    accumulator = forming.classes * np.square(forming.cells * numbers.coarse_cells) * numbers.coarse_layers
+    cells, layers = numbers.coarse
+    accumulator = forming.classes * np.square(forming.cells * cells) * layers
     passed = numbers.indirect * _PASSED * np.where(accumulator < MOST_PLACES, accumulator, 0.0)
     return cast(Number, forming.lines * GROUPS * costs.accumulated * (entries_of_group + passed))
 
@@ -466,8 +453,5 @@ def truth_seconds(pilot_result: PilotResult, settings: Settings, costs: UnitCost
     """
     row, direct = PASSES["direct"], pilot_result.sample_costs["direct"]
     rate = (pilot_result.spread if settings.anchors > 1 else direct).noise.rate
-    return (
-        traced_for(pilot_result.forming.lines, pilot_result.forming.parted)
-        * costs.ray
-        * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)
-    )
+    ray = traced_for(pilot_result.forming.lines, pilot_result.forming.parted) * costs.ray
+    return ray * predicted_rays(direct.paths, float(row.whole(row.predicted_samples(settings))), rate)

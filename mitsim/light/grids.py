@@ -74,6 +74,9 @@ class Grids:
         Use the light's mean wavelength alone for diffraction: a third of the time where diffraction matters little.
     places
         Rows and columns whose frames are formed; None for all.
+    judging_cells
+        Cells a side of a projector pixel for indirect light and for what anchors see beyond their mean, by which the
+        pilot judges those of a run; 0 for those of a run.
     """
 
     def __init__(
@@ -83,8 +86,10 @@ class Grids:
         pixels: int | None = None,
         one_line: bool = False,
         places: Places | None = None,
+        judging_cells: int = 0,
     ) -> None:
         self.bench, self.settings, self.places = bench, settings, places
+        self.judging_cells = judging_cells
         self.physics = Physics.with_effects(bench, settings.effects)
         if settings.raster:
             by_fft = self.physics.geometry.model_copy(update={"mask_fft": True, "mask_cells": settings.raster_cells})
@@ -142,18 +147,12 @@ def _fine(made: Grids) -> Bundle:
     return Bundle(made.cells(settings.subdivision, reach=settings.reach), 1, settings.depths, lamps=made.lamp_rows)
 
 
-def _coarse(made: Grids, anchors: int) -> Bundle:
-    settings = made.settings
-    depths = settings.depths if settings.coarse_layers else (settings.depth,)
-    return Bundle(made.cells(settings.coarse_cells, reach=settings.reach), anchors, depths, lamps=made.lamp_rows)
-
-
-def _wide(made: Grids) -> Bundle:
-    settings, width = made.settings, made.settings.followed_width
-    if width == 1:
-        return _coarse(made, settings.followed_anchors)
-    cells = made.cells(1, width, settings.reach)
-    return Bundle(cells, settings.followed_anchors, (settings.depth,), lamps=made.lamp_rows)
+def _coarse(made: Grids, anchors: int, width: int = 1) -> Bundle:
+    """Return cells of coarse light, or cells of several pixels in one layer; the pilot judges by cells of its own."""
+    settings, wide = made.settings, width > 1 and not made.judging_cells
+    depths = settings.depths if settings.coarse_layers and not wide else (settings.depth,)
+    cells = 1 if wide else made.judging_cells or settings.coarse_cells
+    return Bundle(made.cells(cells, width if wide else 1, settings.reach), anchors, depths, lamps=made.lamp_rows)
 
 
 def _sharp(made: Grids) -> Bundle:
@@ -182,8 +181,9 @@ _ROWS = (
     GridRow("sharp", "sharp", _sharp, lambda settings, physics: settings.sharp is not None),
     # What each anchor sees of light over several surfaces, mirrors' and lamps' beyond its mean; and that mean, of light
     # over several surfaces: smooth or small, so coarse cells hold them well.
-    GridRow("indirect_residual", "followed", _wide, lambda settings, physics: settings.followed_anchors > 1,
-            lamps=True),
+    GridRow("indirect_residual", "followed",
+            lambda made: _coarse(made, made.settings.followed_anchors, made.settings.followed_width),
+            lambda settings, physics: settings.followed_anchors > 1, lamps=True),
     GridRow("indirect", "smooth", lambda made: _coarse(made, 1), lambda settings, physics: physics.interreflection),
 )  # fmt: skip
 GRIDS: Mapping[str, GridRow] = MappingProxyType({row.name: row for row in _ROWS})

@@ -79,7 +79,7 @@ def light_bytes(bench: Apparatus, classes: int, settings: Settings, lines: int =
     held = float(entries(bench.n**2, classes, Numbers.of(settings), settings))
     paths = Simulation(bench, settings).paths_at_once
     followed = bool(settings.effects & names(lambda effect: effect.followed))
-    geometry, cells = bench.geometry, bench.n * max(settings.subdivision, settings.coarse_cells) * settings.anchors
+    geometry, cells = bench.geometry, bench.n * settings.subdivision * settings.anchors
     terms = geometry.mask_terms if geometry.mask_terms > FEW else 0
     factors = _TERM_BYTES * terms * max(geometry.frame_shape) * cells * len(settings.depths)
     if settings.raster or geometry.is_drawn(geometry.diffracts):

@@ -205,7 +205,8 @@ class Plan:
         from mitsim.light.passes import PASSES  # with what traces them: a plan that is read needs no renderer
 
         samples = {row.samples_key: row.predicted_samples(self.settings) for row in PASSES.values()}
-        settings = {**asdict(replace(self.settings, samples={})), "effects": sorted(self.settings.effects), **samples}
+        derived = {name: getattr(self.settings, name) for name in ("coarse_cells", "followed_width")}
+        settings = {**asdict(self.settings), "effects": sorted(self.settings.effects), **derived, **samples}
         del settings["samples"]
         own = replace(self, request=None, cost=None, made_of=None, colour=self.colour or self._uncoloured)
         return {**{name: value for name, value in asdict(own).items() if value is not None}, "settings": settings}

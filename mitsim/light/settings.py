@@ -25,6 +25,12 @@ GROUPS = 4
 many kinds, four tell it as well as more (docs/physics.md), and each takes its own accumulating, forming and probing."""
 PATHS_AT_ONCE = 2**21
 """Paths whose light is held in memory at a time."""
+FOLLOWED_WIDTH = 4
+"""Projector pixels a side of a cell for what several anchors see of followed light beyond its mean: little light, of
+many anchors. Where coarse light has finer cells, so has this."""
+CELLS_OF_COARSE = 4
+"""Fine cells a side of a cell of coarse light, where it has all layers: at accuracies of 1e-3 and above it then lies in
+one cell a projector pixel, at 3e-4 in two a side."""
 MOST_PATHS = 2**32
 """Limit of one light's paths: half an hour on two cores, at which sampling stops and says so."""
 
@@ -82,12 +88,9 @@ class Settings:
         pixel, or of a cell of what is followed from the camera. Below 1, one is traced; so it is where nothing is said.
     followed_anchors
         points a side of the sensor that light over several surfaces, or in mirrors, is followed to.
-    followed_width
-        projector pixels a side of a cell for what they see beyond their mean, in one layer; 1: as ``coarse_cells`` and
-        ``coarse_layers`` say.
-    coarse_cells, coarse_layers
-        cells a side of a projector pixel for what anchors see beyond their mean and for indirect light, and whether
-        they have all layers or one.
+    coarse_layers
+        whether coarse light has all layers and finer cells: indirect light, and what anchors see of direct light beyond
+        its mean.
     shared
         whether neighbouring pixels share the second points of indirect light (:mod:`mitsim.transport.path_reuse`).
     repeats
@@ -114,8 +117,6 @@ class Settings:
     effects: frozenset[str] = frozenset()
     samples: Mapping[str, NonNegative] = field(default_factory=dict, hash=False)
     followed_anchors: Count = 1
-    followed_width: Count = 1
-    coarse_cells: Count = 1
     coarse_layers: bool = False
     shared: bool = False
     repeats: tuple[Index, ...] = ()
@@ -132,6 +133,16 @@ class Settings:
         return self.layers or (self.depth,)
 
     @property
+    def coarse_cells(self) -> int:
+        """Cells a side of a projector pixel for coarse light."""
+        return max(self.subdivision // CELLS_OF_COARSE, 1) if self.coarse_layers else 1
+
+    @property
+    def followed_width(self) -> int:
+        """Projector pixels a side of a cell for what anchors of followed light see beyond its mean, in one layer."""
+        return max(FOLLOWED_WIDTH // self.coarse_cells, 1) if self.followed_anchors > 1 else 1
+
+    @property
     def with_own_anchors(self) -> tuple[int, ...]:
         """Occluded pixels, where they have anchors of their own."""
         return self.occluded if self.occluded_anchors > 1 else ()
@@ -139,10 +150,9 @@ class Settings:
 
 # -------- What the pilot measured, by which a plan is made
 
-COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors", "followed_width")
-"""What a plan counts: points of the sensor a side for direct light, depths, cells a side of a projector pixel, points
-of the sensor a side for light that is followed over several surfaces or from the camera, and for direct light of
-occluded pixels, and projector pixels a side of a cell for what the former see beyond their mean."""
+COUNTED = ("anchors", "layers", "cells", "followed_anchors", "occluded_anchors")
+"""Numbers that a plan chooses: points of the sensor a side for direct light, depths, cells a side of a projector pixel,
+points a side for light that is followed over several surfaces or from the camera, and for occluded pixels."""
 _FEWEST_SAMPLES = 1e-3
 """Samples of light without noise: next to none, and above 0 because costs are ratios."""
 _AT_ONCE = 2**13
@@ -242,6 +252,10 @@ class Approximation:
 
     name: str
     count: int = 0
+
+
+WIDE = Approximation("followed_width", FOLLOWED_WIDTH)
+"""Cells of several projector pixels, in one layer, for what anchors see of followed light."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
-"""The cheapest settings that keep an accuracy: from what the pilot measured to settings, their error and their work.
+"""The cheapest settings that keep an accuracy, with their predicted error and work.
 
-Every combination of effects, anchors, layers, cells and coarse cells is predicted: the error that all it leaves out or
-makes coarse adds up to, with its signs; the samples that keep the rest of the budget; and the work of both, at fixed
-paces. The cheapest that fits is taken.
+Every combination of effects, anchors, layers and cells is predicted: the error of all that it leaves out or makes
+coarse, with signs; the samples that keep the rest of the budget; and the work at fixed unit costs. The cheapest
+combination that fits is chosen.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from itertools import chain, combinations, product
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.bench.effects import EFFECTS
+from mitsim.bench.effects import EFFECTS, names
 from mitsim.bench.request import HIGHEST_ACCURACY
 from mitsim.core.arrays import FloatArray
 from mitsim.light.cost_model import (
     FIXED,
+    MIXING,
     Numbers,
+    UnitCosts,
     accumulation_seconds,
     checking_seconds,
-    costly_effects,
     entries,
     in_waves,
     optics_seconds,
@@ -39,6 +40,7 @@ from mitsim.light.settings import (
     COUNTED,
     GROUPS,
     SURE,
+    WIDE,
     Approximation,
     Estimate,
     Number,
@@ -48,49 +50,38 @@ from mitsim.light.settings import (
 )
 
 _MARGIN = 0.95
-"""Part of the accuracy that is planned for: frames that the pilot looks at differ from all by a few percent, and so do
-shots whose error is seen, where it is not that of all."""
+"""Part of the accuracy that is planned for, because the pilot's frames differ from the others."""
 _MOST_ENTRIES = 2.0**25
-"""Entries of one group's accumulated light beyond which settings are not chosen: 12 GB in all
-(`mitsim.light.cost_model`)."""
+"""Most entries of one group's accumulated light: 12 GB in all (:mod:`mitsim.light.cost_model`)."""
 _LUCKY = -1.0
-"""Standard errors below an estimate at which what keeps no accuracy for certain may still keep it: one case in six."""
+"""Standard errors below an estimate at which settings may still keep the accuracy (one in six)."""
 _AS_GOOD = 1.1
-"""Where nothing fits, settings whose error is larger than the least by this count as good as it."""
+"""If nothing fits, settings within this factor of the least error are equivalent."""
 _ONE_HIT = 0.25
-"""Part of the Monte Carlo error that one hit in a group may be of a small target's light."""
+"""Part of the Monte Carlo error that one hit of a small target may be."""
 _OFF_BY_HITS = Estimate(0.75, 1.5)
-"""Hits in a group that a small target's light is off by: groups that meet it equally often show no spread. Root mean
-square of 40 runs of cards of 3 to 10 mm and a rod of 1 x 60 mm in pixels of 55 mm, 400 to 1600 hits; twice that."""
-_COARSE_CELLS = (1, 2, 4, 8)
-"""As for fine light."""
+"""Error of a small target's light [hits in a group] that the spread of groups does not show: root mean square of 40
+runs with 400 to 1600 hits, and twice that."""
 _BOUND_OVER_ERROR = 1.1
-"""Sampling stops by the 95 % bound on its error, which lies so far above its estimate where four groups of many paths
-tell it at best (1.04 to 1.3 in photograph, gift card, corner, metal blade, compact disc, colour checker); predicting
-1.17 saves no time (processor seconds of gift card, compact disc, metal blade, photograph, five seeds: within 3 %)."""
+"""Ratio of the 95 % bound, by which sampling stops, to the error (measured: 1.04 to 1.3)."""
 _UNEVEN_GROUPS = 2.717430025
-"""What the bound's square, over the error's, is taken to grow by for each relative deviation of the noise of groups:
-Student's 95 % quantile for four groups times (4/3)^(1/2)."""
+"""Growth of the squared bound over the error's per relative deviation of the groups' noise: Student's 95 % quantile for
+four groups times (4/3)^(1/2)."""
 _SETTLED = 8
-"""Times that samples and their bound are worked out from each other: to a percent, as each step leaves a third."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Settings, and what they are predicted to leave and to take.
+    """Settings with their predicted error and work.
 
     Attributes
     ----------
-    settings
-        effects, numbers, and samples.
-    systematic
-        error that all that is left out or made coarse adds up to.
-    lacking
-        light that is known to be missing, by where it is; it is added as it is.
+    systematic, lacking
+        error of all that is left out or made coarse, and light in it that is known to be missing, by its cause.
     target, noise
-        Monte Carlo error at which sampling may stop, and which the samples are predicted to leave.
+        Monte Carlo error at which sampling may stop, and the predicted one.
     fits
-        whether the total is within the accuracy, but for what nothing could make up for.
+        True if the total is within the accuracy, apart from errors that no choice avoids.
     work
         seconds at fixed unit costs.
     """
@@ -105,46 +96,26 @@ class Candidate:
 
     @property
     def total(self) -> Estimate:
-        """Predicted error of the frames, all in all."""
+        """Predicted total error of the frames."""
         return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
 
 
 def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
-    """The choice of least work whose predicted total error is below ``accuracy``; failing that, of least error.
+    """Return the choice of least work that keeps ``accuracy``, or of least error if none does.
 
-    What the user switched off, and light that is known to be missing, does not count for that: nothing could make up
-    for it.
-
-    Parameters
-    ----------
-    accuracy
-        relative rms error of the expected frames.
-    pilot_result
-        what the pilot measured.
-    switches
-        effects that the user switches on or off, by name.
-    sure
-        standard errors that are added to an estimate.
+    Errors that no choice avoids are ignored. ``sure`` is the number of standard errors added to each estimate.
     """
     return Candidates(pilot_result, switches).choice(accuracy, sure)
 
 
 class Candidates:
-    """All combinations that the pilot result lets choose from, at any accuracy and however sure: what they leave is
-    added up once.
-
-    Parameters
-    ----------
-    pilot_result, switches
-        as for :func:`cheapest`.
-    """
+    """All combinations that a pilot result permits. Their errors are added up once, for any accuracy."""
 
     def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
         self.pilot_result, self.switches = pilot_result, switches
         self._chosen: dict[tuple[float, float], Candidate] = {}
         counts = [_choices(pilot_result, name, switches) for name in COUNTED]
-        rows = np.array(list(product(*counts, _COARSE_CELLS, (0, 1))), dtype=np.float64)
-        rows = rows[(rows[:, 3] > 1) | (rows[:, 5] == 1)]  # width is that of what several anchors see
+        rows = np.array(list(product(*counts, (0, 1))), dtype=np.float64)
         if pilot_result.occluded:
             # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
@@ -156,7 +127,6 @@ class Candidates:
         ]
 
     def best(self, accuracy: float, sure: float = SURE) -> tuple[_Table, int]:
-        """The table and row of the choice that :func:`cheapest` makes at an ``accuracy``, ``sure`` as it takes it."""
         tables = [each.at(accuracy, sure) for each in self._tables]
         # Most leave out what no choice of numbers makes up for.
         found = [(table, table.best) for table in tables if table.accurate.any()]
@@ -165,20 +135,13 @@ class Candidates:
         return min(found, key=lambda each: each[0].rank(each[1]))
 
     def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
-        """The same, and what it is predicted to leave and to take.
-
-        Parameters
-        ----------
-        accuracy, sure
-            as for :func:`cheapest`.
-        """
         if (accuracy, sure) not in self._chosen:
             table, index = self.best(accuracy, sure)
             self._chosen[accuracy, sure] = table.alone(index).candidate
         return self._chosen[accuracy, sure]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
-        """Seconds at fixed unit costs of that choice and of its truth, and whether it keeps the ``accuracy``."""
+        """Return seconds of the choice and its truth, and True if it keeps ``accuracy``."""
         table, index = self.best(accuracy)
         truth = truth_seconds(self.pilot_result, table.settings(index), FIXED)
         return float(table.work[index]) + truth, bool(table.fits[index])
@@ -187,38 +150,21 @@ class Candidates:
 def predicted_candidate(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
-    """What ``settings`` leave and take with samples of their own for the rest of the budget.
-
-    Parameters
-    ----------
-    accuracy, pilot_result, switches
-        as for :func:`cheapest`.
-    settings
-        effects and numbers.
-    """
+    """Predict the error and work of given ``settings``, with new sample counts for the rest of the budget."""
     return _table_of(accuracy, pilot_result, settings, switches).candidate
 
 
 def _table_of(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
 ) -> _Table:
-    """Predictions of ``settings`` alone; all else as for :func:`cheapest`."""
-    row = np.array([[*counts_of(settings), settings.coarse_cells, settings.coarse_layers]], dtype=np.float64)
+    row = np.array([[*counts_of(settings), settings.coarse_layers]], dtype=np.float64)
     drawn = pilot_result.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
     return _Table(accuracy, pilot_result, (settings.effects, cells), row, _omissions(switches), sure)
 
 
 def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
-    """Work that knowing the pilot result for certain could save, and the part that is known worst.
-
-    Parameters
-    ----------
-    accuracy
-        as for :func:`cheapest`.
-    candidates
-        of the pilot result.
-    """
+    """Return the work that an exact pilot result could save, and the part with the largest uncertainty."""
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
     unsure = _table_of(accuracy, candidates.pilot_result, hopeful.settings, candidates.switches, 0.0).unsure
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
@@ -232,19 +178,10 @@ def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, A
 
 
 class _Table:
-    """Predictions of many choices with the same effects.
+    """Predictions of many choices with the same effects and raster cells (``form``).
 
-    Parameters
-    ----------
-    accuracy, pilot_result, sure
-        as for :func:`cheapest`.
-    form
-        effects that are on, and cells along a pixel of the raster that frames are formed of; 0: a sum of terms.
-    rows
-        (m, 8) anchors, layers, cells, anchors of followed light and of occluded pixels, width of cells of the former,
-        coarse cells, and whether coarse light has all layers.
-    given
-        parts that are left out whatever is chosen.
+    Each of the ``rows`` (m, 6) has the numbers of ``COUNTED``, and 1 if coarse light has all layers. The ``given``
+    parts are left out in any choice.
     """
 
     def __init__(
@@ -262,30 +199,24 @@ class _Table:
         self.numbers = Numbers.of_counts([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
 
     def at(self, accuracy: float, sure: float = SURE) -> _Table:
-        """The same combinations at an ``accuracy``, ``sure`` as :func:`cheapest` takes it: what does not depend on
-        either is shared.
-
-        To be called before anything else is asked of the table.
-        """
+        """Return the same combinations at another ``accuracy``, sharing all that does not depend on it."""
         self._squares_of_given  # noqa: B018 - found once, and copied
         again = copy.copy(self)
         again.accuracy, again.sure = accuracy, sure
         return again
 
     def alone(self, index: int) -> _Table:
-        """A row on its own."""
         form = self.effects, self.raster_cells
         return _Table(self.accuracy, self.pilot_result, form, self.rows[[index]], self.given, self.sure)
 
     def rank(self, index: int) -> tuple[bool, float, float]:
-        """What makes one choice better than another: that it fits, less work, less error."""
+        """Return a key that sorts choices."""
         if not self.fits[index]:
             return True, float(self._avoidable[index]), 0.0
         return False, float(self.work[index]), float(self._avoidable[index])
 
     @cached_property
     def best(self) -> int:
-        """The best row."""
         if self.fits.any():
             chosen = self.fits
         else:
@@ -294,9 +225,8 @@ class _Table:
         return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
 
     def settings(self, index: int) -> Settings:
-        """The settings of a row."""
         numbers = (int(number) for number in self.rows[index])
-        anchors, layers, cells, followed, occluded, width, coarse, all_layers = numbers
+        anchors, layers, cells, followed, occluded, all_layers = numbers
         return Settings(
             depth=self.pilot_result.depth,
             anchors=anchors,
@@ -305,8 +235,6 @@ class _Table:
             effects=self.effects,
             samples={name: float(count[index]) for name, count in self.needed.items()},
             followed_anchors=followed,
-            followed_width=width,
-            coarse_cells=coarse,
             coarse_layers=bool(all_layers),
             shared=self.pilot_result.shared,
             repeats=self.pilot_result.repeats,
@@ -320,7 +248,6 @@ class _Table:
 
     @property
     def candidate(self) -> Candidate:
-        """The choice of the only row."""
         pilot_result = self.pilot_result
         lacking = {
             "light over sharp lobes": pilot_result.unresolved,
@@ -348,18 +275,16 @@ class _Table:
 
     @cached_property
     def _avoidable(self) -> FloatArray:
-        """(m,) systematic error without what is given."""
         return self._systematic(self.sure, self.given)
 
     @property
     def unsure(self) -> dict[Approximation, float]:
-        """By part that the only row leaves, what chance may add to the square of its error."""
+        """Variance that chance may add to the squared error of the only row, by part."""
         weights = {part: float(self._weight(part)[0]) for part in self.pilot_result.changes.parts}
         errors = {part: self.pilot_result.error(part) for part, weight in weights.items() if weight}
         return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
 
     def _systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
-        """(m,) what all that is left out or made coarse adds up to, but for parts that are ``ignored``."""
         apart = self.pilot_result.apart
         drawn = [
             size**2 for name, size in apart.items() if name not in self.effects and Approximation(name) not in ignored
@@ -376,56 +301,49 @@ class _Table:
         return self._squares(self.given)
 
     def _squares(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
-        """(m,) square of what all that changes the frames adds up to, but for parts that are ``ignored``, and its
-        standard error."""
         changes = self.pilot_result.changes
         return changes.squared_errors(
             np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
         )
 
     def _weight(self, part: Approximation) -> FloatArray:
-        """(m,) how much of a part's change each row leaves."""
+        """Return the (m,) fraction of a part's change that each row leaves."""
         light, _, what = part.name.rpartition(" ")
-        numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse_cells)
+        # Errors of even cells are of second order in their size.
+        numbers, finer_cells = self.numbers, np.square(1 / self.numbers.coarse[0])
         if not part.count:
             return np.full(len(self.rows), float(part.name not in self.effects))
         if not light:
             left = np.asarray(float(bool(self.effects & FOLLOWED) or not part.name.startswith("followed")))
-            if part.name == "followed_width":
-                left = left * (numbers.followed_anchors > 1) * (finer_cells if part.count == 1 else 1.0)
+            if part == WIDE:
+                return np.asarray((numbers.followed_anchors > 1) * finer_cells * left)
             return np.asarray((getattr(numbers, part.name) == part.count) * left, dtype=np.float64)
         row = PASSES[light]
         lit = row.connections(numbers) > 0 if row.anchors else numbers.indirect > 0
-        # Even cells are of second order; several layers leave as much of one layer's error as they do of direct light.
+        # Several layers leave as much of one layer's error as they do of direct light.
         return np.asarray(lit * (finer_cells if what == "cells" else self._left_by_layers))
 
     @cached_property
     def _left_by_layers(self) -> FloatArray:
-        """(m,) part of one layer's error that the layers of coarse light leave."""
         ladder = self.pilot_result.ladders["layers"]
         parts = np.zeros(max(ladder) + 1)
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
-        return np.where(self.rows[:, 7] > 0, parts[self.rows[:, 1].astype(int)], 1.0)
+        return np.where(self.rows[:, 5] > 0, parts[self.rows[:, 1].astype(int)], 1.0)
 
     # ---- samples and work
 
     @cached_property
     def accurate(self) -> npt.NDArray[np.bool_]:
-        """(m,) whether anything is left for sampling."""
         return self._avoidable < _MARGIN * self.accuracy
 
     @cached_property
     def fits(self) -> npt.NDArray[np.bool_]:
-        """(m,) whether anything is left for sampling, and the light can be held."""
         return self.accurate & (self._entries <= _MOST_ENTRIES)
 
     @cached_property
     def target(self) -> FloatArray:
-        """(m,) Monte Carlo error at which sampling may stop.
-
-        Where looks see the error of all shots, it needs no margin; what the pilot saw of a few frames does.
-        """
+        """(m,) Monte Carlo error at which sampling may stop. Checks of all shots need no margin."""
         forming, left = self.pilot_result.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
         margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
         target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
@@ -437,7 +355,6 @@ class _Table:
 
     @cached_property
     def _work_of_sample(self) -> dict[str, Number]:
-        """(m,) work of one sample in every group, by kind of light."""
         lines = traced_for(self.pilot_result.forming.lines, self.pilot_result.forming.parted)
         return {
             name: lines * GROUPS * FIXED.passes[name] * sample_cost.paths * PASSES[name].connections(self.numbers)
@@ -446,12 +363,11 @@ class _Table:
 
     @cached_property
     def samples(self) -> dict[str, FloatArray]:
-        """(m,) samples of a group by kind of light, as they are traced."""
         return {name: np.asarray(PASSES[name].whole(count)) for name, count in self.needed.items()}
 
     @cached_property
     def needed(self) -> dict[str, FloatArray]:
-        """(m,) samples of a group by kind of light, or the part of one: the least work for a sum of variances."""
+        """(m,) samples of a group, by pass, possibly below one: the least work for a sum of variances."""
         parts = {
             name: np.sqrt(self._by_row(name, lambda cost: cost.variance) * price)
             for name, price in self._work_of_sample.items()
@@ -471,7 +387,6 @@ class _Table:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """(m,) Monte Carlo error that these samples leave."""
         total = np.zeros(len(self.rows))
         for name, count in self.samples.items():
             left = self._by_row(name, partial(_noise_after, samples=count))
@@ -479,8 +394,6 @@ class _Table:
         return np.sqrt(total)
 
     def _by_row(self, name: str, of: Callable[[SampleCost], Number]) -> FloatArray:
-        """(m,) something ``of`` the light ``name``: where there are several anchors, direct light goes to random points
-        of the sensor."""
         found = of(sample_costs(self.pilot_result, self.effects)[name]) + np.zeros(len(self.rows))
         if name == "direct":
             found = np.where(self.rows[:, 0] > 1, of(self.pilot_result.spread), found)
@@ -488,14 +401,12 @@ class _Table:
 
     @cached_property
     def _entries(self) -> FloatArray:
-        """(m,) of one group's accumulated light."""
         pixels, classes = self.pilot_result.sample_costs["direct"].paths, self.pilot_result.forming.classes
         found = entries(pixels, classes, self.numbers, self.samples)
         return np.asarray(found) + np.zeros(len(self.rows))
 
     @cached_property
     def work(self) -> FloatArray:
-        """(m,) seconds at fixed unit costs."""
         tracing = sum(self.samples[name] * price for name, price in self._work_of_sample.items())
         forming = self.pilot_result.forming
         accumulating = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
@@ -504,8 +415,7 @@ class _Table:
 
 
 def _samples_for(kind: SampleCost, target: Number) -> Number:
-    """Samples at which sampling may stop at a ``target``: by a bound, which lies the further above the error the fewer
-    paths make it."""
+    """Return the samples at which the bound on the error reaches ``target``; fewer heavy paths need more."""
     noise = kind.noise
     light = needed = noise.samples_for(target)
     if noise.spread:
@@ -520,13 +430,11 @@ def _noise_after(kind: SampleCost, samples: Number) -> Number:
 
 
 def counts_of(settings: Settings) -> tuple[int, ...]:
-    """The numbers in ``settings`` that :data:`COUNTED` names."""
     numbers = Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
 
 
 def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
-    """Numbers of ``name`` that the user leaves to choose from."""
     counts = list(pilot_result.ladders[name])
     if name not in switches or len(counts) == 1:
         return counts
@@ -534,7 +442,6 @@ def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool])
 
 
 def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
-    """What is left out by the user's choice."""
     off = {name for name, on in switches.items() if not on}
     if "anchors" in off:
         off.add("occluded_anchors")
@@ -542,7 +449,7 @@ def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
 
 
 def _subsets(pilot_result: PilotResult, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
-    """Effects that may be on together: those that take no time always are, unless the user switches them off."""
+    """Yield sets of effects that may be on together."""
     takes_time, present = costly_effects(), frozenset(pilot_result.effects)
     free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
     always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
@@ -550,20 +457,34 @@ def _subsets(pilot_result: PilotResult, switches: Mapping[str, bool]) -> Iterato
         yield frozenset(always | set(several))
 
 
+def costly_effects() -> frozenset[str]:
+    """Return the names of effects that take time."""
+    traced = frozenset[str]().union(*(row.effects for row in PASSES.values()))
+    return traced | names(lambda effect: effect.in_shadow) | {MIXING}
+
+
+def unit_costs_of(pilot_result: PilotResult) -> UnitCosts:
+    """Return the measured unit costs, and the fixed ones where nothing was measured."""
+    # All matrix work is as much slower or faster as the products.
+    slower = (pilot_result.forming.product or FIXED.product) / FIXED.product
+    measured = {name: cost.seconds for name, cost in pilot_result.sample_costs.items() if cost.seconds}
+    matrices = {name: slower * getattr(FIXED, name) for name in ("frame", "product", "entry", "accumulated", "pixel")}
+    ray = pilot_result.spread.seconds * FIXED.ray / FIXED.passes["direct"] or FIXED.ray
+    return UnitCosts(passes={**FIXED.passes, **measured}, ray=ray, **matrices)
+
+
 # -------- The finest accuracy that a time buys
 # Accuracies are tried on a grid, by bisection: more seconds never buy a coarser one.
 
 FIRST_ACCURACY = 1e-3
-"""Accuracy of the look that tells what accuracies cost: a looser one takes as long."""
+"""Accuracy of the first pilot run; a looser accuracy takes as long."""
 _STEPS, _DECADES = 10, 5
-"""Accuracies a decade: neighbours differ by a quarter, as predictions of time are good to. The finest, 1e-5, is
-a thirtieth of what sensors tell, and ladders of anchors and cells end near it."""
+"""Tried accuracies per decade, and decades. The finest, 1e-5, is near the end of the ladders of anchors and cells."""
 
 
 @dataclass(frozen=True)
 class AccuracyForTime:
-    """An ``accuracy``, the ``seconds`` that its run is predicted to take at fixed unit costs, and whether that
-    ``fits``."""
+    """An ``accuracy``, the predicted ``seconds`` of its run, and True if these fit the given time."""
 
     accuracy: float
     seconds: float
@@ -571,25 +492,12 @@ class AccuracyForTime:
 
 
 def accuracies(finest: float) -> list[float]:
-    """Those that are tried, from the loosest down to ``finest``."""
     steps = (float(f"{10 ** (-step / _STEPS):.3g}") for step in range(_DECADES * _STEPS + 1))
     return [HIGHEST_ACCURACY, *(each for each in steps if finest <= each < HIGHEST_ACCURACY)]
 
 
 def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kept: bool = True) -> AccuracyForTime:
-    """The finest accuracy whose light, frames and truth take at most so many seconds; the loosest where none does.
-
-    Parameters
-    ----------
-    candidates
-        choices.
-    seconds
-        for light, frames and truth.
-    finest
-        accuracy that the pilot result is good for.
-    kept
-        whether the choice must be predicted to keep the accuracy; else only its price counts.
-    """
+    """Return the finest accuracy whose light, frames and truth take at most ``seconds``, or the loosest."""
 
     def try_accuracy(accuracy: float) -> AccuracyForTime:
         taken, keeps = candidates.seconds(accuracy)
@@ -612,15 +520,7 @@ def accuracy_for_time(candidates: Candidates, seconds: float, finest: float, kep
 
 
 def time_warnings(found: AccuracyForTime, seconds: float, around: float) -> Iterator[str]:
-    """Why a plan is flagged: more time was needed than was given.
-
-    Parameters
-    ----------
-    found
-        what was chosen.
-    seconds, around
-        that were asked for, and that all but light, frames and truth takes.
-    """
+    """Yield a warning if the run needs more than ``seconds``, of which ``around`` are for other stages."""
     if not found.fits:
         yield (
             f"{seconds:g} seconds are too few: even accuracy {found.accuracy:g}, which was taken, is predicted to take "

@@ -1,8 +1,7 @@
-"""Deciding a plan: measured pilot result and an accuracy in; what is simulated, why, and what it costs, out.
+"""The plan of a choice: rows that say what is simulated and why, warnings, and light that frames lack in any plan.
 
-Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, all in all:
-what is left out, what is made coarse, and sampling. The cheapest settings that are predicted to keep it are chosen
-(:mod:`mitsim.planner.choose`).
+Accuracy is the relative rms error of the expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from all
+that is left out, all that is made coarse, and sampling.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.effects import EFFECTS, Effect
@@ -20,17 +20,15 @@ from mitsim.light.cost_model import (
     UnitCosts,
     accumulation_seconds,
     checking_seconds,
-    costly_effects,
     entries,
     optics_seconds,
     tracing_seconds,
     truth_seconds,
-    unit_costs_of,
 )
 from mitsim.light.passes import FOLLOWED
 from mitsim.light.plan import LEFT_OUT, NO_TIME, ONE, WITHOUT, Plan, PlanRow, State
-from mitsim.light.settings import Estimate, PilotResult, Settings
-from mitsim.planner.choose import Candidate, cheapest, predicted_candidate
+from mitsim.light.settings import COUNTED, WIDE, Estimate, PilotResult, Settings
+from mitsim.planner.choose import Candidate, cheapest, costly_effects, counts_of, predicted_candidate, unit_costs_of
 from mitsim.transport.missed import polished_shapes
 from mitsim.transport.plugins.base import turn_and_origin
 
@@ -41,32 +39,18 @@ if TYPE_CHECKING:
 
 
 _GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"
-"""What is said of a scene in greys."""
 _FEW_WAVELENGTHS = 2
-"""Mean width of a mask's openings below which scalar waves, and shadows, are a guess: half the openings of codes and of
-random masks are one feature, which is half the mean and a wavelength then."""
+"""Mean width of a mask's openings, in wavelengths, below which scalar diffraction is a guess."""
 _VAGUE = 2.0
-"""An estimate whose bound is above this much of it is reported as a bound."""
+"""An error is reported as a bound if its bound is larger than this multiple of its estimate."""
 
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What a plan says of a bench's devices besides the pilot's pilot result.
+    """Facts about a bench that a plan reports.
 
-    Attributes
-    ----------
-    notes
-        what to say of an effect that the bench has, by name.
-    keystone
-        how far the projector's window is off a square [projector pixels].
-    warnings
-        what the model of the devices does not cover, and which of the scene's light frames are known to lack.
-    shapes
-        where the scene's shapes are written, if that is known.
-    mirrors
-        those of them that reflect or bend light into single directions.
-    spectrum
-        what to say of colours.
+    ``keystone`` is the deviation of the projector's window from a square [projector pixels], ``mirrors`` are tags of
+    mirrors and curved glass, and ``spectrum`` is the row of colours.
     """
 
     notes: Mapping[str, str]
@@ -78,7 +62,7 @@ class SceneFacts:
 
     @classmethod
     def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
-        """The facts of ``bench``, without what effects that the user's ``switches`` put out would bring."""
+        """Collect the facts of ``bench``, without those of effects that the user's ``switches`` turn off."""
         loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
         warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
         notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
@@ -88,7 +72,6 @@ class SceneFacts:
 
 
 def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
-    """What the model of a ``bench``'s devices does not cover, of effects that are not ``off``."""
     geometry, waves = bench.geometry, "diffraction" not in off
     if bench.projector.glare and bench.loaded.mirrors and not {"glare", "mirrors"} & set(off):
         yield (
@@ -145,41 +128,26 @@ def explain_plan(
     switches: Mapping[str, bool] | None = None,
     chosen: Candidate | None = None,
 ) -> Plan:
-    """Choose effects, anchors, layers, cells and samples.
-
-    Parameters
-    ----------
-    accuracy
-        relative rms error of the expected frames.
-    pilot_result
-        what the pilot measured.
-    facts
-        what to say of the devices.
-    switches
-        effects that the user switches on or off, by name.
-    chosen
-        the choice, where it is known.
-    """
+    """Choose effects, numbers and samples, and explain the choice; ``chosen`` is the choice if it is known."""
     check_accuracy(accuracy)
     switches = switches or {}
     chosen = chosen or cheapest(accuracy, pilot_result, switches)
-    words = _Words(accuracy, pilot_result, chosen, facts, switches)
+    explanation = _Explanation(accuracy, pilot_result, chosen, facts, switches)
     stages = _stages(pilot_result, chosen.settings, unit_costs_of(pilot_result))
     return Plan(
         accuracy=accuracy,
-        effects=words.rows,
+        effects=explanation.rows,
         predicted_seconds=sum(stages.values()),
         settings=chosen.settings,
         sampling_target=chosen.target,
         systematic_error=chosen.systematic.value,
         systematic_bound=chosen.systematic.bound,
-        warnings=facts.warnings + words.warnings,
+        warnings=facts.warnings + explanation.warnings,
         predicted=stages,
     )
 
 
 def _stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
-    """Seconds of transport, truth and optics."""
     forming, numbers = pilot_result.forming, Numbers.of(settings)
     tracing = tracing_seconds(pilot_result, settings, costs)
     held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
@@ -193,8 +161,37 @@ def _stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> 
 
 
 @dataclass(frozen=True)
-class _Words:
-    """What a plan says of its choice."""
+class _NumberRow:
+    """Row of a number that the plan chooses: words for one and for several, and settings with one."""
+
+    setting: str
+    one: str
+    several: str
+    with_one: Mapping[str, Any] = field(default_factory=dict)
+    absent: str = ""
+
+
+_FALLOFF = "falloff, gloss and parallax"
+_FOLLOWED = "light over several surfaces, in mirrors and of lamps"
+_HIDDEN = "{hidden} projector pixels are hidden from part of the sensor"
+_NUMBERS = (
+    _NumberRow("anchors", f"{_FALLOFF} over the sensor: one anchor", f"{_FALLOFF}: {{n}}x{{n}} anchors",
+               {"anchors": 1, "occluded_anchors": 1}),
+    _NumberRow("layers", "the light is seen at {depth:.1f} mm; one layer",
+               "the light is seen from {near:.0f} to {far:.0f} mm; {n} layers", {"layers": ()}),
+    _NumberRow("cells", *["{n}x{n} cells of even light a projector pixel"] * 2),
+    _NumberRow("followed_anchors", f"{_FOLLOWED}: one point",
+               f"{_FOLLOWED}: {{n}}x{{n}} in cells of {{width}}x{{width}} pixels", {"followed_anchors": 1},
+               "no light over several surfaces, in mirrors or of lamps is followed"),
+    # Separate anchors for these pixels save time: as many anchors for all pixels would take far more.
+    _NumberRow("occluded_anchors", f"{_HIDDEN}: one anchor", f"{_HIDDEN}: {{n}}x{{n}} anchors", {},
+               "few anchors serve all projector pixels"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """Rows and warnings of a plan for its choice."""
 
     accuracy: float
     pilot_result: PilotResult
@@ -204,156 +201,131 @@ class _Words:
 
     @property
     def rows(self) -> tuple[PlanRow, ...]:
-        """A row for each effect and discretisation."""
-        effects = (self._effect(effect) for effect in EFFECTS.values())
-        anchors = self._anchors(), self._followed_anchors(), self._occluded_anchors()
-        counted = (anchors[0], self._layers(), self._cells(), *anchors[1:], *self._shadow())
-        return (*counted, *effects, *_fixed_rows(self.facts))
+        keystone = self.facts.keystone
+        fixed = (
+            PlanRow(
+                "keystone",
+                "exact" if keystone else "off",
+                f"the projector's window is {keystone:.1f} of its pixels off a square; responses are not separable"
+                if keystone
+                else "the projector faces the aligned plane squarely",
+                None if keystone else 0.0,
+                0.0,
+            ),
+            self.facts.spectrum,
+            PlanRow(
+                "sensor-noise", "exact", "Poisson, full well, read noise and quantisation of each frame", None, 0.0
+            ),
+        )
+        effects = map(self._of_effect, EFFECTS.values())
+        return (*map(self._of_number, _NUMBERS), *self._of_shadow(), *effects, *fixed)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the frames will not keep the accuracy."""
-        chosen, accuracy, missing = self.chosen, self.accuracy, self.pilot_result.unresolved
+        chosen, accuracy, result = self.chosen, self.accuracy, self.pilot_result
         if chosen.total.bound <= accuracy:
             return ()
         sentences, parts = [], self._bounds_by_part()
-        if missing > accuracy:
+        if result.unresolved > accuracy:
             sentences.append(
-                f"{missing:.0%} of the direct light comes over lobes too sharp to sample, and the frames lack "
-                "most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
+                f"{result.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames "
+                "lack most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
             )
         largest = max(parts, key=lambda name: parts[name])
-        shapes, mirror = self.facts.shapes, self.pilot_result.mirror
-        if mirror is not None and shapes and self.pilot_result.left_out >= min(accuracy, parts[largest]):
-            sentences.append(self._left_out(shapes[mirror]))
-        if self.facts.mirrors and self.pilot_result.unresolved_specular >= min(accuracy, parts[largest]):
-            sentences.append(self._unresolved_specular(self.facts.mirrors))
+        counts, shapes, mirrors = min(accuracy, parts[largest]), self.facts.shapes, self.facts.mirrors
+        if result.mirror is not None and shapes and result.left_out >= counts:
+            sentences.append(
+                _refusal(
+                    shapes[result.mirror],
+                    f"{result.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
+                    "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; "
+                    "turn it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect "
+                    "interreflection",
+                )
+            )
+        if mirrors and result.unresolved_specular >= counts:
+            kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
+            among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+            sentences.append(
+                _refusal(
+                    mirrors[0],
+                    f"{result.unresolved_specular:.2g} of the light comes over the scene's mirrors and curved glass "
+                    f"alone ({among}; this is the first), in beams too fine to be placed on the sensor: it is left "
+                    "out, or in the wrong pixels; use fewer or larger ones, move them apart, or make them rough",
+                )
+            )
         return tuple(sentences) or (
             f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
             f"largest: {largest}, {parts[largest]:.1e}",
         )
 
-    def _unresolved_specular(self, mirrors: tuple[Tag, ...]) -> str:
-        """What is lost of light over ``mirrors`` alone."""
-        kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in mirrors)
-        among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-        rule = (
-            f"{self.pilot_result.unresolved_specular:.2g} of the light comes over the scene's mirrors and curved glass "
-            f"alone ({among}; this is the first), in beams too fine to be placed on the sensor: it is left out, or in "
-            "the wrong pixels; use fewer or larger ones, move them apart, or make them rough"
-        )
-        return str(mirrors[0].refusal("shape", repr(mirrors[0].attributes.get("type", "")), rule))
-
-    def _left_out(self, mirror: Tag) -> str:
-        """What is lost over a ``mirror`` or curved glass."""
-        rule = (
-            f"{self.pilot_result.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a "
-            "sharp lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; turn "
-            "it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect interreflection"
-        )
-        return str(mirror.refusal("shape", repr(mirror.attributes.get("type", "")), rule))
-
     def _bounds_by_part(self) -> dict[str, float]:
-        """By what leaves it, the bound on each part of the systematic error."""
-        pilot_result, settings, of_raster = self.pilot_result, self.chosen.settings, self._of_raster
-        anchors, layers, cells = settings.anchors, len(settings.depths), settings.subdivision
-        sharp = settings.sharp
-        followed, occluded, width = settings.followed_anchors, settings.occluded_anchors, settings.followed_width
+        result, settings, raster = self.pilot_result, self.chosen.settings, self._raster_error
+        sharp, width = settings.sharp, settings.followed_width
+        counted = {
+            f"{name.replace('_', ' ')} ({count}{'' if name == 'layers' else f'x{count}'})": result.ladders[name][count]
+            for name, count in self._counts.items()
+        }
         return {
-            f"anchors ({anchors}x{anchors})": self._number("anchors", anchors).bound,
-            f"layers ({layers})": self._number("layers", layers).bound,
-            f"cells ({cells}x{cells})": self._number("cells", cells).bound,
-            f"followed anchors ({followed}x{followed})": self._number("followed_anchors", followed).bound,
-            f"cells of their light ({width} pixels)": self._number("followed_width", width).bound,
-            **({"the mask's raster": of_raster.bound} if of_raster and settings.raster else {}),
+            **{name: error.bound for name, error in counted.items()},
+            **(
+                {f"cells of their light ({width} pixels)": result.error(WIDE).bound / settings.coarse_cells**2}
+                if width > 1
+                else {}
+            ),
+            **({"the mask's raster": raster.bound} if raster and settings.raster else {}),
             **({f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})": sharp.left} if sharp else {}),
-            f"occluded anchors ({occluded}x{occluded})": self._number("occluded_anchors", occluded).bound,
             **self.chosen.lacking,
-            **{f"{name} (off)": e.bound for name, e in pilot_result.effects.items() if name not in settings.effects},
+            **{f"{name} (off)": e.bound for name, e in result.effects.items() if name not in settings.effects},
         }
 
-    def _number(self, name: str, count: int) -> Estimate:
-        return self.pilot_result.ladders[name][count]
+    @cached_property
+    def _counts(self) -> dict[str, int]:
+        return dict(zip(COUNTED, counts_of(self.chosen.settings), strict=True))
 
     def _seconds(self, **changes: Any) -> float:
-        """What the settings take beyond those with ``changes``."""
         settings, costs = self.chosen.settings, unit_costs_of(self.pilot_result)
         with_it, without = (
             sum(_stages(self.pilot_result, each, costs).values()) for each in (settings, replace(settings, **changes))
         )
         return max(with_it - without, 0.0)
 
-    def _without(self, settings: Settings) -> str:
-        """What the total error would be with other ``settings``."""
-        other = predicted_candidate(self.accuracy, self.pilot_result, settings, {})
-        total = math.hypot(other.systematic.bound, self.chosen.noise)
-        return f"{WITHOUT} would be up to {total:.1e}, and {self.accuracy:g} is allowed"
-
-    def _anchors(self) -> PlanRow:
-        side = self.chosen.settings.anchors
-        alone, several = "falloff, gloss and parallax over the sensor: one anchor", "falloff, gloss and parallax"
-        seconds = self._seconds(anchors=1, occluded_anchors=1)
-        return self._row_of_anchors("anchors", alone, f"{several}: {side}x{side} anchors", seconds)
-
-    def _layers(self) -> PlanRow:
-        depths, one = self.chosen.settings.depths, self._number("layers", 1)
-        if len(depths) == 1:
-            reason = f"the light is seen at {self.pilot_result.depth:.1f} mm; one layer leaves {_error_words(one)}"
-            return PlanRow("layers", "off", reason, one.value, 0.0)
-        left = _error_words(self._number("layers", len(depths)))
-        reason = f"the light is seen from {depths[-1]:.0f} to {depths[0]:.0f} mm; {len(depths)} layers leave {left}"
-        return PlanRow(
-            "layers", "approximate", f"{reason}{ONE} {_error_words(one)}", one.value, self._seconds(layers=())
+    def _of_number(self, row: _NumberRow) -> PlanRow:
+        settings, result = self.chosen.settings, self.pilot_result
+        name, count, errors = row.setting.replace("_", "-"), self._counts[row.setting], result.ladders[row.setting]
+        there = {"followed_anchors": settings.effects & FOLLOWED, "occluded_anchors": result.occluded}
+        if not there.get(row.setting, True):
+            return PlanRow(name, "off", row.absent, 0.0, 0.0)
+        reason = (row.one if count == 1 else row.several).format(
+            n=count,
+            depth=result.depth,
+            near=settings.depths[-1],
+            far=settings.depths[0],
+            width=settings.followed_width,
+            hidden=len(result.occluded),
         )
-
-    def _cells(self) -> PlanRow:
-        cells, errors = self.chosen.settings.subdivision, self.pilot_result.ladders["cells"]
-        reason = f"{cells}x{cells} cells of even light a projector pixel leave {_error_words(errors[cells])}"
-        return PlanRow("cells", "approximate", reason, max(error.value for error in errors.values()), 0.0)
-
-    def _followed_anchors(self) -> PlanRow:
-        settings, light = self.chosen.settings, "light over several surfaces, in mirrors and of lamps"
-        if not settings.effects & FOLLOWED:
-            reason = "no light over several surfaces, in mirrors or of lamps is followed"
-            return PlanRow("followed-anchors", "off", reason, 0.0, 0.0)
-        side, width = settings.followed_anchors, settings.followed_width
-        several = f"{light}: {side}x{side}{f' in cells of {width}x{width} pixels' if width > 1 else ''}"
-        seconds = self._seconds(followed_anchors=1)
-        return self._row_of_anchors("followed_anchors", f"{light}: one point", several, seconds)
-
-    def _occluded_anchors(self) -> PlanRow:
-        pixels, side = len(self.pilot_result.occluded), self.chosen.settings.occluded_anchors
-        if not pixels:
-            return PlanRow("occluded-anchors", "off", "few anchors serve all projector pixels", 0.0, 0.0)
-        hidden = f"{pixels} projector pixels are hidden from part of the sensor"
-        # To see them apart saves time: with as many anchors for all pixels, it would take far more.
-        return self._row_of_anchors(
-            "occluded_anchors", f"{hidden}: one anchor", f"{hidden}: {side}x{side} anchors", 0.0
-        )
-
-    def _row_of_anchors(self, count: str, alone: str, several: str, seconds: float) -> PlanRow:
-        """Of the setting ``count``, in words for one and for ``several``."""
-        name, one = count.replace("_", "-"), self._number(count, 1)
-        if (chosen := getattr(self.chosen.settings, count)) == 1:
-            return PlanRow(name, "off", f"{alone} leaves {_error_words(one)}", one.value, 0.0)
-        reason = f"{several} leave {_error_words(self._number(count, chosen))}{ONE} {_error_words(one)}"
-        return PlanRow(name, "approximate", reason, one.value, seconds)
+        left, one = _error_words(errors[count]), errors[1]
+        if row.setting == "cells":
+            worst = max(error.value for error in errors.values())
+            return PlanRow(name, "approximate", f"{reason} leave {left}", worst, 0.0)
+        if count == 1:
+            return PlanRow(name, "off", f"{reason} leaves {left}", one.value, 0.0)
+        seconds = self._seconds(**row.with_one)
+        return PlanRow(name, "approximate", f"{reason} leave {left}{ONE} {_error_words(one)}", one.value, seconds)
 
     @property
     def _waves(self) -> bool:
-        """Whether the mask's shadow is wave-optical."""
         return any(EFFECTS[name].in_shadow for name in self.chosen.settings.effects)
 
     @property
-    def _of_raster(self) -> Estimate | None:
-        """What the raster leaves that is chosen, or one of the fewest cells where the mask may be drawn on one."""
+    def _raster_error(self) -> Estimate | None:
         return self.pilot_result.raster[self._waves].error_left(self.chosen.settings.raster_cells)
 
-    def _shadow(self) -> tuple[PlanRow, ...]:
-        """How frames behind a mask of more than two terms are formed."""
-        left, settings, forming = self._of_raster, self.chosen.settings, self.pilot_result.forming
+    def _of_shadow(self) -> Iterator[PlanRow]:
+        """Describe how frames behind a mask of more than two separable terms are formed."""
+        left, settings = self._raster_error, self.chosen.settings
         if left is None:
-            return ()
+            return
         drawn, costs = self.pilot_result.raster[self._waves], unit_costs_of(self.pilot_result)
 
         def seconds(cells: int) -> float:
@@ -369,41 +341,48 @@ class _Words:
             if cells != fewest and drawn.error is not None:
                 reason += f", {fewest} {_error_words(drawn.error)}"
                 spent = max(by_fft - seconds(fewest), 0.0)
-            return (PlanRow("mask-shadow", "approximate", reason, None, spent),)
-        sums = seconds(0)
-        terms = f"{forming.geometric_terms:.0f} separable terms"
+            yield PlanRow("mask-shadow", "approximate", reason, None, spent)
+            return
+        sums, terms = seconds(0), f"{self.pilot_result.forming.geometric_terms:.0f} separable terms"
         if settings.raster:
             reason = f"{terms}: by FFT {on_raster}, {by_fft:.2g} s, which leaves {leaves}; their sum takes {sums:.2g} s"
-            return (PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0)),)
+            yield PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0))
+            return
         reason = f"{terms} are summed, {sums:.2g} s; by FFT {on_raster}, {by_fft:.2g} s, {leaves} would be left"
-        return (PlanRow("mask-shadow", "exact", reason, left.value, sums),)
+        yield PlanRow("mask-shadow", "exact", reason, left.value, sums)
 
-    def _effect(self, effect: Effect) -> PlanRow:
+    def _of_effect(self, effect: Effect) -> PlanRow:
         settings, name = self.chosen.settings, effect.name
-        on = name in settings.effects
+        on, takes_time = name in settings.effects, name in costly_effects()
         state: State = "exact" if on else "off"
         error = self.pilot_result.effects.get(name)
         if error is None:
             return PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
+        less = settings.effects - {name}
         sentences = [self.facts.notes.get(name, ""), "switched by the user" if name in self.switches else ""]
         sentences.append(f"{LEFT_OUT} {_error_words(error)}")
-        takes_time = name in costly_effects()
-        if on and name not in self.switches:
-            less = replace(settings, effects=settings.effects - {name})
-            sentences.append(self._without(less) if takes_time else NO_TIME)
-        seconds = self._seconds(effects=settings.effects - {name}) if on and takes_time else 0.0
+        if on and name not in self.switches and takes_time:
+            other = predicted_candidate(self.accuracy, self.pilot_result, replace(settings, effects=less), {})
+            total = math.hypot(other.systematic.bound, self.chosen.noise)
+            sentences.append(f"{WITHOUT} would be up to {total:.1e}, and {self.accuracy:g} is allowed")
+        elif on and name not in self.switches:
+            sentences.append(NO_TIME)
+        seconds = self._seconds(effects=less) if on and takes_time else 0.0
         return PlanRow(name, state, "; ".join(filter(None, sentences)), error.value, seconds)
 
 
+def _refusal(tag: Tag, rule: str) -> str:
+    return str(tag.refusal("shape", repr(tag.attributes.get("type", "")), rule))
+
+
 def _error_words(error: Estimate) -> str:
-    """An error as people read it: below its bound where it cannot be told from none."""
+    """Return an error as text, as a bound if it cannot be told from zero."""
     if error.bound == 0:
         return "0"
     return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
 
 
 def _spectrum(bench: Apparatus) -> PlanRow:
-    """What monochrome frames of a ``bench`` leave out of colours, as far as that is known without tracing."""
     if bench.lines is not None:
         nanometres = ", ".join(f"{wave:g}" for wave in bench.lines.wavelengths_nm)
         return PlanRow("spectrum", "exact", f"all is simulated at {nanometres} nm", None, 0.0)
@@ -418,40 +397,17 @@ def _spectrum(bench: Apparatus) -> PlanRow:
     return PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
 
 
-def _fixed_rows(facts: SceneFacts) -> tuple[PlanRow, ...]:
-    keystone = (
-        f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
-        if facts.keystone
-        else "the projector faces the aligned plane squarely"
-    )
-    noise = "Poisson, full well, read noise and quantisation of each frame"
-    return (
-        PlanRow("keystone", "exact" if facts.keystone else "off", keystone, None if facts.keystone else 0.0, 0.0),
-        facts.spectrum,
-        PlanRow("sensor-noise", "exact", noise, None, 0.0),
-    )
-
-
 # -------- Light that frames are known to lack, whatever the plan
 
 
 _PATHS = 2**15
-"""Paths of the pilot's shortest looks, 4 of 2 x 64 x 64: light that these miss is in no plan."""
+"""Paths of the pilot's shortest runs."""
 _FEWEST = 8.0
-"""Hits of a lamp by all paths below which they may meet it so seldom that nobody knows its light: of Poisson's numbers
-about 8, one in 3000 is none."""
+"""Hits of a lamp below which its light may be unknown: a Poisson number of mean 8 is zero once in 3000."""
 
 
 def known_losses(loaded: LoadedScene, effects: Mapping[str, bool]) -> Iterator[str]:
-    """What the factored estimator does not find of a scene; nothing of effects that are switched off.
-
-    Parameters
-    ----------
-    loaded
-        the scene.
-    effects
-        switched on or off by the user.
-    """
+    """Describe light of a scene that the factored estimator does not find, except that of ``effects`` switched off."""
     if effects.get("ambient", True):
         yield from unseen_lamps(loaded, _PATHS, "the factored estimator")
     if effects.get("mirrors", True):
@@ -462,17 +418,7 @@ def known_losses(loaded: LoadedScene, effects: Mapping[str, bool]) -> Iterator[s
 
 
 def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[str]:
-    """Lamps that shine on the sensor itself, and that paths from there do not meet, or hardly.
-
-    Parameters
-    ----------
-    loaded
-        the scene.
-    paths
-        from all over the field stop.
-    estimator
-        whose they are, in words.
-    """
+    """Describe lamps that shine on the sensor directly and that ``paths`` of an ``estimator`` rarely meet."""
     from mitsim.transport.connect import part_of_view, shines_in
 
     for lamp, tag in loaded.small_lamps:

@@ -1,6 +1,6 @@
-"""A short look at a scene before the real work: a bench and a lighting in, numbers that the plan decides by out.
+"""The pilot: short runs of a scene that measure what a plan depends on.
 
-Every error is relative, ``||a - b|| / ||b||``, over up to four shots of the family.
+Every error is relative, ``||a - b|| / ||b||``, over a few shots of the family.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsim.bench import effects
 from mitsim.bench.apparatus import Apparatus
-from mitsim.core.arrays import FloatArray
+from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
@@ -28,88 +28,63 @@ from mitsim.light.settings import (
     PilotResult,
     SampleCost,
     Settings,
+    SharpPixels,
 )
 from mitsim.light.simulation import Simulation
-from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns, PenumbraRuns
-from mitsim.planner.pilot_direct import SMOOTH, DirectRuns, occluded_pixels, sharp_pixels
-from mitsim.planner.pilot_effects import EffectRuns
-from mitsim.planner.pilot_samples import GOOD_ENOUGH, Sample
+from mitsim.planner.pilot_direct import FINER, GOOD_ENOUGH, SHARP_RATE, DirectRuns, Sample
+from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
 from mitsim.scene.darkness import why_dark
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
 
 RUNS = ("cells", "effects", "anchors", "followed", "occluded")
-"""What is looked at apart: cells and layers of direct light, effects switched off, anchors, those of followed light,
-and of occluded pixels."""
+"""Runs: cells and layers of direct light, effects, anchors, anchors of followed light, and of occluded pixels."""
 _RUN_OF = {
     "layers": "cells",
     "cells": "cells",
     "followed_width": "followed",
     **{row.anchors: row.pilot for row in PASSES.values() if row.anchors},
 }
-"""What tells the error of the numbers that a plan chooses."""
-FINER = 4
-"""Samples of a run over those of the look before: standard errors are halved at least."""
+"""Run that measures the error of each number."""
 _ROUGH = 0.5
-"""Part of the accuracy that a few anchors may leave at most before it is asked which pixels are to blame."""
+"""Part of the accuracy that a few anchors may leave before occluded pixels are searched."""
 _OF_FOLLOWED = 0.5
-"""The same for followed light: every further step takes twice as many connections, and its own noise is as large as
-what it tells."""
+"""Part of the accuracy at which more anchors of followed light are no longer tried."""
 _FRAMES_AS_MANY = 20.0
-"""Frames whose forming takes as long as one more change does: four shots seen by four looks, and finer cells."""
 _OF_EFFECTS = 3
-"""Changes that each effect's look takes as long as: it forms all light with and without, and coarse cells besides."""
 _OVER_WORK, _LESS_S = 4.2, 0.6
-"""Seconds of a look over the price of its samples, and less what flat scenes have less: kernels, searches for lobes and
-edges, chains of changes (processor seconds in a new process: photograph 1.0, gift_card 2, corner 3, cookie_bag 7.5; six
-tenths of them by the clock on two cores)."""
+"""Ratio and offset [s] of a pilot's time to the work of its samples."""
 _LOBE_RAYS = 2**22
-"""Rays that look for sharp lobes, some 0.5 s: a lobe of 1e-4 of the hemisphere is met 400 times, a metal ball of 20 mm
-at 370 twelve times on a sensor of 6.4 mm; a quarter of them overlooked it in one plan of twenty."""
+"""Rays that search for sharp lobes, 0.5 s."""
 _CAUSTIC_PATHS = 2**20
-"""Paths that look for light that is left out: a thousandth of the light that all curved glass sends is met 30 times."""
 _FEWEST_HITS = 30.0
-"""Below so many hits the pilot's connections do not tell how much light a lobe sends, nor how noisy it is."""
 _FEWEST_MET = 3.0
-"""Below so many meetings of the projector's own lens the pilot may see none, one time in twenty: where it sees one, the
-run samples until it knows the light; else neither may."""
+"""Hits of the projector's lens below which the pilot may see none (one time in twenty)."""
 _FAINT = 1e-3
-"""Part of the mean light on the sensor below which its centre sees nothing but rounding."""
 _MOST_RAYS = 2**26
-"""Rays that look for what a scene shows while few have met it, some 0.5 s: they meet 2e-4 of the window's width."""
 _MORE = 4
-"""Times as many rays as before: a power of two keeps the places of each pixel's rays even."""
 _LOOSELY = 0.3
-"""Part of the light of highlights that the search for lobes may lack where it has found them: some 30 hits tell it to a
-fifth."""
+"""Part of the light of highlights that the search for lobes may miss."""
 _FEWEST_IN_RUN = 8.0
-"""Hits that a look at a small target must count on: the looks then tell its light to a fifth."""
 _ALIGNED = 1e-6
-"""Relative distance from the aligned plane that is rounding: the plane keeps its exact cells."""
 
 
 # ---- Runs of the pilot, each repeated with more samples ----
 
 
 class PilotRuns:
-    """A look at a scene, as short as it can be at first; each of its runs is repeated with more samples.
+    """Runs of the pilot at a scene. Each can be repeated with more samples.
 
     Parameters
     ----------
-    bench
-        what is looked at.
-    lighting
-        of the family that will be captured.
+    bench, lighting
+        the scene, and the lighting of the family.
     accuracy
-        where the search for enough anchors, layers and cells may stop.
+        accuracy at which finer numbers are no longer tried.
     seed
         root of the random streams.
     lines
-        that share the paths, of which the bench shows one.
-
-    Raises
-    ------
-    MitsimError
-        when no light of the projector reaches the camera, or none passes its mask.
+        lines that share the paths; the bench has one.
     """
 
     def __init__(self, bench: Apparatus, lighting: Lighting, accuracy: float, seed: int, lines: int = 1) -> None:
@@ -117,7 +92,10 @@ class PilotRuns:
         self.present = effects.present(bench)
         first_pilot_run = frozenset(self.present) & effects.names(lambda effect: effect.first_pilot_run)
         first = Simulation(bench, Settings(depth=bench.geometry.scene_distance, effects=first_pilot_run))
-        self._sharp = _sharp(first, seed)
+        pixels, own = bench.n**2, integer(seed, "pilot", "lobes")
+        self._sharp = SharpLight.none(pixels)
+        if bench.loaded.glossy:
+            self._sharp = sharp_light(first.setup, own, max(1, _LOBE_RAYS // pixels))
         depth, centre, hits = _first_light(first, seed, self._sharp)
         # A connection that meets a sharp lobe by chance may be all that the centre sees.
         self._light = self._sharp.rest if self._sharp.irradiance else centre
@@ -138,7 +116,6 @@ class PilotRuns:
             self._look_for_occluded()
 
     def _look_for_occluded(self) -> None:
-        """Give pixels that are hidden from part of the sensor anchors of their own."""
         own = integer(self.seed, "pilot", "occluded")
         occluded = occluded_pixels(Simulation(self.bench, self._base), self.accuracy, own)
         shown = np.isin(self.samples["occluded"].shown, occluded)
@@ -153,17 +130,18 @@ class PilotRuns:
     # ---- More samples: their work, and where they are called for ----
 
     def refine(self, run: str) -> None:
-        """Repeat a ``run`` with so many more samples that its standard errors are halved."""
-        self.samples[run] = self._finer(run)
+        """Repeat a ``run`` with more samples."""
+        self.samples[run] = self.samples[run].finer
         self._measure(run)
         vars(self).pop("pilot_result", None)
 
     def work(self, run: str) -> float:
-        """Work of repeating a ``run``, in seconds at fixed unit costs; infinite where it has all the samples it may."""
-        now, finer = self.samples[run], self._finer(run)
+        """Return the work of repeating a ``run`` [s]; infinite if it cannot take more samples."""
+        now, finer = self.samples[run], self.samples[run].finer
         if (finer.fine, finer.direct) == (now.fine, now.direct):
             return math.inf
-        costs, followed = FIXED.passes, self.switched.paths_per_sample
+        costs, sample_costs = FIXED.passes, self.switched.sample_costs
+        followed = {name: cost.paths for name, cost in sample_costs.items() if name != "sharp"}
         one = forming_seconds(self.forming, Numbers.coarsest(), _FRAMES_AS_MANY, FIXED)
         if run == "cells":
             paths, changes = costs["direct"] * len(finer.shown) * finer.fine, len(self.fine.changes)
@@ -172,7 +150,7 @@ class PilotRuns:
             changes = len(self.anchored.changes)
         elif run == "followed":
             paths = costs["indirect_residual"] * sum(followed.values()) * finer.followed * self.followed.connections
-            changes = len(self.followed.changes)
+            changes = len(self.followed.changes) + 2  # Finer cells, and layers, judge wide cells.
         elif run == "occluded":
             count = len(self.occluded.pixels) if self.occluded else 0
             if self.occluded is None or finer.samples_of_occluded(count) == now.samples_of_occluded(count):
@@ -187,30 +165,23 @@ class PilotRuns:
 
     @property
     def seconds(self) -> float:
-        """What the look took, about, at fixed unit costs."""
+        """Approximate seconds of the pilot at fixed unit costs."""
         repeats = [work / FINER for work in map(self.work, RUNS) if math.isfinite(work)]
         return max(_OVER_WORK * sum(repeats) - _LESS_S, 0.0)
 
     @property
     def _rough(self) -> bool:
-        """Whether a few anchors may leave too much: light that is hidden from part of the sensor, or sharp gloss."""
-        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2).estimate(
-            [Approximation("anchors", SMOOTH)]
-        )
-        return few.bound > _ROUGH * self.accuracy
+        """True if a few anchors may leave too much error."""
+        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2)
+        return few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
-        """What passes from the camera take, by name, as looks of more ``samples`` see it: a lobe that is met in one of
-        a million paths, and brings most of the noise, is in none of the short ones."""
+        """Measure sample costs of light from the camera's side with more ``samples``, by pass."""
         found = {
             "from_camera": self.switched.with_more(samples),
             "camera_residual": self.followed.with_more(self.switched.light, samples),
         }
         return {name: sample_cost for name, sample_cost in found.items() if sample_cost.noise.error}
-
-    def _finer(self, run: str) -> Sample:
-        sample = self.samples[run]
-        return replace(sample, times=FINER * sample.times)
 
     # ---- What is measured, and how frames are formed for it ----
 
@@ -229,9 +200,8 @@ class PilotRuns:
                 )
         elif run == "followed":
             tolerance, lit = self._tolerance(_OF_FOLLOWED), self.switched.received > 0
-            before = vars(self).get("followed")
             others = sample, tolerance, seed, self.fine.judging, lit
-            self.followed = FollowedRuns(bench, self._everything, *others, before=before)
+            self.followed = FollowedRuns(bench, self._everything, *others)
             self.followed.coarse = self._over_tolerance(self.switched.coarse)
         elif run == "occluded":
             if base.occluded:
@@ -243,12 +213,10 @@ class PilotRuns:
             self.anchored.coarse = self._over_tolerance(self.fine.coarse)
 
     def _tolerance(self, part: float = GOOD_ENOUGH) -> float:
-        """Norm of that ``part`` of all light that the capture may leave out."""
         return part * self.accuracy * self.switched.light
 
     def _over_tolerance(self, parts: tuple[float, float]) -> tuple[float, float]:
-        cells, layer = parts
-        return cells / self._tolerance(), layer / self._tolerance()
+        return parts[0] / self._tolerance(), parts[1] / self._tolerance()
 
     @property
     def _everything(self) -> Settings:
@@ -256,7 +224,7 @@ class PilotRuns:
 
     @cached_property
     def forming(self) -> Forming:
-        """How frames are formed."""
+        """What the cost of forming frames depends on."""
         return self.fine.forming(self.lighting)
 
     @cached_property
@@ -265,13 +233,17 @@ class PilotRuns:
 
     @cached_property
     def _left_out(self) -> LeftOut:
-        return _left_out(self.switched.simulation, self.seed)
+        simulation = self.switched.simulation
+        if not self.bench.loaded.mirrors:
+            return LeftOut.none()
+        samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
+        return left_out_light(simulation.setup, simulation.aim, integer(self.seed, "pilot", "caustics"), samples)
 
     # ---- Light that neither rays nor connections find ----
 
     @property
     def _unmet(self) -> float:
-        """Irradiance of glossy balls' highlights that neither the search for lobes nor the looks' rays meet."""
+        """Irradiance of highlights that neither the search for lobes nor ordinary rays meet."""
         if not self.bench.loaded.glossy:
             return 0.0
         every = highlights(self._seen.setup)
@@ -286,7 +258,7 @@ class PilotRuns:
 
     @cached_property
     def pilot_result(self) -> PilotResult:
-        """What has been found."""
+        """Result of all runs."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
         seen = {**anchored.changes, **fine.changes, **switched.changes, **self.followed.changes}
         if self.occluded:
@@ -334,7 +306,7 @@ class PilotRuns:
 
 
 def run_of(part: Approximation) -> str:
-    """The run that tells the error of a ``part``."""
+    """Return the run that measures the error of a ``part``."""
     light, _, _ = part.name.rpartition(" ")
     if light:
         return PASSES[light].pilot if PASSES[light].anchors else "effects"
@@ -345,10 +317,7 @@ def run_of(part: Approximation) -> str:
 
 
 def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
-    """The ``sample`` with so many rays that some meet what the camera sees, where one of each pixel has few ``hits``.
-
-    MitsimError where that takes more than a look may trace.
-    """
+    """Return the ``sample`` with enough rays for a small target; refuse targets that are too small."""
     times = math.ceil(_FEWEST_IN_RUN / (hits * sample.direct)) if hits else 1
     more = replace(sample, times=times * sample.times)
     if times > 1 and hits * more.direct < _FEWEST_IN_RUN:
@@ -360,31 +329,11 @@ def _enough(sample: Sample, hits: float, bench: Apparatus) -> Sample:
     return more
 
 
-def _sharp(simulation: Simulation, seed: int) -> SharpLight:
-    """Direct light over lobes that are too sharp to be met by connections."""
-    pixels = simulation.bench.n**2
-    if not simulation.bench.loaded.glossy:
-        return SharpLight.none(pixels)
-    return sharp_light(simulation.setup, integer(seed, "pilot", "lobes"), max(1, _LOBE_RAYS // pixels))
-
-
-def _left_out(simulation: Simulation, seed: int) -> LeftOut:
-    """Light that no tracer finds, or connections may not meet."""
-    if not simulation.bench.loaded.mirrors:
-        return LeftOut.none()
-    samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
-    return left_out_light(simulation.setup, simulation.aim, integer(seed, "pilot", "caustics"), samples)
-
-
 # ---- Where light is first seen, and how many rays bring it ----
 
 
 def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[float, float, float]:
-    """Where light is seen, 1 / mean(1/z) [mm], how much of it, and how many rays bring it if each pixel sends one.
-
-    From one ray of each projector pixel, or, where hardly one meets what the camera sees, from more. Rays count by
-    their light, as so many equal ones.
-    """
+    """Return the depth of the light, 1 / mean(1/z) [mm], its irradiance, and its hits per ray of a pixel."""
     bench, own = simulation.bench, integer(seed, "pilot", "depth")
     enough = min(_FEWEST_HITS, simulation.bench.n**2 / 4)
     first, samples = 0, 1
@@ -413,7 +362,6 @@ def _first_light(simulation: Simulation, seed: int, sharp: SharpLight) -> tuple[
 
 
 def _equal(values: FloatArray) -> float:
-    """How many equal ``values`` would scatter as much about their sum as these."""
     squares = float(np.square(values, dtype=np.float64).sum())
     return float(values.sum(dtype=np.float64)) ** 2 / squares if squares else 0.0
 
@@ -421,24 +369,13 @@ def _equal(values: FloatArray) -> float:
 # ---- How far from the axis light comes ----
 
 _CONNECTIONS = 2**16
-"""Connections that look for near surfaces, some 10 ms; what they overlook is counted when the light is accumulated."""
 _FLAT = 1e-4
-"""Relative distance of the nearest light from the mean below which the scene is flat: single precision is 1e-7."""
 
 
 def light_reach(simulation: Simulation, seed: int) -> float | None:
-    """Largest tan-angle of direct light at any point of the sensor, seen from its centre; None: that of its depth.
+    """Return the largest tan-angle of direct light, seen from the sensor's centre; None: that of its depth.
 
-    At the field stop's edge the sensor sees surfaces nearer than the mean depth beyond the cells of a flat scene.
-    Found by connections to random points of the sensor, plus a projector pixel for what they did not meet; never more
-    than the nearest light can have.
-
-    Parameters
-    ----------
-    simulation
-        with the depth that the cells are made for.
-    seed
-        of the connections.
+    At the edge of the field stop the sensor sees near surfaces outside the cells of a flat scene.
     """
     bench, depth = simulation.bench, simulation.settings.depth
     if float(bench.loaded.scene.bbox().min.z) > depth * (1 - _FLAT):
@@ -454,3 +391,156 @@ def light_reach(simulation: Simulation, seed: int) -> float | None:
     pixel = max((last - first) / bench.n for first, last in bench.windows_at(depth))
     reach = min(farthest + pixel, simulation.physics.geometry.reach(nearest))
     return reach if reach > simulation.reach else None
+
+
+# -------- Projector pixels whose light is hidden from part of the sensor
+
+_ANCHORS, SMOOTH = 5, 3
+"""Anchors a side that sample light over the sensor, and coefficients a side of its smooth part."""
+_FIRST, _NEAR = 2, 16
+"""Rays of each pixel, and of each pixel near one that is partly hidden."""
+_LEFT = 0.1
+"""Part of the accuracy that may stay on the other pixels."""
+_MOST = 1 / 16
+"""Largest part of the pixels that may be occluded."""
+
+
+def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple[int, ...]:
+    """Return the pixels whose light is hidden from part of the sensor, increasing.
+
+    An object's edge hides light only along a line of projector pixels. All other light is smooth over the sensor.
+    """
+    n, sharp = simulation.bench.n, simulation.settings.sharp
+    pixels = np.setdiff1d(np.arange(n**2), sharp.pixels) if sharp else np.arange(n**2)
+    rough, whole = _roughness(simulation, pixels, _FIRST, seed)
+    rest = (_LEFT * accuracy) ** 2 * whole
+    found = pixels[_most(rough, rest)]
+    every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
+    # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
+    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
+        if looked.sum() + len(near) > 9 * _MOST * n**2:
+            return ()
+        every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
+        looked[near] = True
+        found = _most(every, rest)
+    return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
+
+
+def _beside(found: Labels, n: int) -> Labels:
+    chosen = np.zeros(n**2, dtype=bool)
+    chosen[found] = True
+    return with_neighbours(chosen, n)
+
+
+def _most(rough: FloatArray, rest: float) -> Labels:
+    order = np.argsort(-rough, kind="stable")
+    left = rough.sum() - np.cumsum(rough[order])
+    return order[: int(np.argmax(left <= rest)) + 1] if rough.sum() > rest else order[:0]
+
+
+def _roughness(simulation: Simulation, pixels: Labels, samples: int, seed: int) -> tuple[FloatArray, float]:
+    """Return each pixel's squared light that is not smooth over the sensor, and the square of all light."""
+    light = DirectTracer(simulation.setup, _ANCHORS, pixels=pixels).sums(seed, samples) / samples
+    # Orthonormal polynomials at Chebyshev's nodes, by degree: the discrete cosine transform.
+    angle = (np.arange(_ANCHORS) + 0.5) * np.pi / _ANCHORS
+    basis = np.cos(np.outer(np.arange(_ANCHORS), angle)) * np.sqrt(2 / _ANCHORS)
+    basis[0] /= np.sqrt(2)
+    squares = np.square(basis @ light @ basis.T)
+    smooth = squares[:, :SMOOTH, :SMOOTH].sum(axis=(1, 2))
+    whole = squares.sum(axis=(1, 2))
+    return np.asarray(whole - smooth), float(whole.sum())
+
+
+# -------- Projector pixels that light sharp lobes
+
+_FEW = 8
+_MOST_SHARP = 384
+_LEFT_SHARP = 0.25
+"""Part of the accuracy that interpolation, and pixels not traced separately, may leave."""
+_EVEN = 0.1
+"""Relative variance of an ordinary pixel's connection (photograph: 0.05 to 0.2)."""
+_WORTH = 0.5
+_WELL_MET = 30.0
+_SEEN = 0.5
+_TRIAL, _LARGEST_TRIAL = 16, 2**21
+_MOST_CONNECTIONS = 2.0**29
+"""Connections, 100 s, above which sharp lobes stay unresolved."""
+_RAYS_OF_WINDOW = 64
+
+
+def sharp_pixels(
+    simulation: Simulation, sharp: SharpLight, light: float, accuracy: float, seed: int
+) -> SharpPixels | None:
+    """Return the pixels that are better traced separately, or None; ``light`` is all other direct light [W m^-2].
+
+    A lobe of radius w on a sensor of half-width H is analytic except for poles at distance w, so interpolation between
+    N Chebyshev nodes converges as exp(-N asinh(w / H)) (Trefethen, Approximation Theory, theorem 8.2).
+
+    """
+    if not sharp.irradiance:
+        return None
+    whole, rate = sharp.irradiance + light, math.asinh(sharp.width / simulation.physics.geometry.half_width)
+    anchors = max(2, math.ceil(math.log(1 / (_LEFT_SHARP * accuracy)) / rate))
+    if anchors > _MOST_SHARP or (anchors <= _FEW and sharp.hits >= _WELL_MET):
+        return None
+    order = np.argsort(-sharp.moments, kind="stable")
+    lit = min(int(np.count_nonzero(sharp.moments)), len(order) - 1)
+    moments = np.cumsum(sharp.moments[order])[:lit]
+    paths = _paths(moments, light**2 / len(order) * _EVEN, len(order), anchors)
+    if anchors <= _FEW:
+        count = max(int(np.argmin(paths[1:])) + 1, _unseen(sharp, order[:lit], _LEFT_SHARP * accuracy * whole))
+        if paths[count] > _WORTH * paths[0]:
+            return None
+    else:
+        order = np.argsort(-sharp.by_pixel, kind="stable")
+        held = np.cumsum(sharp.by_pixel[order])[:lit]
+        count = min(int(np.searchsorted(held, sharp.irradiance - _LEFT_SHARP * accuracy * whole)) + 1, lit)
+    # Beside a lobe's light is that of its tails, which ordinary replicates meet as seldom where it is small.
+    pixels = with_neighbours(np.isin(np.arange(len(order)), order[:count]), simulation.bench.n)
+    # One pixel at least stays with the others.
+    if len(pixels) == len(order):
+        pixels = np.sort(order[:count])
+    left = math.exp(-anchors * rate) * sharp.irradiance / whole
+    chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed), left)
+    return chosen if _connections(simulation, chosen, accuracy, seed) <= _MOST_CONNECTIONS else None
+
+
+def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
+    """Return how many pixels to trace separately."""
+    held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
+    settled = (held <= negligible) | (np.square(held) >= _SEEN * moments)
+    return int(np.argmax(settled)) if settled.any() else len(order)
+
+
+def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, seed: int) -> float:
+    if len(chosen.pixels) * chosen.anchors**2 > _MOST_CONNECTIONS:
+        return math.inf
+    tracer = Simulation(simulation.bench, replace(simulation.settings, sharp=chosen)).sharp
+    assert tracer is not None
+    samples = min(max(_LARGEST_TRIAL // tracer.paths_per_sample, 2), _TRIAL)
+    seen = [tracer.trace(integer(seed, half), 0, samples) for half in range(2)]
+    place = [(light.pixel * chosen.anchors + light.anchor_row) * chosen.anchors + light.anchor_column for light in seen]
+    every, where = np.unique(np.concatenate(place), return_inverse=True)
+    parts = np.split(where, [len(place[0])])
+    first, second = (np.bincount(at, light.value, len(every)) for at, light in zip(parts, seen, strict=True))
+    energy = float((first * second).sum())
+    noise = math.sqrt(float(np.square(first - second).sum()) / 2 / energy) if energy > 0 else math.inf
+    return float(tracer.paths_per_sample * samples * (noise / accuracy) ** (1 / SHARP_RATE))
+
+
+def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> FloatArray:
+    """Return (k + 1,) paths, to a factor, with the first 0..k of ``pixels`` traced separately.
+
+    Two kinds of light with variances V and paths P per sample take (sum sqrt(V P))^2.
+    """
+    count = np.arange(len(moments) + 1)
+    apart = np.concatenate([[0.0], moments])
+    rest = np.maximum(moments[-1] - apart, 0) + even
+    return np.asarray(np.sqrt(rest * (pixels - count)) + np.sqrt(apart * count * anchors**2)) ** 2
+
+
+def _window(simulation: Simulation, pixels: Labels, seed: int) -> tuple[float, float, float, float]:
+    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _RAYS_OF_WINDOW)
+    if not seen.value.size:
+        return (0.0, 0.0, 0.0, 0.0)
+    return float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())

@@ -1,14 +1,13 @@
-"""A bench with all effects, and with each switched off, in; what that changes of the frames, and noise of each
-pass, out."""
+"""Changes of the frames by anchors and effects, and the noise of each pass."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,19 +16,23 @@ from mitsim.bench.effects import DIRECT, EFFECTS, FOLLOWED, Effect
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
-from mitsim.light.passes import PASSES
-from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, Noise, SampleCost, Settings
+from mitsim.light.grids import Grid
+from mitsim.light.passes import PASSES, PassTracer
+from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, Noise, SampleCost, Settings
 from mitsim.light.simulation import Simulation, emission
-from mitsim.planner.pilot_anchors import AS_ROUGH
-from mitsim.planner.pilot_direct import SHARP_RATE
-from mitsim.planner.pilot_samples import (
+from mitsim.planner.pilot_direct import (
+    EVEN_CELLS,
     GOOD_ENOUGH,
+    SHARP_RATE,
     Known,
     Sample,
     coarsening_changes,
     heavy_paths,
+    ladder,
     noise,
     norm,
+    shown_pixels,
+    tracer_of,
 )
 from mitsim.transport import records
 from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
@@ -37,32 +40,275 @@ from mitsim.transport.integrator import KINDS
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import PathSamples
 
+_JUDGE = 2
+_AT_ONCE = 2**20
+_AS_ROUGH = 15.0
+"""Limit of the change by one cell, or layer, of what a few anchors see beyond their mean, over that of all their light;
+and of indirect over direct light (measured: at most 9)."""
+_FAINT = 0.6
+_FOLLOWED_JUDGE = 1
 _FOLLOWED = tuple(name for name, row in PASSES.items() if not (row.even or row.anchors))
-"""Passes of light that is followed to one point of the sensor."""
+"""Passes that follow light to one point of the sensor."""
 _OVER_SEVERAL = "indirect", "from_camera"
-"""Those of it that hold light over several surfaces, in mirrors and of lamps alone."""
+"""Those passes that hold only light over several surfaces, in mirrors and of lamps."""
 _WORTH_REPEATING = 0.85
-"""Variance times paths, over that of even ones, below which blocks are followed unevenly: short replicates tell it so
-well."""
 _OF_INDIRECT = 0.2
-"""Part of what indirect light is predicted to take that closer replicates of it may take at most."""
 _WORTH_SHARING_S = 0.5
-"""Seconds of indirect light, at fixed unit costs, from which it is looked at whether shared paths take fewer: to see
-that takes 0.13 to 0.28 processor seconds (metal_blade, corner, cookie_bag), and where they do, they save half."""
+"""Seconds of indirect light above which shared paths are tried."""
 _SHARING, _CLEARLY = 2, 0.7
-"""Replicates that tell whether shared paths take fewer, and the part of others' variance times paths below which they
-are taken to: two tell it to a fifth (corner 0.27, 0.32, 0.34, where four tell 0.31, 0.30, 0.34), and may miss heavy
-paths (cookie_bag 0.98, and the run took 24 processor seconds in place of 20)."""
+"""Replicates that try shared paths, and the ratio of variance times paths below which paths are shared."""
 _OF_CLOSER = 4
-"""Samples of closer replicates over those that tell what layers change of indirect light: it changes alike in all."""
 _OPEN = 0.15
-"""Part of the accuracy that noise may leave open of what coarse cells for indirect light change: a fiftieth of the
-budget's square. Where more is, the capture follows ten times as many paths as the closer replicates, or more (corner at
-5e-4, first replicates: 1e-3 open, and 110 processor seconds in place of 33)."""
+"""Part of the accuracy that noise may hide of the change of indirect light by one cell a pixel."""
+
+
+# -------- Anchors
+
+
+class AnchorRuns:
+    """Frames with fewer anchors. Each anchor is connected to the same points, so that differences have little noise.
+
+    Frames are compared, not radiance, because most of the falloff's error cancels in a frame. One wavelength is enough.
+    ``coarse`` has the changes of such light by one cell a pixel, and by one layer, over the tolerance.
+    """
+
+    _pass = PASSES["anchor_residual"]
+    _stream = "fine"
+    ladder: tuple[int, ...] = (1, 2, 3, 5, 8)
+    few = 3
+
+    def __init__(
+        self,
+        bench: Apparatus,
+        base: Settings,
+        sample: Sample,
+        tolerance: float,
+        seed: int,
+        layers: tuple[float, ...] = (),
+        lit: bool = True,
+    ) -> None:
+        self.bench, self.base, self.sample, self.tolerance = bench, base, sample, tolerance
+        self.layers, self._lit = layers, lit
+        self.traced: dict[int, list[PathSamples]] = {}
+        self.coarse = math.inf, math.inf
+        self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
+        self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
+        self._seen: Callable[[int, tuple[float, ...]], FloatArray] = cache(self._in_cells)
+        self._choose(sample)
+
+    def _choose(self, sample: Sample) -> None:
+        self.pixels = np.setdiff1d(shown_pixels(self.base, sample), self.base.occluded)
+        self._samples, self._lanes = sample.anchored, self.bench.n**2 - len(self.base.occluded)
+
+    def take_over(self, known: Mapping[int, Sequence[PathSamples]]) -> None:
+        """Use ``known`` light of the same samples, by number of anchors, instead of tracing it again."""
+        for anchors, replicates in known.items():
+            self.traced[anchors] = [light.where(np.isin(light.pixel, self.pixels)) for light in replicates]
+
+    @property
+    def paths(self) -> int:
+        return REPLICATES * len(self.pixels) * self._samples
+
+    @property
+    def connections(self) -> int:
+        """Connections of each path to all anchors that were tried."""
+        return sum(part.count**2 for part in self.changes if part.name == self._pass.anchors)
+
+    @cached_property
+    def changes(self) -> dict[Approximation, FloatArray]:
+        """Change of the frames by each number of anchors, and by one cell and one layer."""
+        changes, (cells, layers) = self._until(self.tolerance), self._worth_a_look
+        if not (cells or layers):
+            return changes
+        return {**changes, **coarsening_changes(self._pass.name, self._beyond_mean, layers)}
+
+    @property
+    def _worth_a_look(self) -> tuple[bool, tuple[float, ...]]:
+        most = _AS_ROUGH * norm(self._beyond_mean())
+        cells, layer = (most * part > 1 for part in self.coarse)
+        return cells, self.layers if layer else ()
+
+    @property
+    def of_few(self) -> dict[Approximation, FloatArray]:
+        return self._until(math.inf)
+
+    def _until(self, tolerance: float, judge: int = _JUDGE) -> dict[Approximation, FloatArray]:
+        found = ladder(self.ladder, self._frames, judge, tolerance)
+        return {Approximation(self._pass.anchors, count): change for count, change in found.items()}
+
+    def sample_costs(self, light: float) -> dict[str, SampleCost]:
+        """Return the sample cost of what a few anchors see beyond their mean, by pass."""
+        return {self._pass.name: SampleCost.relative(noise(self._beyond_mean()), light, self._samples, self._lanes)}
+
+    def _beyond_mean(self, cells: int = 1, layers: tuple[float, ...] = ()) -> FloatArray:
+        """Form frames of what a few anchors see beyond their mean; 0 ``cells`` are those of a run."""
+        return self._seen(cells, layers)
+
+    def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
+        known = self._frames(self.few) if cells == 1 and not layers else None
+        return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
+
+    def _beyond(
+        self,
+        simulation: Simulation,
+        replicates: Sequence[PathSamples],
+        frames: FloatArray | None = None,
+        samples: int | None = None,
+    ) -> FloatArray:
+        weights, grids = simulation.mean_weights(self.few), self._grids(simulation)
+        mean = [replicate.average(weights) for replicate in replicates]
+        frames = self._form(grids, replicates, samples) if frames is None else frames
+        return frames - self._form([grid.of_mean for grid in grids], mean, samples)
+
+    @cached_property
+    def _few(self) -> list[PathSamples]:
+        return self._trace(self._simulation(self.few))
+
+    def _at_anchors(self, anchors: int) -> FloatArray:
+        simulation = self._simulation(anchors)
+        return self._form(self._grids(simulation), self._few if anchors == self.few else self._trace(simulation))
+
+    def _simulation(self, anchors: int = 1, cells: int = 1, layers: tuple[float, ...] = ()) -> Simulation:
+        changes: dict[str, Any] = {"coarse_layers": True, "layers": layers} if layers else {}
+        settings = replace(self.base, **changes, **{self._pass.anchors: anchors})
+        return self.sample.simulation(self.bench, settings, one_line=True, judging_cells=cells)
+
+    def _grids(self, simulation: Simulation) -> list[Grid]:
+        name = self._pass.grid
+        lamps = [simulation.ambient[name]] if self.bench.loaded.lamps and name in simulation.ambient else []
+        return [simulation.grids[name], *lamps]
+
+    def _trace(self, simulation: Simulation) -> list[PathSamples]:
+        anchors = self._grids(simulation)[0].bundle.anchors
+        if anchors not in self.traced:
+            tracer = tracer_of(simulation, self.pixels, anchors)
+            self.traced[anchors] = tracer.replicates(self._seeds, self._samples)[0]
+        return self.traced[anchors]
+
+    def _form(self, grids: Sequence[Grid], replicates: Sequence[PathSamples], samples: int | None = None) -> FloatArray:
+        samples = samples or self._samples
+        frames = self.sample.frames(grids[0], replicates, samples)
+        return frames + self.sample.lamps(grids[1], replicates, samples) if len(grids) > 1 else frames
+
+
+class PenumbraRuns(AnchorRuns):
+    """Frames with fewer anchors for occluded pixels.
+
+    A penumbra has kinks, at which N anchors err by about 1 / N^1.5.
+    """
+
+    _pass = PASSES["penumbra"]
+    ladder = (1, 2, 3, 5, 8, 16, 32)
+    few = 5
+
+    def _choose(self, sample: Sample) -> None:
+        self.pixels = np.intersect1d(shown_pixels(self.base, sample), self.base.occluded)
+        self._samples, self._lanes = sample.samples_of_occluded(len(self.pixels)), len(self.base.occluded)
+
+
+class FollowedRuns(AnchorRuns):
+    """Frames with fewer anchors for followed light."""
+
+    _pass = PASSES["indirect_residual"]
+    _stream = "followed"
+    ladder = (1, 2, 3, 5, 8, 12)
+    few = 2
+    passes = "indirect_residual", "camera_residual"
+    """From the projector's side, and from the camera's side."""
+
+    def _choose(self, sample: Sample) -> None:
+        self._samples = sample.followed
+
+    @cached_property
+    def changes(self) -> dict[Approximation, FloatArray]:
+        """Change of the frames by each number of anchors, and by wide cells."""
+        if not self._lit or not _tracers(self._simulation()) or not norm(self._frames(1)):
+            return {}
+        return {**self._until(self.tolerance, _FOLLOWED_JUDGE), WIDE: self._wide}
+
+    def sample_costs(self, light: float) -> dict[str, SampleCost]:
+        """Return the sample costs from the projector's side and from the camera's side."""
+        tracers = self._simulation().at_anchors
+        if not self.changes:
+            return dict.fromkeys(self.passes, SampleCost.none())
+        every = self._beyond_mean()
+        seen = (every, every) if None in tracers else (every - self._from_camera, self._from_camera)
+        return {
+            name: SampleCost.relative(noise(each), light, self._samples, tracer.paths_per_sample)
+            if tracer
+            else SampleCost.none()
+            for name, each, tracer in zip(self.passes, seen, tracers, strict=True)
+        }
+
+    @property
+    def _camera_is_faint(self) -> bool:
+        """True if light from the camera's side needs no more anchors than a few."""
+        if None in self._simulation(self.few).at_anchors:
+            return False
+        return math.sqrt(float(np.square(self._from_camera).sum()) / REPLICATES) < _FAINT * self.tolerance
+
+    @cached_property
+    def _from_camera(self) -> FloatArray:
+        return self._beyond(self._simulation(self.few), self._few_by_tracer[1])
+
+    def with_more(self, light: float, samples: int) -> SampleCost:
+        """Measure the sample cost from the camera's side with more ``samples``."""
+        simulation = self._simulation(self.few)
+        tracer, one = simulation.at_anchors[1], self._simulation().at_anchors[1]
+        if tracer is None or one is None or not self.changes or not light:
+            return SampleCost.none()
+        seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
+        frames = self._beyond(simulation, seen, samples=samples)
+        # The heaviest paths come to one anchor of several: each connection counts.
+        found = Noise.among(frames, light, samples, np.concatenate([replicate.value for replicate in seen]))
+        return SampleCost(found, one.paths_per_sample)
+
+    @property
+    def _wide(self) -> FloatArray:
+        one, (cells, layers) = self._beyond_mean(), self._worth_a_look
+        missing = (self._beyond_mean(2) - one) / (1 - EVEN_CELLS) if cells else np.zeros_like(one)
+        layered = self._beyond_mean(1, layers) if layers else one
+        return np.asarray(layered + missing - self._beyond_mean(0))
+
+    @cached_property
+    def _few(self) -> list[PathSamples]:
+        return _join(self._few_by_tracer)
+
+    @cached_property
+    def _few_by_tracer(self) -> list[list[PathSamples]]:
+        tracers = _tracers(self._simulation(self.few))
+        return [tracer.replicates(self._seeds, self._samples)[0] for tracer in tracers]
+
+    def _at_anchors(self, anchors: int) -> FloatArray:
+        simulation, samples = self._simulation(anchors), self._samples
+        grids, tracers = self._grids(simulation), _tracers(simulation)
+        if anchors == self.few:
+            return self._form(grids, self._few)
+        found = []
+        if anchors > self.few and self._camera_is_faint:
+            tracers = tracers[:1]
+            found.append(self._form(self._grids(self._simulation(self.few)), self._few_by_tracer[1]))
+        each = max(1, _AT_ONCE // (REPLICATES * sum(tracer.paths_per_sample for tracer in tracers)))
+        for first in range(0, samples, each):
+            some = min(each, samples - first)
+            traced = [tracer.replicates(self._seeds, some, first=first)[0] for tracer in tracers]
+            found.append(self._form(grids, _join(traced)))
+        return np.asarray(sum(found))
+
+
+def _tracers(simulation: Simulation) -> list[PassTracer]:
+    return [tracer for tracer in simulation.at_anchors if tracer is not None]
+
+
+def _join(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
+    return [PathSamples.join(replicates) for replicates in zip(*traced, strict=True)]
+
+
+# -------- Effects
 
 
 class Bounced(NamedTuple):
-    """Light from the projector's side, replicate by replicate; what of it is indirect light; and samples of each."""
+    """Light from the projector's side and its indirect part, by replicate, and the samples of each."""
 
     replicates: list[PathSamples]
     indirect: list[PathSamples]
@@ -70,33 +316,18 @@ class Bounced(NamedTuple):
 
     @classmethod
     def of(cls, replicates: list[PathSamples], samples: int) -> Bounced:
-        """That of ``replicates`` of so many ``samples``."""
         indirect = [light.where(light.kind == records.INDIRECT) for light in replicates]
         return cls(replicates, indirect, samples)
 
     @property
     def is_indirect(self) -> bool:
-        """Whether it is all indirect light; else some came over mirrors or curved glass."""
         return sum(light.value.size for light in self.indirect) == sum(light.value.size for light in self.replicates)
 
 
 class EffectRuns:
-    """A bench with all effects; direct and followed light are traced once and reused where they can be.
+    """Frames with all effects and without each. Light is traced once and reused where possible.
 
-    Parameters
-    ----------
-    bench, everything
-        what is traced, and settings with all its effects on.
-    sample
-        shots and samples.
-    seed
-        root of the random streams.
-    layers
-        depths [mm] that judge one layer; none for a flat scene.
-    accuracy
-        what coarse cells change of indirect light is told to a small part of it, where that is cheap.
-    as_direct
-        gives parts that one cell a pixel, and one layer, leave of direct light, as far as known.
+    ``as_direct`` returns the changes of direct light by one cell a pixel and by one layer.
     """
 
     def __init__(
@@ -124,14 +355,13 @@ class EffectRuns:
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by each effect that they have, and by coarse cells for indirect light."""
+        """Change of the frames by each effect, and by one cell and one layer for indirect light."""
         shown = [name for name in EFFECTS if name in self.everything.effects and EFFECTS[name].in_frames]
         found = {Approximation(name): self.frames - self._without(EFFECTS[name]) for name in shown}
         return {**found, **self._coarse}
 
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
-        """Change of the frames by coarse cells for indirect light; none where there is no such light."""
         if self._is_faint or not any(light.value.size for light in self._closer.indirect):
             return {}
         changes = coarsening_changes("indirect", self._indirect, ())
@@ -142,15 +372,15 @@ class EffectRuns:
 
     @cached_property
     def _is_faint(self) -> bool:
-        """Whether so little light is indirect that one coarse cell a pixel, and one layer, serve."""
+        """True if so little light is indirect that one cell a pixel and one layer certainly suffice."""
         direct = sum(float(light.value.sum()) for light in self.direct) / (REPLICATES * self.sample.direct)
         part = self.received / (direct + self.received) if self.received else 0.0
         # Direct light that lies in its cells tells nothing of indirect light.
-        return 0 < AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
+        return 0 < _AS_ROUGH * max(self._as_direct()) * part < GOOD_ENOUGH * self.accuracy
 
     @property
     def coarse(self) -> tuple[float, float]:
-        """Parts that one cell a pixel, and one layer, leave of indirect light."""
+        """Relative changes of indirect light by one cell a pixel, and by one layer."""
         light = norm(self._indirect(1, ())) if self._coarse else 0.0
         if not light:
             return math.inf, math.inf
@@ -159,18 +389,13 @@ class EffectRuns:
         return cells, layer
 
     def _indirect(self, cells: int, layers: tuple[float, ...], seen: Bounced | None = None) -> FloatArray:
-        """Frames of indirect light that was ``seen``, of closer replicates where not given, in coarse cells and layers;
-        of the mean wavelength and of what the shots show alone, as those of :class:`AnchorRuns`."""
         seen = seen or self._closer
         effects = self.everything.effects - {"black-level"}
-        coarse = replace(
-            self.everything, effects=effects, coarse_cells=cells, coarse_layers=bool(layers), layers=layers
-        )
-        simulation = self.sample.simulation(self.bench, coarse, one_line=True)
+        coarse = replace(self.everything, effects=effects, coarse_layers=bool(layers), layers=layers)
+        simulation = self.sample.simulation(self.bench, coarse, one_line=True, judging_cells=cells)
         return self._form(simulation, followed={"indirect": seen.indirect}, samples=seen.samples)
 
     def _noise_of_bounced(self, seen: Bounced) -> float:
-        """Error of a replicate of light that was ``seen``."""
         if seen.is_indirect:
             return noise(self._indirect(1, (), seen))
         followed = self._by_kind({"indirect": seen.replicates})
@@ -178,17 +403,15 @@ class EffectRuns:
 
     @property
     def _closer(self) -> Bounced:
-        """Light from the projector's side in closer replicates."""
         return self._looks[1]
 
     @property
     def _few(self) -> Bounced:
-        """The first of these samples: layers change the same in all of them."""
         return self._looks[0]
 
     @cached_property
     def _looks(self) -> tuple[Bounced, Bounced]:
-        """Looks at the projector's side's light: more where noise hides what coarse cells change."""
+        """First and closer replicates; closer ones if noise hides the change by one cell a pixel."""
         first, tracer = Bounced.of(self.followed["indirect"], self.sample.followed), self.simulation.indirect
         if tracer is None or self._is_faint or not any(light.value.size for light in first.indirect):
             return first, first
@@ -207,30 +430,22 @@ class EffectRuns:
 
     @property
     def received(self) -> float:
-        """Light that is followed, as irradiance at the sensor's centre [W m^-2]."""
+        """Followed light, as irradiance at the sensor's centre [W m^-2]."""
         light = sum(float(replicate.value.sum()) for replicates in self.followed.values() for replicate in replicates)
         return light / (REPLICATES * self.sample.followed)
 
     @property
     def apart(self) -> dict[str, float]:
-        """Error of leaving out each effect that is drawn with the sensor's noise: speckle's contrast."""
+        """Error of leaving out effects that are drawn with the sensor's noise: the speckle contrast."""
         effects = self.everything.effects
         return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
-    @property
-    def paths_per_sample(self) -> dict[str, int]:
-        """Paths in a sample of each tracer."""
-        return {name: paths_per_sample for name, (_, _, paths_per_sample) in self._noise.items()}
-
     def sample_cost(self, name: str) -> SampleCost:
-        """Monte Carlo error of one estimate by the pass ``name``, relative to all light, and its paths."""
-        if name not in self._noise:
-            return SampleCost.none()
-        error, samples, paths_per_sample = self._noise[name]
-        return SampleCost.relative(error, self.light, samples, paths_per_sample)
+        """Return the sample cost of the pass ``name``, relative to all light."""
+        return self.sample_costs.get(name, SampleCost.none())
 
     def with_more(self, samples: int) -> SampleCost:
-        """Sample cost of from-camera light, measured anew by replicates of so many ``samples``."""
+        """Measure the sample cost of light from the camera's side with more ``samples``."""
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
             return SampleCost.none()
@@ -240,8 +455,7 @@ class EffectRuns:
         return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.paths_per_sample)
 
     def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
-        """What light over several surfaces takes, whether that is less where neighbouring pixels share it, and how
-        often each block of pixels is followed in a sample."""
+        """Return the cost of indirect light, True if pixels share paths, and the paths of each block."""
         sample_cost, shared = self._shared_or_not
         repeats, (variance, paths) = self._repeats
         if variance * paths > _WORTH_REPEATING:
@@ -251,7 +465,7 @@ class EffectRuns:
 
     @cached_property
     def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
-        """Paths of each block of pixels in a sample, and what that makes of variance and paths, by other replicates."""
+        """Paths of each block of pixels in a sample, and their effect on variance and number of paths."""
         pixels = self.bench.n
         moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer.indirect]
         repeats = adaptive_counts(np.sum(moments, axis=0))
@@ -263,7 +477,6 @@ class EffectRuns:
 
     @cached_property
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
-        """What light over several surfaces takes, and whether it is shared."""
         plain = self.sample_cost("indirect")
         taken = plain.noise.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
         if not plain.noise.error or taken < _WORTH_SHARING_S:
@@ -283,33 +496,23 @@ class EffectRuns:
     def _sharing(self) -> Simulation:
         return self.sample.simulation(self.bench, replace(self.everything, shared=True))
 
-    @property
-    def sample_costs(self) -> dict[str, SampleCost]:
-        """Sample costs of all passes that are traced to one point of the sensor, and of sharp pixels if there are
-        any."""
-        found = {name: self.sample_cost(name) for name in _FOLLOWED}
-        tracer = self.simulation.sharp
-        return {**found, "sharp": self._sharp_cost(tracer.paths_per_sample)} if tracer else found
-
-    def _sharp_cost(self, paths_per_sample: int) -> SampleCost:
-        """That of pixels that are traced apart, their rate being that of stratified rays."""
-        samples, error = self.sample.sharp(self.simulation), noise(self._form(self.simulation, sharp=self.sharp))
-        return SampleCost.relative(error, self.light, samples, paths_per_sample, SHARP_RATE)
-
     @cached_property
-    def _noise(self) -> dict[str, tuple[float, int, int]]:
-        """Error of a replicate by each tracer, the replicate's samples, and paths of one."""
+    def sample_costs(self) -> dict[str, SampleCost]:
+        """Sample costs of all passes to one point of the sensor, and of sharp pixels."""
         found = {}
         for name, each in self.simulation.passes.items():
-            if name in _FOLLOWED:
-                if name == "indirect":
-                    error, samples = self._noise_of_bounced(self._closer), self._closer.samples
-                else:
-                    samples = self.sample.followed
-                    seen = self._by_kind({name: self.followed[name]})
-                    error = noise(self._form(self.simulation, followed=seen, samples=samples))
-                found[name] = error, samples, each.tracer.paths_per_sample
-        return found
+            samples, paths, rate = self.sample.followed, each.tracer.paths_per_sample, 0.5
+            if name == "sharp":
+                samples, rate = self.sample.sharp(self.simulation), SHARP_RATE
+                error = noise(self._form(self.simulation, sharp=self.sharp))
+            elif name == "indirect":
+                error, samples = self._noise_of_bounced(self._closer), self._closer.samples
+            elif name in _FOLLOWED:
+                error = noise(self._form(self.simulation, followed=self._by_kind({name: self.followed[name]})))
+            else:
+                continue
+            found[name] = SampleCost.relative(error, self.light, samples, paths, rate)
+        return {**dict.fromkeys(_FOLLOWED, SampleCost.none()), **found}
 
     def _without(self, effect: Effect) -> FloatArray:
         effects = self.everything.effects - {effect.name}
@@ -328,7 +531,6 @@ class EffectRuns:
         return simulation.direct.replicates(self.seeds, self.sample.direct)[0]
 
     def _follow(self, simulation: Simulation, name: str) -> list[PathSamples]:
-        """Light of the pass ``name``, replicate by replicate."""
         loaded = self.bench.loaded
         # Light comes over several surfaces only where one sees another.
         none = name in _OVER_SEVERAL and loaded.one_way and not (loaded.lamps or loaded.mirrors)
@@ -342,14 +544,12 @@ class EffectRuns:
 
     @staticmethod
     def _by_kind(followed: dict[str, list[PathSamples]]) -> dict[str, list[PathSamples]]:
-        """Light of several tracers together by its kind, replicate by replicate."""
         replicates = [PathSamples.join(replicates) for replicates in zip(*followed.values(), strict=True)]
         return {
             name: [replicate.where(replicate.kind == kind) for replicate in replicates] for name, kind in KINDS.items()
         }
 
     def _sharp(self, simulation: Simulation) -> list[PathSamples]:
-        """Light of pixels that are traced apart, replicate by replicate."""
         tracer, samples = simulation.sharp, self.sample.sharp(simulation)
         if tracer is None:
             return []
@@ -363,8 +563,6 @@ class EffectRuns:
         sharp: Sequence[PathSamples] = (),
         samples: int | None = None,
     ) -> FloatArray:
-        """Frames of light replicate by replicate, where there is any; ``samples`` of followed light, if not as many as
-        of all."""
         sample, known, physics = self.sample, self._known, simulation.physics
         light, few = emission(physics, sample.lighting), samples or sample.followed
         grids = simulation.grids

@@ -1,4 +1,4 @@
-"""Plans: from a bench, a family's lighting and an accuracy to what is simulated, by as long a look as that is worth."""
+"""Make the plan of a capture from a short pilot run, for a given accuracy or a given time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, ROUNDS, tracing_seconds, unit_costs_of
+from mitsim.light.cost_model import FIXED, ROUNDS, tracing_seconds
 from mitsim.light.memory import frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
@@ -30,45 +30,32 @@ from mitsim.planner.choose import (
     accuracy_for_time,
     predicted_candidate,
     time_warnings,
+    unit_costs_of,
     value_of_refining,
 )
 from mitsim.planner.explain import SceneFacts, explain_plan
 
 OPENING_S = 1.5
-"""Seconds of starting the program and opening a scene (shipped ones: 1.2 to 1.6 on two cores)."""
+"""Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
 _LONGER = 2.0
-"""Seconds of a second, finer look over those of the first (photograph 1.0, corner 1.1, gift_card 1.3, cookie_bag 2.6 at
-a tenth of the accuracy)."""
+"""Seconds of a second, finer pilot over those of the first."""
 _REHEARSED = 2**16
-"""Paths that tell a pass's unit cost at first: a tenth of a second or less."""
 _SELDOM = 3.0
-"""What knowing for certain saves at most, over what a closer look may take for it: the look seldom turns out as hoped
-(corner and cookie_bag at 1e-3: four looks of 1 to 13 s, and no run was the faster for them)."""
+"""Ratio of what a closer run may save to its work below which it is not made: it seldom saves that."""
 _OF_RUN = 0.2
-"""Part of the light's and the frames' work that closer looks may take, all together."""
+"""Part of the work on light and frames that closer runs may take in total."""
 _MORE, _OF_ALL, _TIMED = 4, 0.1, 0.02
-"""Times as many paths as before that tell noise, or a unit cost, next, and the parts of all planned that they are at
-most: noise decides how many are planned, a unit cost only what is said of their seconds."""
 _MOSTLY = 0.75
-"""Part of the tracing that is timed, at fixed unit costs: unit costs of the rest are off by 2 at most, which moves what
-is said of all by less than predictions are good to."""
 _USUAL = 1.5
-"""Times as long as at fixed unit costs that a launch takes at most where it neither compiles a kernel nor is disturbed;
-one of few paths takes longer for itself, and is cheap to repeat."""
+"""Ratio to its fixed cost from which a launch was disturbed, and is repeated."""
 _LEAST_SLOPE = 0.25
-"""Part of a path's seconds in a launch that are its own at least, whatever shorter launches seem to say."""
+"""Smallest part of a path's seconds in a launch that grows with the paths."""
 _HEAVY_PATHS, _MOST_HEAVY_PATHS = 2**19, 2**23
-"""Paths from the camera that are looked at for rare heavy ones, 0.1 s, and at most, 1 s: ten glossy balls of alpha 0.02
-need millions to tell their noise to a factor of two (25 thousand: 3000 too little; two million: 4 once)."""
+"""First and largest number of paths that search for heavy paths, 0.1 s and 1 s."""
 _FEW, _FEWEST = 8.0, 4.0
-"""Heavy paths, as so many equal ones, below which looks go on to the most whatever the run takes, and below which these
-tell nothing of its samples: ten glossy balls of alpha 0.005 need a hundred times those planned, one time in ten."""
 _LEAST, _MOST = 0.7, 5.0
-"""Times the planned work on heavy paths that a run takes in nine cases of ten where more are met: sampling begins with
-0.8 of it (:mod:`mitsim.light.light`), at a unit cost known to a tenth (93, 99, 100 and 95 % of 400 pilots and runs,
-drawn from 1.3e8 paths of balls of alpha 0.02, 0.05 and 0.1 and of a torus)."""
+"""Ratios of actual to planned work on few heavy paths: nine of ten runs lie between."""
 _HEAVIER = 1.25
-"""Tracing that takes so many times as long as planned is planned anew; less is what predictions are good to."""
 
 
 @single_threaded_blas()
@@ -80,7 +67,7 @@ def make_plan(
     switches: Mapping[str, bool] | None = None,
     lines: int = 1,
 ) -> Plan:
-    """Look at the scene for a moment and decide what to simulate.
+    """Run the pilot and choose what to simulate.
 
     Parameters
     ----------
@@ -91,14 +78,9 @@ def make_plan(
     seed
         root of the pilot's random streams.
     switches
-        effects that are switched on or off by name, whatever they are worth.
+        effects that the user switches on or off, by name.
     lines
-        that share the paths, of which the bench shows one; what it takes is time_warnings of all.
-
-    Raises
-    ------
-    MitsimError
-        for a scene that the factored estimator cannot render.
+        lines that share the paths; the bench has one.
     """
     check_accuracy(accuracy)
     _refuse_unfit(bench, switches or {})
@@ -110,8 +92,7 @@ def make_plan(
 
 
 def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]) -> tuple[Candidates, tuple[str, ...]]:
-    """Let ``runs`` look closer as long as that is worth it: what may be chosen then, and what is to be said where they
-    may not, as that would be a large part of the run."""
+    """Repeat pilot runs with more samples while that is worth its work; return candidates and notes."""
     spent = 0.0
     while True:
         candidates = Candidates(runs.pilot_result, switches)
@@ -135,21 +116,9 @@ def _refine(runs: pilot.PilotRuns, accuracy: float, switches: Mapping[str, bool]
 def plan_within(
     bench: Apparatus, lighting: Lighting, seconds: float, seed: int, switches: Mapping[str, bool] | None = None
 ) -> Plan:
-    """The plan of the finest accuracy whose run is predicted to end within so many seconds.
+    """Make the plan of the finest accuracy whose run is predicted to take at most ``seconds`` from the program's start.
 
-    Predicted at fixed unit costs, looking and opening the scene included: the same seconds mean the same plan.
-
-    Parameters
-    ----------
-    bench, lighting, seed, switches
-        as for :func:`make_plan`.
-    seconds
-        from the start of the program to the last file.
-
-    Raises
-    ------
-    MitsimError
-        as :func:`make_plan`.
+    Predictions use fixed unit costs, so that the same time gives the same plan.
     """
     started, switches = time.perf_counter(), switches or {}
     _refuse_unfit(bench, switches)
@@ -174,7 +143,6 @@ def plan_within(
 
 
 def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
-    """MitsimError for a ``bench`` that the factored estimator cannot render; ``switches`` may leave effects out."""
     if bench.loaded.unfit.factored is not None:
         raise bench.loaded.unfit.factored
     if bench.geometry.diffracts and switches.get("diffraction") is not False:
@@ -183,8 +151,6 @@ def _refuse_unfit(bench: Apparatus, switches: Mapping[str, bool]) -> None:
 
 
 def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> Plan:
-    """The plan at an ``accuracy`` of the ``candidates`` that ``runs`` left, with the unit costs of its choice
-    measured."""
     pilot_result, switches, bench = candidates.pilot_result, candidates.switches, runs.bench
     chosen = candidates.choice(accuracy)
     if pilot_result.sharp is not None and Simulation(bench, chosen.settings).from_camera is not None:
@@ -202,11 +168,7 @@ def _decide(runs: pilot.PilotRuns, accuracy: float, candidates: Candidates) -> P
 def _with_heavy_paths(
     runs: pilot.PilotRuns, accuracy: float, chosen: Candidate, switches: Mapping[str, bool]
 ) -> tuple[PilotResult, Candidate]:
-    """What ``runs`` found, and ``chosen`` with samples for rare paths over gloss where these make most of the noise.
-
-    Whether the first samples of a run meet such paths is chance, and where they do not, nothing in it tells that their
-    light is missing. So sampling begins with what looks of ever more paths ask for, the last of a part of the run's.
-    """
+    """Return the pilot result and choice with samples for rare heavy paths, which a run's first samples may miss."""
     plain = tracing_seconds(runs.pilot_result, chosen.settings, FIXED)
     paths = _HEAVY_PATHS
     while True:
@@ -229,15 +191,13 @@ def _with_heavy_paths(
 
 
 def _limit_samples(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
-    """The choice with no more samples of light whose ``paths`` in a run are known than sampling stops at."""
     samples = dict(chosen.settings.samples)
     samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
     return replace(chosen, settings=replace(chosen.settings, samples=samples))
 
 
 def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
-    """Seconds between which nine of ten runs of a ``plan`` end, where few heavy paths bring most of their noise; None
-    where many bring it, whose samples are known."""
+    """Return the seconds between which nine of ten runs end, if few heavy paths make most of their noise."""
     costs, least, most = unit_costs_of(pilot_result), 0.0, 0.0
     for name, seconds in tracing_seconds(pilot_result, plan.settings, costs).items():
         heavy = pilot_result.sample_costs[name].noise.heavy
@@ -250,7 +210,6 @@ def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
 
 
 def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, samples: int) -> float:
-    """What so many ``samples`` of a pass take to be traced and accumulated."""
     accumulator = simulation.accumulator(name, labels, 1)
     started = time.perf_counter()
     simulation.accumulate(name, simulation.passes[name].trace(seed, 0, samples, accumulator), labels, samples)
@@ -260,16 +219,7 @@ def _seconds(simulation: Simulation, name: str, seed: int, labels: Labels, sampl
 
 
 def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Labels, seed: int) -> PilotResult:
-    """The ``pilot_result`` with the seconds that a path takes to be traced and accumulated in a ``simulation`` of the
-    choice: timed of the passes that take most, and as much slower or faster than the fixed ones of the others.
-
-    Parameters
-    ----------
-    pilot_result, simulation
-        what was found, and what was chosen.
-    labels, seed
-        how light is accumulated, and the root of its random numbers.
-    """
+    """Measure the seconds of a path in the passes that take most, and scale the others."""
     own, spread = integer(seed, "pilot", "paces"), pilot_result.spread
     fixed = {name: 0.0 for name in simulation.passes} | tracing_seconds(pilot_result, simulation.settings, FIXED)
     timed, ratios, ray = dict[str, float](), dict[str, float](), 0.0
@@ -298,22 +248,11 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
 
 
 def _paths_of(simulation: Simulation, name: str) -> int:
-    """Paths, or connections, of a sample of a pass."""
     return simulation.passes[name].tracer.paths_per_sample
 
 
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
-    """Seconds of a sample of a pass in a run, and of its paths alone.
-
-    Launches of more and more paths, up to those of the run itself, tell what each launch takes besides its paths.
-
-    Parameters
-    ----------
-    simulation, name
-        what is traced of it.
-    labels, seed
-        how it is accumulated, and the root of its random numbers.
-    """
+    """Return seconds of a sample of a pass in a run, and of its paths alone."""
     each, at_once = simulation.passes[name], simulation.paths_at_once
     planned, paths_per_sample = each.whole, each.tracer.paths_per_sample
     every = GROUPS * planned

@@ -390,11 +390,11 @@ def ablations(settings: Settings, present: frozenset[str]) -> Iterator[tuple[str
     if settings.anchors > 1:
         yield "anchors", replace(settings, anchors=1, occluded_anchors=1)
     if settings.followed_anchors > 1:
-        yield "followed-anchors", replace(settings, followed_anchors=1, followed_width=1)
+        yield "followed-anchors", replace(settings, followed_anchors=1)
     if len(settings.depths) > 1:
         yield "layers", replace(settings, layers=())
     if settings.subdivision > 1:
-        yield "cells", replace(settings, subdivision=1, coarse_cells=1)
+        yield "cells", replace(settings, subdivision=1)
 
 
 # -------- A bench, settings and orders of light in

@@ -165,7 +165,6 @@ def _fill(now: Settings, finer: Settings) -> Settings:
         effects=finer.effects,
         anchors=max(now.anchors, finer.anchors if now.anchors == 1 else 1),
         followed_anchors=max(now.followed_anchors, finer.followed_anchors if now.followed_anchors == 1 else 1),
-        followed_width=finer.followed_width if now.followed_anchors == 1 else now.followed_width,
         occluded_anchors=max(now.occluded_anchors, finer.occluded_anchors if now.occluded_anchors == 1 else 1),
         layers=now.layers or finer.layers,
         subdivision=max(now.subdivision, finer.subdivision if now.subdivision == 1 else 1),
@@ -468,7 +467,7 @@ class Stand:
     def finest(self, plan: Plan) -> Plan:
         """Everything on, and one step finer than ``plan`` in each number."""
         pilot_result, now = self.pilot_result, plan.settings
-        anchors, layers, cells, followed, occluded, _ = (
+        anchors, layers, cells, followed, occluded = (
             next((finer for finer in pilot_result.ladders[name] if finer > count), count)
             for name, count in zip(COUNTED, counts_of(now), strict=True)
         )
@@ -479,9 +478,7 @@ class Stand:
             subdivision=cells,
             effects=frozenset(present(self.bench)),
             followed_anchors=followed,
-            followed_width=max(now.followed_width // 2, 1),
             occluded_anchors=occluded,
-            coarse_cells=min(2 * now.coarse_cells, cells),
             coarse_layers=True,
         )
         return replace(plan, settings=settings)

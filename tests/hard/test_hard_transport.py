@@ -58,7 +58,7 @@ def test_a_lobe_that_would_be_missed_flags_the_plan(
 ) -> None:
     """Too much to trace at 1e-3 and below, 95 % of the light would lack, and no group tell: the plan says so."""
     bench = open_bench(small_scene(**glossy(alpha)))
-    monkeypatch.setattr("mitsim.planner.pilot_direct._MOST_CONNECTIONS", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot._MOST_CONNECTIONS", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 2e-2, 1, {"diffraction": False})
     reported = [warning for warning in plan.warnings if "too sharp" in warning]
     assert bool(reported) is not seen
@@ -86,6 +86,6 @@ def test_light_over_sharp_lobes_alone_flags_the_plan(
     """
     bench = open_bench(small_scene(**glossy(1e-4, sheet=False)))
     assert not any("too sharp" in warning for warning in make_plan(bench, Lighting.uniform(N), 2e-2, 1).warnings)
-    monkeypatch.setattr("mitsim.planner.pilot_direct._MOST_CONNECTIONS", 0.0)
+    monkeypatch.setattr("mitsim.planner.pilot._MOST_CONNECTIONS", 0.0)
     plan = make_plan(bench, Lighting.uniform(N), 1e-2, 1)
     assert plan.systematic_error > 0.9 and any("100% of the direct light" in warning for warning in plan.warnings)

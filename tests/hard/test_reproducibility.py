@@ -26,7 +26,7 @@ from mitsim.light import sampling
 from mitsim.light.light import trace_light
 from mitsim.light.settings import GROUPS, REPLICATES, Approximation, ErrorCovariance, Settings
 from mitsim.optics import forming
-from mitsim.planner import pilot_direct, pilot_samples
+from mitsim.planner import pilot_direct
 from mitsim.planner.planner import make_plan
 from mitsim.transport.direct import DirectTracer
 from tests.physics.judged_scenes import CAMERA_FILE
@@ -166,7 +166,7 @@ def test_sums_do_not_depend_on_threads_of_blas(measured: Recorder) -> None:
     for count in THREADS:
         with threadpool_limits(count):
             naive.add(float(np.vdot(a[0], a[1])))
-            norms.add(pilot_samples.norm(a))
+            norms.add(pilot_direct.norm(a))
             products.add(
                 ErrorCovariance.between({Approximation("a"): a, Approximation("b"): b}, 1.0).products.tobytes()
             )

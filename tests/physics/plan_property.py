@@ -53,10 +53,10 @@ class Error:
 def answer(bench: Bench, shots: Lighting, depth: float, seed: int, sample_work: SampleWork) -> np.ndarray:
     """(groups, shots, pixels, pixels) frames with all that ``bench`` has, all ``depth`` [mm] of the light in layers."""
     names = frozenset(effects.present(bench)) - {"speckle"}
-    base = Settings(depth, subdivision=sample_work.cells, effects=names, coarse_cells=2, coarse_layers=True)
+    base = Settings(depth, subdivision=sample_work.cells, effects=names, coarse_layers=True)
     base = replace(base, followed_anchors=sample_work.followed_anchors)
     settings = replace(base, anchors=sample_work.anchors, layers=_layers(bench, base, seed, sample_work.layers))
-    simulation = Simulation(bench, settings)
+    simulation = Simulation(bench, settings, judging_cells=2)
     counts = {"direct": sample_work.direct, "anchor_residual": max(1, sample_work.direct // 4)}
     groups = []
     for group in range(GROUPS):

@@ -59,7 +59,6 @@ def some_light(bench: Bench) -> Light:
         subdivision=2,
         effects=frozenset({"diffraction", "black-level", "interreflection", "ambient", "mirrors"}),
         followed_anchors=3,
-        followed_width=2,
         sharp=SharpPixels((5,), 3, (-0.05, 0.05, -0.05, 0.05)),
         occluded=(3, 4),
         occluded_anchors=4,

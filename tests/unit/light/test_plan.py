@@ -152,7 +152,7 @@ def test_what_does_not_fit_is_flagged_with_the_largest_part() -> None:
     assert "largest: diffraction (off), 3.0e-01" in warning
     assert found.systematic_error == pytest.approx(0.3, rel=0.01) and "0.001" in warning
     (warning,) = plan(1e-6, ONE_CLASS).warnings
-    assert "largest: followed anchors (2x2), 9.0e-05" in warning, "more cannot be held"
+    assert "largest: layers (4), 5.0e-05" in warning
 
 
 def test_what_nothing_can_make_up_for_does_not_make_the_rest_finer() -> None:

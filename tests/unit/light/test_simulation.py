@@ -152,7 +152,7 @@ def test_ambient_light_is_in_a_dark_capture(bench: Bench) -> None:
 
 
 def test_indirect_light_goes_to_its_own_cells(bench: Bench) -> None:
-    made = simulation(bench, "interreflection", "ambient", subdivision=2, coarse_cells=1)
+    made = simulation(bench, "interreflection", "ambient", subdivision=2)
     assert made.grids["fine"].bundle.cells == tuple(2 * count for count in made.grids["indirect"].bundle.cells)
     labels = np.zeros(N * N, dtype=np.int64)
     found = made.follow(1, 64)

@@ -16,11 +16,11 @@ from mitsim.light.cost_model import (
     predicted_rays,
     tracing_seconds,
     truth_seconds,
-    unit_costs_of,
 )
 from mitsim.light.settings import GROUPS, Forming, Noise, SampleCost, Settings
 from mitsim.optics.fft_shadow import CORRELATION_PRODUCTS
 from mitsim.optics.forming import PROBES
+from mitsim.planner.choose import unit_costs_of
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT, plan
 
 FORMING = Forming(pixels=50, cells=10, lit=0.5, terms=3.0, shots=4, classes=4)
@@ -63,14 +63,13 @@ def test_a_slower_machine_is_slower_in_all_that_it_does_with_matrices() -> None:
         ({}, products(5, 3)),
         ({"layers": 2.0}, 2 * products(5, 3)),
         ({"cells": 4.0}, products(20, 3)),
-        ({"anchors": 2.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
-        ({"anchors": 2.0, "layers": 3.0, "all_layers": 1.0}, 3 * products(5, 3) + 3 * products(10, 3)),
-        ({"indirect": 1.0, "coarse_cells": 2.0}, products(5, 3) + products(20, 3)),
-        ({"followed_anchors": 3.0, "coarse_cells": 2.0}, products(5, 3) + products(60, 3)),
-        ({"followed_anchors": 3.0, "followed_width": 2.0, "all_layers": 1.0}, products(5, 3) + products(15, 3)),
+        ({"anchors": 2.0, "cells": 8.0}, products(40, 3) + products(20, 3)),
+        ({"anchors": 2.0, "layers": 3.0, "coarse_layers": 1.0}, 3 * products(5, 3) + 3 * products(10, 3)),
+        ({"indirect": 1.0}, products(5, 3) + products(10, 3)),
+        ({"followed_anchors": 3.0, "layers": 3.0, "coarse_layers": 1.0}, 3 * products(5, 3) + products(7.5, 3)),
         ({"occluded_anchors": 4.0}, products(5, 3)),
         ({"occluded": 1.0, "occluded_anchors": 4.0}, products(5, 3) + products(2, 3)),
-        ({"occluded": 90.0, "occluded_anchors": 4.0, "coarse_cells": 2.0}, products(5, 3) + products(40, 3)),
+        ({"occluded": 90.0, "occluded_anchors": 4.0}, products(5, 3) + products(20, 3)),
         ({"mixed": 1.0}, products(5, 3) + 4 * 50**2),
     ],
 )
@@ -109,9 +108,9 @@ def test_shadows_take_entries_of_waves_or_a_thirtieth_of_one_without() -> None:
         ({}, 3 * one),
         ({"waves": 0.0}, 0.03 * one),
         ({"cells": 2.0, "layers": 2.0}, 4 * 3 * one),
-        ({"anchors": 2.0, "coarse_cells": 2.0}, (1 + 2) * 3 * one),
+        ({"anchors": 2.0, "cells": 8.0}, (8 + 2) * 3 * one),
         ({"anchors": 2.0, "indirect": 1.0}, (1 + 2) * 3 * one),
-        ({"followed_anchors": 2.0, "followed_width": 4.0, "all_layers": 1.0}, (1 + 0.25) * 3 * one),
+        ({"followed_anchors": 2.0, "coarse_layers": 1.0}, (1 + 0.25) * 3 * one),
     ):
         assert optics_seconds(FORMING, replace(ONE, **change), entries) == pytest.approx(count), change
     many = replace(FORMING, geometric_terms=9.0)
@@ -176,10 +175,11 @@ def test_light_lies_in_the_cells_that_its_samples_reach() -> None:
         (ONE, 2),
         (replace(ONE, cells=2.0), 3),
         (replace(ONE, cells=2.0, layers=4.0), 2 * 3),
-        (replace(ONE, anchors=2.0, coarse_cells=2.0), 2 + 2 * 2**2 * 2 * 4),
-        (replace(ONE, indirect=1.0, coarse_cells=2.0), 2 + 7 * 2**2),
-        (replace(ONE, followed_anchors=2.0, coarse_cells=4.0), 2 + 2 * 2**2 * 2 * 20),
-        (replace(ONE, followed_anchors=4.0, followed_width=2.0, all_layers=1.0), 2 + 2 * 4**2 * 7 / 2**2),
+        (replace(ONE, anchors=2.0, cells=8.0), 3 + 2 * 2**2 * 2 * 4),
+        (replace(ONE, indirect=1.0, cells=8.0), 3 + 7 * 2**2),
+        (replace(ONE, followed_anchors=4.0), 2 + 2 * 4**2 * 7 / 4**2),
+        (replace(ONE, followed_anchors=4.0, cells=8.0), 3 + 2 * 4**2 * 7 / 2**2),
+        (replace(ONE, followed_anchors=4.0, cells=8.0, coarse_layers=0.0), 3 + 2 * 4**2 * 7 / 4**2),
     ):
         assert entries(100, 7, numbers, settings) == 100 * found, numbers
 
@@ -235,14 +235,14 @@ def test_truth_is_as_rough_as_direct_light_where_the_sensor_sees_it() -> None:
 
 
 def test_an_accumulator_is_emptied_and_looked_through_where_it_has_room() -> None:
-    """4 classes of 20 x 20 cells in two layers, where light is followed over several surfaces."""
-    numbers = replace(ONE, indirect=1.0, coarse_cells=2.0, layers=2.0)
-    places = 4 * 20**2 * 2
+    """4 classes of 10 x 10 cells in two layers, where light is followed over several surfaces."""
+    numbers = replace(ONE, indirect=1.0, layers=2.0)
+    places = 4 * 10**2 * 2
     entry = GROUPS * FIXED.accumulated
     assert accumulation_seconds(FORMING, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * places))
     assert accumulation_seconds(FORMING, replace(numbers, indirect=0.0), 1000.0, FIXED) == pytest.approx(entry * 1000)
-    most = 2**26 // 800
+    most = 2**26 // 200
     large = replace(FORMING, classes=most)
-    assert accumulation_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 800))
+    assert accumulation_seconds(large, numbers, 1000.0, FIXED) == pytest.approx(entry * (1000 + 0.4 * most * 200))
     larger = replace(FORMING, classes=most + 1)
     assert accumulation_seconds(larger, numbers, 1000.0, FIXED) == pytest.approx(entry * 1000)

@@ -13,6 +13,7 @@ from mitsim.light.settings import (
     COUNTED,
     GROUPS,
     REPLICATES,
+    WIDE,
     Approximation,
     ErrorCovariance,
     Noise,
@@ -81,7 +82,7 @@ def test_no_choice_that_fits_is_cheaper(accuracy: float, seed: int) -> None:
         replace(now, layers=pilot_result.layers[count] if count > 1 else ()) for count in pilot_result.ladders["layers"]
     ]
     others += [replace(now, subdivision=count) for count in pilot_result.ladders["cells"]]
-    others += [replace(now, coarse_cells=count, coarse_layers=all_) for count in (1, 2, 4, 8) for all_ in (False, True)]
+    others += [replace(now, coarse_layers=all_) for all_ in (False, True)]
     others += [replace(now, effects=frozenset({"blur", "speckle"}), anchors=1, layers=(), subdivision=1)]
     for settings in others:
         other = predicted_candidate(accuracy, pilot_result, settings, {})
@@ -186,7 +187,7 @@ def test_no_light_is_asked_for_that_cannot_be_held(accuracy: float) -> None:
     settings, pixels = cheapest(accuracy, PILOT_RESULT, {}).settings, PILOT_RESULT.sample_costs["direct"].paths
     assert entries(pixels, 49, Numbers.of(settings), settings) <= 2**25
     samples = {**settings.samples, "indirect": 1e5, "indirect_residual": 1e5}
-    finest = replace(settings, followed_anchors=3, coarse_cells=8, samples=samples)
+    finest = replace(settings, anchors=64, followed_anchors=64, samples=samples)
     assert entries(pixels, 49, Numbers.of(finest), finest) > 2**28
 
 
@@ -203,11 +204,11 @@ def test_occluded_pixels_count_with_their_anchors() -> None:
         return float(entries(pixels, 49, Numbers.of(settings), settings)) - plain
 
     plain = float(entries(pixels, 49, Numbers.of(few), few))
-    assert more(own) == pytest.approx(100 * 256 * 4 * few.coarse_cells**2)
+    assert more(own) == pytest.approx(100 * 256 * 4)
     assert more(replace(own, occluded_anchors=1)) == 0
     layered = replace(own, layers=(400.0, 300.0), coarse_layers=True)
     plain = float(entries(pixels, 49, Numbers.of(replace(layered, occluded_anchors=1)), layered))
-    assert more(layered) == pytest.approx(2 * 100 * 256 * 4 * few.coarse_cells**2)
+    assert more(layered) == pytest.approx(2 * 100 * 256 * 4)
 
 
 @pytest.mark.parametrize("accuracy", ACCURACIES)
@@ -279,28 +280,28 @@ def test_samples_take_the_least_work_for_the_target() -> None:
 
 
 def test_wide_cells_hold_light_of_many_anchors() -> None:
-    """8 x 8 anchors of 49 classes are 10^8 places, of cells of two pixels a quarter of that. (Planted: as many places
-    whatever the width; the width's own error not counted.)"""
+    """8 x 8 anchors of 49 classes are 10^8 places in cells of a pixel, and a sixteenth of that in cells of four.
+    (Planted: as many places as in cells of a pixel; the error of wide cells not counted.)"""
     many = {
         Approximation("followed_anchors", count): size for count, size in {1: 7e-3, 2: 3e-3, 5: 6e-4, 8: 2e-5}.items()
     }
-    wide = {Approximation("followed_width", width): size for width, size in {1: 0.0, 2: 5e-5, 4: 4e-4}.items()}
     followed = SampleCost(Noise(2e-2, 2, 0.5), 36_384)
     sizes = {part: size for part, size in SIZES.items() if part.name != "followed_anchors"} | many
     without, found = (
         replace(PILOT_RESULT, changes=changes(each)).with_sample_costs({"indirect_residual": followed})
-        for each in (sizes, sizes | wide)
+        for each in (sizes, sizes | {WIDE: 5e-5})
     )
-    assert not cheapest(5e-4, without, {}).fits
     chosen = cheapest(5e-4, found, {})
     settings = chosen.settings
-    assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 2)
+    assert chosen.fits and (settings.followed_anchors, settings.followed_width) == (8, 4)
     assert entries(PILOT_RESULT.sample_costs["direct"].paths, 49, Numbers.of(settings), settings) <= 2**25
-    narrow = predicted_candidate(5e-4, without, replace(settings, followed_width=1), {}).systematic.value
+    narrow = predicted_candidate(5e-4, without, settings, {}).systematic.value
     assert chosen.systematic.value == pytest.approx(math.hypot(narrow, 5e-5), rel=1e-6)
-    assert cheapest(1e-2, found, {}).settings.followed_width == 1, "one anchor sees nothing beyond its mean"
-    wide_ones, narrow_ones = (rows(each)["followed-anchors"].reason for each in (plan(5e-4, found), plan(1e-4)))
-    assert "8x8 in cells of 2x2 pixels leave" in wide_ones and ": 2x2 leave" in narrow_ones
+    one = cheapest(1e-2, found, {})
+    assert one.settings.followed_width == 1, "one anchor sees nothing beyond its mean"
+    alone = predicted_candidate(1e-2, without, one.settings, {}).systematic.value
+    assert one.systematic.value == pytest.approx(alone, rel=1e-9)
+    assert "8x8 in cells of 4x4 pixels leave" in rows(plan(5e-4, found))["followed-anchors"].reason
 
 
 def test_one_hit_of_a_small_target_is_a_quarter_of_the_noise_and_counts_beside_it() -> None:

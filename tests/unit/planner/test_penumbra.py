@@ -17,8 +17,8 @@ from mitsim.devices.patterns import Lighting, parse_patterns
 from mitsim.light.settings import Settings, SharpPixels
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.planner import pilot
-from mitsim.planner.pilot_direct import occluded_pixels
-from mitsim.planner.pilot_samples import Sample
+from mitsim.planner.pilot import occluded_pixels
+from mitsim.planner.pilot_direct import Sample
 from mitsim.planner.planner import make_plan
 
 pytestmark = pytest.mark.usefixtures("variant")

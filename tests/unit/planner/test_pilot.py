@@ -20,12 +20,11 @@ from mitsim.bench.effects import EFFECTS
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import parse_patterns
-from mitsim.light.settings import REPLICATES, Approximation, ErrorCovariance, PilotResult, Settings
+from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, PilotResult, Settings
 from mitsim.light.simulation import Simulation, expected_of
 from mitsim.optics.frames import monte_carlo_error
-from mitsim.planner import pilot, pilot_anchors, pilot_direct, pilot_effects, pilot_samples
-from mitsim.planner.pilot_anchors import AnchorRuns, FollowedRuns
-from mitsim.planner.pilot_effects import EffectRuns
+from mitsim.planner import pilot, pilot_direct, pilot_effects
+from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
@@ -59,12 +58,12 @@ def pilot_result(bench: Bench) -> PilotResult:
     return measured(bench, seed=3)
 
 
-def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24) -> np.ndarray:
+def frames(bench: Bench, settings: Settings, many: int = 64, other: int = 24, judging_cells: int = 0) -> np.ndarray:
     """(16, pixels, pixels) of the captures that the pilot looks at, from many samples."""
     lighting = parse_patterns("dots:4", N).lighting.shots(SHOWN)
     labels = lighting.labels
     made, counts = (
-        Simulation(bench, settings),
+        Simulation(bench, settings, judging_cells=judging_cells),
         {"direct": many, "anchor_residual": many // 4, "indirect": 8 * other, "from_camera": other}
         | dict.fromkeys(("indirect_residual", "camera_residual"), other),
     )
@@ -96,10 +95,8 @@ def test_what_is_measured(bench: Bench, pilot_result: PilotResult) -> None:
     assert {1, 2} <= set(ladders["cells"]) <= set(pilot_direct.CELL_LADDER)
     for name, errors in ladders.items():
         assert all(0 <= error.value <= error.bound for error in errors.values())
-        coarsest, finest = (max(errors), 1) if name == "followed_width" else (1, max(errors))
-        assert len(errors) == 1 or errors[coarsest].value > errors[finest].value
-    widths = ladders["followed_width"]
-    assert tuple(widths) == pilot_anchors.WIDTHS and widths[1].value < widths[2].value < widths[4].value
+        assert len(errors) == 1 or errors[1].value > errors[max(errors)].value, name
+    assert WIDE in pilot_result.changes.parts and pilot_result.error(WIDE).value > 0
     assert {1, 2} <= set(ladders["followed_anchors"]) <= set(FollowedRuns.ladder)
     assert 0 < pilot_result.forming.product < 1e-6
     assert (
@@ -151,10 +148,10 @@ def test_effects_come_true(bench: Bench, pilot_result: PilotResult, effect: str)
 
 
 def test_anchors_come_true(bench: Bench, pilot_result: PilotResult) -> None:
-    base = Settings(depth=pilot_result.depth, coarse_cells=2, subdivision=2)
+    base = Settings(depth=pilot_result.depth, subdivision=2)
     every = frozenset(effects.present(bench)) - {"speckle"}
     light = np.linalg.norm(frames(bench, replace(base, effects=every)))
-    judge = frames(bench, replace(base, anchors=5), 256)
+    judge = frames(bench, replace(base, anchors=5), 256, judging_cells=2)
     actual = np.linalg.norm(frames(bench, base, 256) - judge) / light
     assert actual > 2e-3
     assert promised(pilot_result.ladders["anchors"][1].value, actual)
@@ -176,23 +173,23 @@ def test_anchors_of_followed_light_come_true(bench: Bench, pilot_result: PilotRe
     assert few < actual / 2
 
 
-@pytest.mark.parametrize("width", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult, width: int) -> None:
-    """What anchors see beyond their mean, in cells of several pixels and one layer, against cells of half a pixel and
-    two layers. (Planted: the mean accumulated in the cells of indirect light; cells twice as wide.)"""
+def test_wide_cells_of_followed_light_come_true(bench: Bench, pilot_result: PilotResult) -> None:
+    """What anchors see beyond their mean, in cells of four pixels and one layer, against cells of half a pixel and two
+    layers. (Planted: the mean accumulated in the cells of indirect light; cells twice as wide.)"""
     every = frozenset(effects.present(bench)) - {"speckle"}
     base = Settings(
         depth=pilot_result.depth, subdivision=2, effects=every, followed_anchors=2, layers=pilot_result.layers[2]
     )
-    judge = frames(bench, replace(base, coarse_cells=2, coarse_layers=True))
-    wide = replace(base, coarse_cells=2, coarse_layers=True, followed_width=width)
-    accumulated = Simulation(bench, wide)
+    base = replace(base, coarse_layers=True)
+    accumulated = Simulation(bench, base)
     assert accumulated.grids["indirect_residual"].bundle.grid.rows.size == pytest.approx(
-        2 * width * accumulated.grids["indirect"].bundle.grid.rows.size
+        4 * accumulated.grids["indirect"].bundle.grid.rows.size
     )
-    actual = change(frames(bench, wide), judge)
+    judge, few = frames(bench, base, judging_cells=2), frames(bench, replace(base, followed_anchors=1), judging_cells=2)
+    of_mean = frames(bench, replace(base, followed_anchors=1))
+    actual = float(np.linalg.norm((frames(bench, base) - of_mean) - (judge - few)) / np.linalg.norm(judge))
     assert actual > 1e-3, "the scene has to call for it"
-    assert promised(pilot_result.ladders["followed_width"][width].value, actual)
+    assert promised(pilot_result.error(WIDE).value, actual)
 
 
 @pytest.mark.slow
@@ -202,7 +199,7 @@ def test_light_to_many_anchors_is_traced_in_parts(
     """All of it at once takes gigabytes. Parts of two samples make the same ladder but for the order of sums.
     (Planted: every part from the first sample on.)"""
     monkeypatch.setattr(
-        pilot_anchors,
+        pilot_effects,
         "_AT_ONCE",
         2 * 9 * (pilot_result.sample_costs["indirect_residual"].paths + pilot_result.sample_costs["from_camera"].paths),
     )
@@ -270,9 +267,9 @@ def test_noise_comes_true(bench: Bench, pilot_result: PilotResult) -> None:
 def test_frames_of_pilot_runs_are_those_that_a_capture_forms(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the sample's pixels, other rows than columns, from the same paths, with lamps and black pixels that leak.
     (Planted: lamps' light lost, the least light of a shot left out, places of rows for columns.)"""
-    monkeypatch.setattr(pilot_samples, "_PLACES", 5)
+    monkeypatch.setattr(pilot_direct, "_PLACES", 5)
     lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     rows, columns = sample.places
     sample = replace(sample, places=(rows, tuple(place + 1 for place in columns[:-1])))
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
@@ -294,14 +291,14 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     """At anchors, as a tracer alone would make it; their squares add up. (Planted: one side's for the other's, all
     light's for one of them.)"""
     lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = FollowedRuns(bench, everything, sample, 0.0, 5)
     indirect, camera = found.sample_costs(1.0).values()
     alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * REPLICATES
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
-    assert indirect.noise.error == pytest.approx(pilot_samples.noise(alone._beyond_mean()), rel=1e-9)
-    both = pilot_samples.noise(found._beyond_mean())
+    assert indirect.noise.error == pytest.approx(pilot_direct.noise(alone._beyond_mean()), rel=1e-9)
+    both = pilot_direct.noise(found._beyond_mean())
     assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
     assert (indirect.paths, camera.paths) == tuple(tracer.paths_per_sample for tracer in found._simulation().at_anchors)
 
@@ -315,13 +312,13 @@ def test_a_ladder_ends_where_its_last_step_leaves_little() -> None:
         tried.append(count)
         return np.full((REPLICATES, 1), 0.25 ** [1, 2, 4, 8].index(count))
 
-    found = pilot_samples.ladder((1, 2, 4, 8), step, 1, 0.07)
+    found = pilot_direct.ladder((1, 2, 4, 8), step, 1, 0.07)
     assert tried == [1, 2, 4] and [float(change[0, 0]) for change in found.values()] == [-1, -0.25, -0.0625]
     tried.clear()
-    pilot_samples.ladder((1, 2, 4, 8), step, 1, 1.0)
+    pilot_direct.ladder((1, 2, 4, 8), step, 1, 1.0)
     assert tried == [1, 2, 4], "0.75 of one step may leave as much again, which is more than 1.0 with it"
     tried.clear()
-    pilot_samples.ladder((1, 2, 4, 8), step, 1, 1.6)
+    pilot_direct.ladder((1, 2, 4, 8), step, 1, 1.6)
     assert tried == [1, 2]
 
 
@@ -329,7 +326,7 @@ def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeyp
     """Whether paths are shared, where indirect light takes little; and no closer look than a part of that light.
     (Planted: always asked; a closer look whatever it takes.)"""
     lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     monkeypatch.setattr(pilot_effects, "_OF_INDIRECT", 1e-12)
     loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
@@ -342,7 +339,7 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
     """By looks of their own, whose light and noise are as large as told before. (Planted: samples of the first looks
     for either, the first looks' seeds, no closer looks at all.)"""
     lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     first, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
     seen = [ErrorCovariance.between(found.changes, found.light**2) for found in (first, close)]
@@ -407,7 +404,7 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
     (Planted: the part of the mean, not of what is beyond it.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
     cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1 / (15 * pilot_samples.norm(runs.anchored._beyond_mean()))
+    enough = 1 / (15 * pilot_direct.norm(runs.anchored._beyond_mean()))
     for coarse, looked_at in (
         ((0.9 * enough, 0.9 * enough), set()),
         ((1.1 * enough, 0.9 * enough), {cells}),
@@ -421,7 +418,7 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
 def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: Bench) -> None:
     """Light whose kind is direct light's, as over mirrors and curved glass, comes by the same paths. (Planted: indirect
     light alone.)"""
-    sample = pilot_samples.Sample.of(
+    sample = pilot_direct.Sample.of(
         parse_patterns("dots:4", N).lighting, bench.geometry.frame_shape, bench.loaded.mirrors
     )
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
@@ -433,18 +430,18 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     ]
     parted = pilot_effects.Bounced.of(halves, seen.samples)
     assert found._noise_of_bounced(parted) == pytest.approx(found._noise_of_bounced(seen), rel=0.1)
-    assert pilot_samples.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
+    assert pilot_direct.noise(found._indirect(1, (), parted)) < 0.85 * found._noise_of_bounced(seen)
 
 
 def test_more_anchors_see_a_faint_camera_part_as_few_do(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Then it is not traced again, and nothing of it is lost. (Planted: frames without it; those of one anchor.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
     others = runs.samples["followed"], math.inf, 3, runs.fine.judging
-    whole = pilot_anchors.FollowedRuns(bench, runs._everything, *others)
-    monkeypatch.setattr(pilot_anchors, "_FAINT", 0.0)
+    whole = pilot_effects.FollowedRuns(bench, runs._everything, *others)
+    monkeypatch.setattr(pilot_effects, "_FAINT", 0.0)
     apart = whole._frames(3)
-    monkeypatch.setattr(pilot_anchors, "_FAINT", 0.6)
-    faint = pilot_anchors.FollowedRuns(bench, runs._everything, *others)
+    monkeypatch.setattr(pilot_effects, "_FAINT", 0.6)
+    faint = pilot_effects.FollowedRuns(bench, runs._everything, *others)
     traced = list[str]()
     replicates = Tracer.replicates
 
@@ -465,12 +462,12 @@ def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) ->
     """Where the bound on what they leave, by what they leave of direct light, is below the accuracy. (Planted: the
     bound of direct light, not of its part.)"""
     lighting = parse_patterns("dots:4", N).lighting
-    sample = pilot_samples.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
+    sample = pilot_direct.Sample.of(lighting, bench.geometry.frame_shape, bench.loaded.mirrors)
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     followed = EffectRuns(bench, everything, sample, 5)
     direct = sum(float(light.value.sum()) for light in followed.direct) / (REPLICATES * sample.direct)
     part = followed.received / (direct + followed.received)
-    enough = pilot_samples.GOOD_ENOUGH * 1e-2 / (15 * part)
+    enough = pilot_direct.GOOD_ENOUGH * 1e-2 / (15 * part)
     for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True), (0.0, True)):
         found = EffectRuns(bench, everything, sample, 5, (), 1e-2, partial(tuple, (left / 2, left)))
         assert bool(found._coarse) == looked_at
@@ -489,27 +486,6 @@ def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.Mo
     monkeypatch.setattr(pilot_direct.time, "perf_counter", lambda: clock[0])
     assert pilot_direct._product_seconds() == pytest.approx(1.8 / (4 * 256**3))
     assert not list(taken)
-
-
-@pytest.mark.slow
-def test_first_samples_of_a_closer_look_are_kept(bench: Bench) -> None:
-    """A closer look traces the new samples alone, and tells what one of all samples tells. (Planted: the first samples
-    weighed as the new ones; the same samples twice; the camera's part of the new samples alone.)"""
-    runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
-    first = runs.followed
-    runs.refine("followed")
-    closer = runs.followed
-    others = first.tolerance, 3, runs.fine.judging
-    whole = pilot_anchors.FollowedRuns(bench, runs._everything, closer.sample, *others)
-    assert (closer._first, closer._samples, whole._samples) == (first._samples, 3 * first._samples, 4 * first._samples)
-    size = float(np.abs(whole._frames(1)).max())
-    for anchors in (1, 2, 3):
-        np.testing.assert_allclose(closer._frames(anchors), whole._frames(anchors), atol=1e-9 * size)
-    for cells in ({}, {"coarse_cells": 2}, {"followed_width": 4}):
-        np.testing.assert_allclose(closer._beyond_mean(**cells), whole._beyond_mean(**cells), atol=1e-9 * size)
-    for name, cost in whole.sample_costs(1.0).items():
-        assert closer.sample_costs(1.0)[name].noise.error == pytest.approx(cost.noise.error, rel=1e-6)
-        assert closer.sample_costs(1.0)[name].noise.samples == cost.noise.samples
 
 
 def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callable[..., Path]) -> None:

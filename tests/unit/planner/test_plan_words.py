@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.api.bench import Bench
 from mitsim.bench.effects import EFFECTS
-from mitsim.light.cost_model import unit_costs_of
 from mitsim.light.settings import Approximation, PilotResult, Settings
+from mitsim.planner.choose import unit_costs_of
 from mitsim.planner.explain import SceneFacts, explain_plan
 from mitsim.scene.limits import Unfit
 from mitsim.scene.outline import Tag
@@ -107,7 +107,7 @@ def test_light_over_mirrors_that_is_not_resolved_is_told_with_their_kinds_and_th
     assert "0.2 of the light" in warning and "2 sphere, 1 disk" in warning
     assert not explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=1e-4), facts).warnings
     (other,) = explain_plan(1e-6, ONE_CLASS, facts).warnings
-    assert "largest: followed anchors" in other, "mirrors whose light is all resolved are no reason"
+    assert "largest: layers (4)" in other, "mirrors whose light is all resolved are no reason"
     (nameless,) = explain_plan(1e-2, replace(PILOT_RESULT, unresolved_specular=0.2), SceneFacts({}, 0.0)).warnings
     assert "largest: light over small mirrors alone (not resolved), 2.0e-01" in nameless
 

@@ -240,10 +240,10 @@ def test_without_names_each_effect_once(bench: Bench) -> None:
     switched = dict(ablations(settings, present))
     assert present - switched.keys() == {"speckle"}, "it is not part of expected frames"
     assert "anchors" in switched and switched["anchors"] == replace(settings, anchors=1)
-    finest = replace(settings, followed_anchors=2, followed_width=2, subdivision=4, coarse_cells=2, layers=(3.0, 2.0))
+    finest = replace(settings, followed_anchors=2, subdivision=4, layers=(3.0, 2.0))
     fallen = dict(ablations(finest, frozenset()))
-    assert fallen["followed-anchors"] == replace(finest, followed_anchors=1, followed_width=1)
-    assert fallen["cells"] == replace(finest, subdivision=1, coarse_cells=1)
+    assert fallen["followed-anchors"] == replace(finest, followed_anchors=1)
+    assert fallen["cells"] == replace(finest, subdivision=1)
     assert fallen["layers"] == replace(finest, layers=())
     assert one_line(bench).spectrum.weights.shape == (1,)
     for name in present & switched.keys():
