@@ -22,7 +22,7 @@ from skimage import data
 from skimage.transform import resize
 
 from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.point_spread_fit import find_fit
+from mitsim.reconstruct.point_spread_image import find_fit
 
 PICTURES = "camera", "coins", "astronaut", "text", "cell", "page"
 

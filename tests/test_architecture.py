@@ -181,7 +181,7 @@ def test_every_room_has_a_floor() -> None:
         ("mitsim.core.arrays", "from mitsim.devices import mask"),
         ("mitsim.sensor.chain", "def f():\n    from ..optics import shadow"),
         ("mitsim.sensor.chain", "from mitsim import scene"),
-        ("mitsim.reconstruct.estimate_factors", "import mitsim.sensor.chain"),
+        ("mitsim.reconstruct.factors", "import mitsim.sensor.chain"),
         ("mitsim.reconstruct.solver", "import drjit"),
         ("mitsim.core.manifests", "import mitsuba as mi"),
         ("mitsim.devices.camera", "from mitsim.optics import shadow"),

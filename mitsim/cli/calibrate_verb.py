@@ -324,8 +324,7 @@ def _calibrate_known(listed: Path, aged: Path | None, output: Path, limited: Lim
 
     captures = load_known(listed)  # refused before the fit is imported
     check_output(output)
-    from mitsim.reconstruct.aged_calibration import moved_in_words
-    from mitsim.reconstruct.known_pictures import calibrate_known
+    from mitsim.reconstruct.known_pictures import calibrate_known, moved_in_words
 
     held = memory_from_here()
     with limited.job() as job:

@@ -169,7 +169,7 @@ def _bin(values: FloatArray) -> FloatArray:
 
 def _slabs(side: Side) -> FloatArray:
     """(K, b, r) sums over bins of U of every pattern of a ``side``."""
-    stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), side.accumulated_size))
+    stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), len(side.singular)))
     for whole, slab in zip(stack, side.slabs, strict=True):
         whole[:, slab.columns] = _bin(slab.matrix)
     return stack

@@ -38,8 +38,7 @@ from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_f
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
-from mitsim.reconstruct.estimate_factors import Estimate, ResponseFit, StripeSums, stripe_sums
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
@@ -132,7 +131,6 @@ def calibrate_planes(
 
 
 def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
-    """The ``session`` with what its list does not state taken from the ``camera``, and where both contradict."""
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
     absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
@@ -224,7 +222,6 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
 
 
 def _not_known(session: SessionFrames) -> Iterator[str]:
-    """What neither frames nor list tell, and what follows."""
     listed = session.listed
     yield "phi_error, noise_free_residual: nobody has exact factors of a real camera; predicted_phi_error is by noise"
     if not listed.digital.noise_is_stated:
@@ -242,11 +239,6 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
 
 
 def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
-    """The ``session`` with what makes frames of its numbers, divided by their common factor where they are beyond the
-    camera's range; and what is doubtful of it.
-
-    The first and last frames tell: others that are no multiples are refused as they are read.
-    """
     prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
     if prepare.divide_by is None:
         common = CommonFactor()
@@ -264,7 +256,6 @@ def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, .
 
 
 def _check_sizes(session: SessionFrames) -> None:
-    """MitsimError for a frame that cannot be read, or is of another size than the first."""
     first, *others = session.files
     size = image_size(session.folder / first, session.wanted)
     for name in session.files:
@@ -279,8 +270,6 @@ def _check_sizes(session: SessionFrames) -> None:
 
 
 def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
-    """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
-    columns) being the brighter of both uniform responses [electrons/s]."""
     first = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
     values, digital = session.read(first.file), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
@@ -296,28 +285,21 @@ def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
-
     rate: FloatArray
     ladder: Ladder
     shots: int
 
     @property
     def exposure_s(self) -> float:
-        """The shortest exposure [s]."""
         return self.ladder.digitals[0].exposure_s
 
     @property
     def variance(self) -> float:
-        """Mean noise variance, of all shots [(electrons/s)^2]."""
         return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
 @dataclass(frozen=True)
 class _Compared:
-    """Two frames that should be alike: names, mean ``squared`` difference over mean squared light, that light, and how
-    much of the light of the second the first has. ``kind`` are those that noise makes differ alike."""
-
     names: tuple[str, str]
     kind: int
     squared: float
@@ -326,7 +308,6 @@ class _Compared:
 
     @classmethod
     def of(cls, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> _Compared:
-        """Of rates (pixels,)."""
         light = max(float(np.square(other).mean()), float(np.square(one).mean()))
         product = float(np.dot(one.ravel(), other.ravel())) / other.size
         size = float(np.square(other).mean())
@@ -335,19 +316,12 @@ class _Compared:
 
 @dataclass(frozen=True, eq=False)
 class _Readings:
-    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read,
-    how frames ``compared`` that should be alike, and which dark ones are ``odd``, in words.
-
-    Measurements of all patterns are as in a simulated session: :meth:`mitsim.calibrate.lit_session.LitSession.noisy`.
-    """
-
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
     compared: dict[Half, list[_Compared]] = field(default_factory=dict)
     odd: dict[str, str] = field(default_factory=dict)
 
     def wrong(self) -> dict[Half, str]:
-        """Which halves of patterns have repeats or exposures that differ, in words."""
         kinds: dict[int, list[float]] = {}
         for each in self.compared.values():
             for one in each:
@@ -376,8 +350,6 @@ class _Readings:
         return found
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
-        """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
-        frames (rows, columns); None where it is not their difference."""
         positive = self._merge((side, index, 1))
         if self.session.pairs:
             negative = self._merge((side, index, -1))
@@ -404,7 +376,6 @@ class _Readings:
 
     @cached_property
     def _ladders(self) -> dict[Side, Ladder] | None:
-        """How several exposures of a side's frames are merged, by a uniform frame of the other; None for one."""
         listed = self.session.listed
         if len(listed.exposure_ladder) == 1:
             return None
@@ -421,7 +392,6 @@ class _Readings:
 
     @cached_property
     def _dark_of(self) -> dict[Side, dict[float, _Reading]]:
-        """Mean dark frame of a side by exposure; of several, by the shortest, merged."""
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
@@ -453,7 +423,6 @@ class _Readings:
         return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
     def _merge(self, half: Half) -> _Reading:
-        """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
             return self._read(self.session.repeats_of(half), True)
         ladder = self._ladders[half[0]]
@@ -468,13 +437,11 @@ class _Readings:
         return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
 
     def _compare(self, half: Half, compared: _Compared) -> None:
-        """Note it, once."""
         known = self.compared.setdefault(half, [])
         if compared not in known:
             known.append(compared)
 
     def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
-        """The mean of ``frames`` of one exposure; ``used`` are the pixels that may not be saturated."""
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
         before: FloatArray | None = None
@@ -500,8 +467,6 @@ class _Readings:
 
 @single_threaded_blas()
 def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, CheckedSession]:
-    """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
-    wrong."""
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
@@ -513,7 +478,6 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 
 
 def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Return sums over all responses, and the noise variance of each."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first

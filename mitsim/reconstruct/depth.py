@@ -1,36 +1,51 @@
-"""Shots and factors in; the one depth out whose factors leave least of the measurements unexplained.
+"""Depth of the scene as a whole or for each projector pixel, by the least unexplained energy.
 
-Only what lies in the model's range counts, whatever lambda: the energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2 of
-:mod:`mitsim.reconstruct.misfit`. It has a narrow valley at the true depth, and others where dots of period k see their
-neighbours' light: parallax by k pixels moves the image by as much, and all that tells the two apart are the image's
-edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every
-valley that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made
-lower are named beside the lowest.
+*One depth.* The energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2, which no lambda changes, has a narrow valley at the
+true depth, and others where dots of period k see their neighbours' light. So depths are tried in steps of a pixel of
+parallax, every valley that may be the lowest is followed to its bottom, and valleys that chance or the model's own
+misfit may have raised are named beside the lowest. Columns of neighbouring depths are much alike: a few hundred vectors
+span them, so that frames are read once and kept small.
 
-*The basis that depths share.* Columns of neighbouring depths are much alike: a few hundred vectors span all of them,
-and what of a frame lies outside is not explained at any depth. So frames are read once and kept small.
-"""
+*A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the baseline
+were lit, which shows where each dot's light arrives. Then each pixel has columns of both factors at its own depth. The
+model is linear in (X, X o d), d a change of 1/z, so that each Gauss-Newton step, with the d of neighbours pooled, is
+one closed-form solve for each frame: its normal matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take
+the depth on its other side where that explains more. Depths whose parallax spans more than a period of the dots are
+ambiguous."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
+from mitsim.reconstruct.accumulation import FrameNoise, LitFrames, factor_energy
 from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
+from mitsim.reconstruct.focus import (
+    LEAST_PART,
+    STEP,
+    FactorOfDepths,
+    are_dots,
+    move_factors,
+    parallax_of,
+    parallax_period,
+    pixels_of_parallax,
+    unambiguous_parallax,
+)
+from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
-from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
-from mitsim.reconstruct.subpixel import LitFrames
+from mitsim.reconstruct.solver import Solution, Status, Verdict, centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
@@ -145,14 +160,6 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
 
 
 class _Search:
-    """What one depth for the whole scene leaves of all measurements.
-
-    Attributes
-    ----------
-    pixel
-        change of 1/z [1/mm] that moves light by one projector pixel, along the axis where it moves more.
-    """
-
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         self._ends, self._period = shifts_searched(factors, depth_range), np.inf
         beyond = 0.0
@@ -163,14 +170,13 @@ class _Search:
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
         self._shots, self._factors = shots, factors
         rows, columns = shots.patterns
-        self._groups = group_pixels(rows, "auto"), group_pixels(columns, "auto")
+        self._groups = group_pixels(rows), group_pixels(columns)
         self._all = CommonBasis(shots, factors, self._tried, self._groups)
         self._inverse, self._factor_noise = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
 
     def find(self) -> Depth:
-        """The lowest valley, and all that may be as low."""
         margin = 2 * _RESOLUTION * self.pixel
         valleys = sorted(self._valleys(*self._ends))
         valleys = sorted([*valleys, *self._beyond(valleys[0][1], margin)])
@@ -214,9 +220,8 @@ class _Search:
         )
 
     def left_over(self, shift: float) -> float:
-        """Energy of the measurements that factors moved by ``shift`` of 1/z leave."""
         left, right = (
-            factorise(self._all.side(axis, shift), patterns, groups, "svd", "auto", False)
+            factorise(self._all.side(axis, shift), patterns, groups)
             for axis, (patterns, groups) in enumerate(zip(self._all.patterns, self._groups, strict=True))
         )
         measured = np.outer(left.singular, right.singular) > 0
@@ -225,8 +230,6 @@ class _Search:
     # ---- Valleys of the energy over 1/z ----
 
     def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
-        """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
-        low, and changes of 1/z."""
         steps = max(int(np.ceil((last - first) / (_STEP * self.pixel))), _FEWEST)
         shifts = np.linspace(first, last, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
@@ -259,7 +262,6 @@ class _Search:
                     yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
 
     def _bottom(self, first: float, last: float) -> tuple[float, float]:
-        """Least energy left over between two changes of 1/z, and where."""
         least = minimize_scalar(
             self.left_over, bounds=(first, last), method="bounded", options={"xatol": _RESOLUTION * self.pixel}
         )
@@ -268,8 +270,6 @@ class _Search:
     # ---- Standard error, and valleys that may be as low ----
 
     def _certainty(self, shift: float, least: float) -> tuple[float, float]:
-        """Standard error of the ``shift`` that leaves ``least``, from a parabola through quarters of a pixel: what is
-        left over rises by its own mean over a datum; and how much more is left a pixel beside."""
         before, after = (self.left_over(shift + part * self.pixel) for part in (-0.25, 0.25))
         rise = min(self.left_over(shift + self.pixel), self.left_over(shift - self.pixel)) - least
         curvature = (before - 2 * least + after) / (self.pixel / 4) ** 2
@@ -277,7 +277,6 @@ class _Search:
         return error, float(rise)
 
     def _variance(self, least: float) -> float:
-        """Of a datum, by what the best depth leaves."""
         return float(least / max(self._all.data - self._unknowns, 1))
 
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
@@ -285,16 +284,12 @@ class _Search:
         return max(chance_difference(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
 
     def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
-        """Those of the sorted ``valleys`` that may be the right one, beside the lowest, by what its depth leaves beyond
-        noise."""
         least = valleys[0][0]
         return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
 
     # ---- Print, and what stays unexplained ----
 
     def _print_part(self, shift: float) -> float:
-        """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
-        side of the pixels' centres, so no other depth explains it."""
         there = move_factors(self._factors, self._mm(shift))
         lit = LitFrames(there.factors.sides, self._all.patterns)
         for each in there.of(self._shots).pattern_measurements():
@@ -303,8 +298,6 @@ class _Search:
         return float(np.nan_to_num(lit.print_part()))
 
     def _misfit(self, shift: float, least: float) -> float:
-        """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0
-        where the noise is not stated."""
         noise, stated = self._all.noise, self._factor_noise
         if not (noise.stated and stated):
             return 0.0
@@ -472,7 +465,6 @@ def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -
 
 
 def _alone(groups: tuple[Group, ...], patterns: FloatArray) -> list[tuple[npt.NDArray[np.intp], list[int]]] | None:
-    """Scene pixels of each group, and which of the ``patterns`` (n, K) light it; None where one lights several."""
     lit = np.array([[group.lights(index) for index in range(patterns.shape[1])] for group in groups])
     if len(groups) == 1 or (lit.sum(axis=0) > 1).any():
         return None
@@ -480,9 +472,6 @@ def _alone(groups: tuple[Group, ...], patterns: FloatArray) -> list[tuple[npt.ND
 
 
 class _Basis:
-    """Orthonormal vectors (m, ``size``) that span the columns of all ``factors`` (m, n) but for a part of their energy;
-    of those pixels that are lit ``alone``, where that is given, each with its patterns."""
-
     def __init__(self, factors: list[FloatArray], alone: list[tuple[npt.NDArray[np.intp], list[int]]] | None) -> None:
         self._alone = alone or [(np.arange(factors[0].shape[1]), [])]
         found = [np.linalg.eigh(sum(own @ own.T for own in (f[:, px] for f in factors))) for px, _ in self._alone]
@@ -496,14 +485,536 @@ class _Basis:
         }
 
     def of(self, index: int) -> FloatArray:
-        """(m, size) vectors for frames of pattern ``index``."""
         return self._by_pattern.get(index, self._vectors[0])
 
     def project(self, columns: FloatArray) -> FloatArray:
-        """(size, n) the ``columns`` (m, n) on the basis of each."""
         if len(self._vectors) == 1:
             return np.asarray(self._vectors[0].T @ columns)
         seen = np.zeros((self.size, columns.shape[1]))
         for (pixels, _), vectors in zip(self._alone, self._vectors, strict=True):
             seen[:, pixels] = vectors.T @ columns[:, pixels]
         return seen
+
+
+_STEPS, _STEP_POOLED = 4, 3.0
+"""Gauss-Newton steps at most, and the standard deviation [pixels] over which changes of depth are pooled: with 2 and
+1.5 noise of dark pixels spreads (cookie_bag 29.7, 29.2, 28.8 dB)."""
+_ROUNDS, _BESIDE = 4, 5
+"""Rounds at most in which single pixels take another depth of the 5 x 5 around them: pooling rounds the edges of cards,
+and what lies a pixel or two beside is then the depth of what is there."""
+_SURE = 25.0
+"""Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
+_RIVAL, _ASTRAY = 2.0, 0.05
+"""Starts that leave less than twice as much as the best one must not place more than this part of the told pixels half
+a period beside it: two cards under dots too near to each other come out either way, and 1.8 times as much is left."""
+_RELIABLE = 0.5
+"""Confidence from which a pixel's depth counts as told: twice as much light arrives there as anywhere else."""
+SPARE = 2.0
+"""Projector pixels of the period that told depths must leave free, or they may be another's by a whole period: as many
+as a dot's image is wide. With one, two cards that span 3 of 4 pixels came out 2 dB worse than at one depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """Depths by projector pixel, and the image that they give.
+
+    Attributes
+    ----------
+    image
+        (n, n') reflectance.
+    mm
+        (n, n') depth.
+    confidence
+        (n, n') 1 less what arrives at the second place over what arrives at the first; 0 where nothing does.
+    lam
+        lambda of the image.
+    left_over, energy, data
+        energy that image and depths leave of the measurements, all of their energy, and their number.
+    part
+        of the sensor, which these measurements are of.
+    doubt
+        why it is not to be trusted, or nothing.
+    range_mm
+        nearest and farthest depth that were looked for.
+    smoothing
+        variance of the factors' noise at these depths, over that of the calibrated ones.
+    alternatives
+        none: depths by pixel that may be others are not told at all.
+    """
+
+    image: FloatArray
+    mm: FloatArray
+    confidence: FloatArray
+    lam: float
+    left_over: float
+    energy: float
+    data: int
+    part: float
+    doubt: str = ""
+    range_mm: tuple[float, float] | None = None
+    smoothing: float = 1.0
+    alternatives: tuple[Alternative, ...] = ()
+
+    def __str__(self) -> str:
+        if self.doubt:
+            return "focus: no depths are told; the image is that of the calibrated one"
+        message = self.summary()
+        depths = f"{message['least_mm']:.4g} to {message['most_mm']:.4g} mm, median {message['median_mm']:.4g}"
+        return f"focus: depths of {depths}, told for {message['told_part']:.0%} of pixels"
+
+    @property
+    def solution(self) -> Solution:
+        """The image; solved, as dots leave fewer unknowns in a frame than the sensor has data."""
+        residual = float(np.sqrt(self.left_over / self.energy))
+        status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+        return Solution(self.image, self.lam, residual, status)
+
+    @property
+    def reliable(self) -> np.ndarray:
+        """(n, n') whether each depth is reliable."""
+        return np.asarray(self.confidence >= _RELIABLE)
+
+    def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
+        """What of the measurements fits no image at these depths, over the sensor as a whole.
+
+        Parameters
+        ----------
+        noise
+            of all measurements.
+        factor_energy
+            what noise of the calibrated factors adds to all frames; None: not stated.
+        print_energy
+            what print within a pixel may add to them.
+        """
+        spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
+        variance = float(noise.variance.mean()) * self.data * spare
+        expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
+        whole = self.left_over, self.energy, expected, self.data / noise.variance.size
+        energies = tuple(np.array([[value]]) for value in whole)
+        return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
+
+    def channels(self) -> dict[str, npt.NDArray[np.float32]]:
+        """As a file has it: depth [mm], and confidence."""
+        return {"depth_mm": self.mm.astype(np.float32), "confidence": self.confidence.astype(np.float32)}
+
+    def summary(self) -> dict[str, float]:
+        """What result.json and the command line's JSON say of it."""
+        reliable = self.mm[self.reliable] if self.reliable.any() else self.mm
+        low, middle, high = (float(value) for value in np.percentile(reliable, (1, 50, 99)))
+        return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
+
+
+@single_threaded_blas()
+def depth_map(
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"] = "auto",
+    depth_range: tuple[float, float] | None = None,
+) -> DepthMap:
+    """The depth of each projector pixel, and the image with all of them in focus.
+
+    Parameters
+    ----------
+    shots
+        under shifting dots.
+    factors
+        of the same camera, with their parallax.
+    lam
+        of the image; ``auto``: what its own residual asks for.
+    depth_range
+        nearest and farthest depth [mm] that are looked for; None: a quarter of 1/z either way of the calibrated one.
+
+    Raises
+    ------
+    MitsimError
+        for other patterns than dots, devices without parallax, a calibration that does not state it, or a frame that
+        cannot be read.
+    """
+    return _MapSearch(shots, factors, depth_range).find(lam)
+
+
+class _MapSearch:
+    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
+        # Of a flat scene far from the calibrated depth dots of any period tell the rest.
+        self._ends = shifts_searched(factors, depth_range)
+        self._inverse = 1 / parallax_of(factors).depth_mm
+        self._range_mm = 1 / (self._inverse + self._ends[1]), 1 / (self._inverse + self._ends[0])
+        self._plane = best_depth(shots, factors, self._range_mm)
+        self._middle = (self._ends[0] + self._ends[1]) / 2
+        # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
+        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - self._inverse
+        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
+        self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
+        self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
+
+    def find(self, lam: float | Literal["auto"]) -> DepthMap:
+        middle = self._middle / self.pixel
+        tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
+        if self._arrivals.limited:
+            look = min(tried, key=lambda start: tried[start])[0]
+            plane = self._start / self.pixel
+            offsets = {start + offset for start in (middle, plane) for offset in (0.0, *OFFSETS)} - {middle}
+            tried |= {(look, offset): self._left_over(self._arrivals.most(look, offset)[0]) for offset in offsets}
+        start = min(tried, key=lambda start: tried[start])
+        rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
+        shift, confidence = self._arrivals.most(*start)
+        shift = self._sharpen(self._refine(shift, start[1] * self.pixel, tried[start]))
+        doubt = self._doubt(shift, confidence, rivals)
+        if doubt:
+            shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
+        solved = self._pixels.solve(shift, None if lam == "auto" else lam)
+        solved = self._pixels.final(shift, solved) if lam == "auto" else solved
+        return DepthMap(
+            solved.image,
+            1 / (self._inverse + shift),
+            confidence,
+            solved.lam,
+            solved.left_over,
+            *(self._all.energy, self._all.data, self._all.part),
+            doubt,
+            self._range_mm,
+            self._all.smoothing(float(np.median(shift))),
+        )
+
+    def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
+        reliable = confidence >= _RELIABLE
+        found = self._pixels.solve(shift)
+        variance, unknowns = self._pixels.variance(found), 2 * shift.size
+        less = found.left_over - self._left_over(np.zeros(shift.shape))
+        # Of a sheet at the calibrated depth either may leave more.
+        if not reliable.any() or less > chance_difference(less, variance, unknowns):
+            return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
+        span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
+        astray = max(
+            float((np.abs(self._arrivals.most(*rival)[0] - shift)[reliable] > self.width / 2).mean())
+            for rival in rivals
+        )
+        spared = not self._arrivals.limited or self.width - span >= SPARE * self.pixel
+        if not spared or astray > _ASTRAY:
+            period = self.width / self.pixel
+            why = f"Depths a period of the dots away, {period:.0f} projector pixels, explain nearly as much"
+            if not spared:
+                why = f"Parallax seems to span {span / self.pixel:.1f} of the {period:.0f} pixels of a period"
+            return (
+                f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of "
+                f"a period of {2 * period:.0f} along the baseline, and of a short one across it."
+            )
+        ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
+        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
+        if others:
+            return (
+                f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
+                "explain a flat scene as well, so the image is that of the calibrated one. Use dots of a longer period "
+                "along the baseline, or give the range of depths."
+            )
+        return ""
+
+    def _left_over(self, shift: FloatArray) -> float:
+        return self._pixels.solve(shift).left_over
+
+    def _refine(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
+        for _ in range(_STEPS):
+            image, moved = self._pixels.step(shift, self.pixel)
+            weight = gaussian_filter(np.square(image), _STEP_POOLED)
+            change = gaussian_filter(image * moved, _STEP_POOLED) / np.maximum(weight, np.finfo(float).tiny)
+            half = self.width / 2
+            ahead = np.clip(shift + self.pixel * np.clip(change, -1, 1), offset - half, offset + half)
+            ahead = median_filter(ahead, MEDIAN)
+            now = self._left_over(ahead)
+            if now >= left_over:
+                break
+            shift, left_over = ahead, now
+        return shift
+
+    def _sharpen(self, shift: FloatArray) -> FloatArray:
+        solved = self._pixels.solve(shift)
+        for _ in range(_ROUNDS):
+            others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
+            gains = self._pixels.gains(shift, solved.image, others)
+            sure = gains.max(axis=0) > _SURE * self._pixels.variance(solved)
+            ahead = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
+            now = self._pixels.solve(ahead)
+            if now.left_over >= solved.left_over:
+                break
+            shift, solved = ahead, now
+        return shift
+
+
+# -------- Measurements and a depth for each projector pixel in, the image out
+
+_SMALL = 1e-3
+"""Lambda over the mean diagonal of the normal matrix while depths are looked for: images under 98 dots differ by 0.1 dB
+from 1e-2 to 1e-4."""
+_LARGEST = 1e-2
+"""The same of the last image at most: noise asks for more only where there is no image."""
+_MOST_LIT = 4096
+"""Pixels of one frame: their normal matrix has 128 MiB, and takes seconds to factorise."""
+_CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6
+"""Lagrange's cubic through -1, 0, 1, 2: weight of each by power of the place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """An ``image`` (n, n') at given depths, its ``lam``, and the energy that it leaves over."""
+
+    image: FloatArray
+    lam: float
+    left_over: float
+
+
+class PixelDepths:
+    """The model with a depth for each projector pixel.
+
+    Parameters
+    ----------
+    depths
+        frames and factors.
+    limit, step
+        largest change of 1/z [1/mm], and the distance between those that columns are computed at; others lie on a cubic
+        between them.
+    """
+
+    def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
+        self._all = depths
+        self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
+        self._tables = [np.stack([depths.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
+        self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in depths.patterns]
+        most = max(len(row) for row in self._lit[0]) * max(len(column) for column in self._lit[1])
+        if most > _MOST_LIT:
+            raise MitsimError(
+                f"focus map: {most} pixels are lit at a time, and {_MOST_LIT} can be told; use dots further apart"
+            )
+        middle = len(self._shifts) // 2
+        left, right = (float(np.square(table[:, middle]).sum(axis=1).mean()) for table in self._tables)
+        self._scale = left * right
+
+    def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
+        """The image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
+        lam = _SMALL * self._scale if lam is None else lam
+        image, left_over = np.zeros(shift.shape), self._all.outside
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            left, right = (self._columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
+            normal, data = (left @ left.T) * (right @ right.T), ((left @ frame.frame) * right).sum(axis=1)
+            found = np.linalg.solve(normal + lam * np.eye(len(data)), data)
+            image[lit] = found
+            left_over += float(np.square(frame.frame).sum() + found @ (normal @ found - 2 * data))
+        return Solved(image, lam, left_over)
+
+    def variance(self, solved: Solved) -> float:
+        """Of a datum, from what a ``solved`` image leaves over, less a reflectance and a depth for each pixel."""
+        return float(solved.left_over / max(self._all.data - 2 * solved.image.size, 1))
+
+    def final(self, shift: FloatArray, solved: Solved) -> Solved:
+        """The image at the lambda that its own residual asks for: variance of a datum over the mean square of pixels.
+
+        Parameters
+        ----------
+        shift, solved
+            depths, and the image at them.
+        """
+        ideal = self.variance(solved) / max(float(np.square(solved.image).mean()), np.finfo(float).tiny)
+        return self.solve(shift, min(ideal, _LARGEST * self._scale))
+
+    def step(self, shift: FloatArray, unit: float) -> tuple[FloatArray, FloatArray]:
+        """Image X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
+        lam, image, moved = _SMALL * self._scale, np.zeros(shift.shape), np.zeros(shift.shape)
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            (u, du), (v, dv) = (
+                (self._columns(axis, place, shift[lit]), unit * self._columns(axis, place, shift[lit], slope=True))
+                for axis, place in enumerate(lit)
+            )
+            # Columns of the model are u v^T, and by d du v^T + u dv^T.
+            uu, uv, vv = u @ u.T, (u @ du.T, v @ dv.T), v @ v.T
+            across = uv[0] * vv + uu * uv[1]
+            own = (du @ du.T) * vv + uu * (dv @ dv.T) + uv[0].T * uv[1] + uv[0] * uv[1].T
+            normal = np.block([[uu * vv, across], [across.T, own]])
+            seen, slid = u @ frame.frame, du @ frame.frame
+            data = np.concatenate([(seen * v).sum(axis=1), (slid * v + seen * dv).sum(axis=1)])
+            both = np.linalg.solve(normal + lam * np.eye(len(data)), data)
+            image[lit], moved[lit] = np.split(both, 2)
+        return image, moved
+
+    def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
+        """(len(``others``), n, n') energy that each pixel alone explains more at another change of 1/z.
+
+        Pixels of a frame lie a period apart and hardly share measurements, so each is weighed with all else as it is.
+
+        Parameters
+        ----------
+        shift, image
+            (n, n') changes of 1/z, and the image at them.
+        others
+            (n, n') changes of 1/z that are tried.
+        """
+        gains = np.zeros((len(others), *shift.shape))
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            left, right = self._columns(0, lit[0], shift[lit]), self._columns(1, lit[1], shift[lit])
+            rest = frame.frame - (left * image[lit][:, None]).T @ right
+            for index, other in enumerate((shift, *others)):
+                u, v = self._columns(0, lit[0], other[lit]), self._columns(1, lit[1], other[lit])
+                own = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
+                size = np.square(u).sum(axis=1) * np.square(v).sum(axis=1)
+                explained = np.square(((u @ rest) * v).sum(axis=1) + own) / size
+                if index == 0:
+                    gains[:, lit[0], lit[1]] -= explained
+                else:
+                    gains[index - 1][lit] += explained
+        return gains
+
+    def _pixels(self, frame: Measurement) -> tuple[np.ndarray, np.ndarray]:
+        rows, columns = np.meshgrid(self._lit[0][frame.row], self._lit[1][frame.column], indexing="ij")
+        return rows.ravel(), columns.ravel()
+
+    def _columns(self, axis: int, pixels: np.ndarray, shift: FloatArray, slope: bool = False) -> FloatArray:
+        """(k, r) columns of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivative by it."""
+        step = self._shifts[1] - self._shifts[0]
+        place = (shift - self._shifts[0]) / step
+        start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
+        part = place - start
+        one, zero = np.ones_like(part), np.zeros_like(part)
+        powers = [zero, one / step, 2 * part / step, 3 * part**2 / step] if slope else [one, part, part**2, part**3]
+        weights = _CUBIC @ np.stack(powers)
+        table = self._tables[axis]
+        return np.asarray(sum(weight[:, None] * table[pixels, start + k - 1] for k, weight in enumerate(weights)))
+
+
+# ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
+
+
+LAMBDAS = 1e-5, 1e-6, 1e-7
+"""Of the largest sigma^2: at less, noise rules, at more, dots blur (cookie_bag under dots:7x16 at 1.4 s: median errors
+of 1.2, 0.6, 0.4 mm)."""
+OFFSETS = -1.0, -0.5, 0.5, 1.0
+"""Projector pixels by which the range of displacements may be moved: it is the period wide, and a surface at its end
+would else be taken for one at the other."""
+MEDIAN = 5
+"""Projector pixels: width of the median of places; wider ones round the edges of cards."""
+_POOLED = 1.0
+"""Projector pixels: standard deviation over which light is pooled before its place is taken; with 2 edges blur, with
+none single pixels go astray."""
+_BESIDE_LARGEST = 2
+"""Projector pixels beyond the largest displacement, so that a dot's image is not cut."""
+_LEAST_PARALLAX = 0.5
+"""Projector pixels that the range of depths must move light along an axis, or it is one without parallax."""
+_NEIGHBOURHOOD = 2.0
+"""Projector pixels of displacement beside the largest light that belong to it: a second one further off is a doubt."""
+
+
+class Arrivals:
+    """Where light arrives, by pixel and change of 1/z.
+
+    Parameters
+    ----------
+    shots, factors
+        under shifting dots, and of the same camera; MitsimError for other patterns, and for devices without parallax.
+    ends
+        least and largest change of 1/z [1/mm] of the depths that are looked for.
+    beside
+        change of 1/z [1/mm] of the middle of those that are told apart, at most.
+
+    Attributes
+    ----------
+    depths
+        frames and factors.
+    pixel
+        change of 1/z [1/mm] that moves light by one projector pixel.
+    width, reach
+        changes of 1/z that are told apart, and the largest that is tried, either way.
+    """
+
+    def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
+        self._classes = [_classes(patterns) for patterns in shots.patterns]
+        parallax, counts = parallax_of(factors), (factors.left.shape[1], factors.right.shape[1])
+        self._span = ends[1] - ends[0]
+        moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
+        self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
+        if not any(self._open):
+            raise MitsimError(
+                f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
+                "light; give a depth, or auto"
+            )
+        self.pixel = 1 / max(moves)
+        periods = [own.shape[1] for own in shots.patterns]
+        self.width = min(
+            self._span, unambiguous_parallax(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel
+        )
+        self.reach = beside + self.width / 2 + (max(OFFSETS) + _BESIDE_LARGEST) * self.pixel
+        self.depths = CommonBasis(shots, factors, (-self.reach, self.reach))
+        self._margin = int(np.ceil(self.reach / self.pixel)) + 1
+
+    @property
+    def limited(self) -> bool:
+        """Whether the dots' period limits the range of depths."""
+        return self.width < self._span
+
+    def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
+        """Changes of 1/z by pixel where most light arrives, and how much more than elsewhere.
+
+        Parameters
+        ----------
+        lam
+            of the look, over the largest sigma^2.
+        offset
+            middle of the displacements [projector pixels].
+        """
+        count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
+        shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
+        light = np.stack([self._arriving(self._class_images[lam], shift) for shift in shifts])
+        light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
+        place, step = light.argmax(axis=0), shifts[1] - shifts[0]
+        near = round(_NEIGHBOURHOOD * self.pixel / step)
+        beside = np.arange(count)[:, None, None] - place
+        own = np.where(np.abs(beside) <= near, light, 0.0)
+        other = np.where(np.abs(beside) <= near, 0.0, light).max(axis=0)
+        peak = light.max(axis=0)
+        dark = peak <= np.finfo(float).tiny
+        centroid = (own * beside).sum(axis=0) / np.where(dark, 1.0, own.sum(axis=0))
+        found = median_filter(shifts[place] + step * centroid, MEDIAN)
+        elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
+        return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
+
+    def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
+        keys, places, parts = [], [], []
+        for axis, (classes, opened) in enumerate(zip(self._classes, self._open, strict=True)):
+            place = np.arange(classes.size) + (self.depths.edges(axis) * shift + self._margin if opened else 0.0)
+            whole = np.floor(place).astype(np.intp)
+            whole = np.clip(whole, 0, max(seen.shape[2 + axis] - 2, 0)) if opened else whole
+            keys.append(classes if opened else np.zeros_like(classes))
+            places.append(whole)
+            parts.append(place - whole)
+        total = np.zeros(self.depths.shape)
+        for row in (0, 1) if self._open[0] else (0,):
+            for column in (0, 1) if self._open[1] else (0,):
+                weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
+                value = seen[keys[0][:, None], keys[1], (places[0] + row)[:, None], places[1] + column]
+                total += np.outer(*weights) * value
+        return total
+
+    @cached_property
+    def _class_images(self) -> dict[float, FloatArray]:
+        sides, patterns = [], []
+        for axis, opened in enumerate(self._open):
+            side = self.depths.widen(axis, self._margin) if opened else self.depths.side(axis, 0.0)
+            sides.append(side)
+            patterns.append(np.ones((side.shape[1], 1)) if opened else self.depths.patterns[axis])
+        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
+        counts = [own.shape[1] if opened else 1 for own, opened in zip(self.depths.patterns, self._open, strict=True)]
+        sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
+        for each in self.depths.frames:
+            key = (each.row if self._open[0] else 0, each.column if self._open[1] else 0)
+            sums[key].add(each.frame, 0 if self._open[0] else each.row, 0 if self._open[1] else each.column)
+        problems = {key: prepared.problem(own) for key, own in sums.items()}
+        found = {}
+        for lam in LAMBDAS:
+            images = [prepared.solve(own, lam * problems[key].scale).image for key, own in sums.items()]
+            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
+        return found
+
+
+def _classes(patterns: FloatArray) -> np.ndarray:
+    if not are_dots(patterns):
+        raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
+    return np.asarray(patterns.argmax(axis=1))

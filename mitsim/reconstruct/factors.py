@@ -1,17 +1,23 @@
-"""The two factors of a calibrated camera: arrays or a CAL folder in, the linear operator of any pattern family out."""
+"""Factors of a calibrated camera, and their estimate from responses to +-1 stripes on a white board.
+
+Under X = h_i 1^T a separable camera records Y_i = Phi_L h_i (Phi_R 1)^T = u_i v^T, and under 1 h_i^T it records a w_i^T
+with a = Phi_L 1. The uniform response a v^T gives a and v. Projections on them give u_i and w_i, and H H^T = N I gives
+Phi_L = U H^T / N (arXiv 2111.12862, section IV-A, after the FlatCam procedure; the paper omits 1/N). Factors are known
+up to (c Phi_L, Phi_R / c) only. They are returned balanced, |Phi_L 1| = |Phi_R 1|."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, SeparableTerm
+from mitsim.core.arrays import FloatArray, SeparableTerm, sum_of_squares
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
@@ -19,14 +25,564 @@ from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.estimate_factors import Estimate, squared_condition
-from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import centre_columns
+from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from scipy.sparse.linalg import LinearOperator
     from xarray import Dataset
+
+SEPARABLE_RESIDUAL = 0.01
+"""Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
+light. Falloff and diffraction leave less than 1e-3."""
+
+UNKNOWN_NOISE = 0.05
+"""The same where the sensor's noise was not stated, so that a good session's own few percent do not count."""
+
+NOISE_MODEL = 0.2
+"""Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
+
+LARGEST_ERROR = 0.1
+"""Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
+_NUMBERS_AT_ONCE = 2**15
+"""Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
+_NEGATIVE = 0.1
+"""Sum over the sum of absolute values below which a uniform response counts as negative: noise alone makes 0.01."""
+_TURNS, _TURNED = 30, 1e-13
+"""Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
+each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
+
+
+# ---- Estimated factors ----
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Factors as :func:`estimate_factors` found them, and how far to trust them; once they are those of a camera, with
+    its identity and in a file's precision, they are :class:`mitsim.reconstruct.factors.Factors`.
+
+    Attributes
+    ----------
+    left, right
+        Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
+    separability_residual
+        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses: noise plus what no separable
+        camera explains.
+    unexplained
+        the part of that residual which the stated sensor noise does not account for; equal to it when none was stated.
+    condition
+        the larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient.
+    noise
+        root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
+    predicted_error
+        relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
+    rank
+        of (left, right): singular values that are more than rounding, and than that noise alone would make.
+    status
+        not ok when the responses cannot be trusted; with error, rank and condition.
+    """
+
+    left: FloatArray
+    right: FloatArray
+    separability_residual: float
+    unexplained: float
+    condition: float
+    noise: float
+    predicted_error: tuple[float, float]
+    rank: tuple[int, int]
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Whether the factors can be used as they are."""
+        return self.status.ok
+
+
+# ---- Sums over the responses of a side ----
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """What one response adds to :class:`StripeSums`.
+
+    Attributes
+    ----------
+    vector
+        (m,) u_i, or w_i: least squares in Y_i = u_i common^T.
+    misfit, energy
+        ||Y_i - u_i common^T||^2 and ||Y_i||^2.
+    ambient
+        (3,) light that the mask does not cast, measured across the common vector: even, and tilted along the response's
+        vector and along the common one, whose places are -1 to 1. Zeros where responses are centred.
+    light
+        (m,) the sum of its two frames, projected as the response is; None: not known.
+    """
+
+    vector: FloatArray
+    misfit: float
+    energy: float
+    ambient: FloatArray
+    light: FloatArray | None = None
+
+
+@dataclass
+class StripeSums:
+    """Running sums over the responses of one side; saved after any response and continued, they come to the same bits.
+
+    Attributes
+    ----------
+    side
+        ``horizontal`` or ``vertical`` stripes.
+    centre
+        whether row and column means are taken out of every response.
+    common
+        v (k,) of Y_i = u_i v^T; for vertical stripes a of Y_i^T = w_i a^T.
+    vectors
+        (m, N) u_i, or w_i, as columns; those of responses to come are undefined.
+    misfit, energy
+        sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
+    done
+        responses that are in.
+    misfits, energies, ambient
+        (N,), (N,) and (N, 3) of each response.
+    lights
+        (m, N) the sums of the two frames of each response, projected as the response is; (m, 0) where responses are not
+        the differences of two frames, or where the sums are not known.
+    """
+
+    side: str
+    centre: bool
+    common: FloatArray
+    vectors: FloatArray
+    misfit: float = 0.0
+    energy: float = 0.0
+    done: int = 0
+    misfits: FloatArray = field(init=False)
+    energies: FloatArray = field(init=False)
+    ambient: FloatArray = field(init=False)
+    lights: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.misfits, self.energies = np.zeros((2, self.vectors.shape[1]))
+        self.ambient = np.zeros((self.vectors.shape[1], 3))
+        self.lights = np.zeros((len(self.vectors), 0))
+
+    def add(self, response: npt.ArrayLike) -> None:
+        """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
+        self.put(self.fit_response(response, self.done))
+
+    def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
+        """What a response adds; MitsimError as :meth:`add`.
+
+        Changes nothing, so that responses are looked at in several threads.
+
+        Parameters
+        ----------
+        response
+            (rows, columns).
+        number
+            of its pattern.
+        light
+            (rows, columns) the sum of the two frames whose difference it is; None: not known.
+        """
+        shape = len(self.vectors), len(self.common)
+        shape = shape if self.side == "horizontal" else shape[::-1]
+        checked = _response(response, f"{self.side} response {number}", shape, self.centre)
+        return self._fit_checked(checked, np.asarray(response), light)
+
+    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
+        across = self.side == "horizontal"
+        common = self.common / np.dot(self.common, self.common)
+        vector = (response if across else response.T) @ common
+        rows, columns = (vector, self.common) if across else (self.common, vector)
+        misfit = energy = 0.0
+        step = max(1, _NUMBERS_AT_ONCE // response.shape[1])
+        for start in range(0, len(response), step):
+            block = response[start : start + step]
+            explained = np.multiply.outer(rows[start : start + step], columns)
+            misfit += sum_of_squares(np.subtract(block, explained, out=explained))
+            energy += sum_of_squares(block)
+        # Both factors' means are zero if centred, so that light of no mask is not in their vectors.
+        shown = AmbientLight(self.common, len(vector)).measure(given if across else given.T)
+        if light is not None:
+            light = (light if across else light.T) @ common
+            light -= light.mean() * self.centre
+        return ResponseFit(vector, misfit, energy, shown * (not self.centre), light)
+
+    def put(self, seen: ResponseFit) -> None:
+        """Count in what was ``seen`` of the next response."""
+        self.vectors[:, self.done] = seen.vector
+        self.misfit += seen.misfit
+        self.energy += seen.energy
+        self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
+        self.ambient[self.done] = seen.ambient
+        if seen.light is not None:
+            self.lights = self.lights if self.lights.size else np.zeros_like(self.vectors)
+            self.lights[:, self.done] = seen.light
+        self.done += 1
+
+
+def stripe_sums(
+    horizontal: npt.ArrayLike,
+    vertical: npt.ArrayLike,
+    count: int,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+    lights: Sequence[FloatArray | None] = (None, None),
+) -> tuple[StripeSums, StripeSums]:
+    """Sums of horizontal and of vertical stripes, with the first response of each.
+
+    Parameters
+    ----------
+    horizontal, vertical
+        responses number 0 (rows, columns).
+    count
+        N, the responses of each side.
+    centre, uniform
+        as :func:`estimate_factors`, which also says what is refused.
+    lights
+        (rows, columns) sums of the two frames that each of both responses is the difference of.
+    """
+    first = _response(horizontal, "horizontal response 0", None, centre)
+    second = _response(vertical, "vertical response 0", first.shape, centre)
+    mean = (upright(first, horizontal) + upright(second, vertical)) / 2
+    if uniform is not None:
+        mean = _response(uniform, "uniform response", first.shape, centre)
+    a, v = _rank_one_split(mean)
+    left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
+    right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
+    for sums, checked, response, light in zip(
+        (left, right), (first, second), (horizontal, vertical), lights, strict=True
+    ):
+        sums.put(sums._fit_checked(checked, np.asarray(response), light))
+    return left, right
+
+
+def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
+    """Return a uniform ``response``, its sign turned if its ``light`` (before centring) is negative because its two
+    frames are exchanged. Light that was centred before has no sign."""
+    negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
+    return -response if negative else response
+
+
+# ---- From responses, or their sums, to factors ----
+
+
+def estimate_factors(
+    horizontal: Iterable[npt.ArrayLike],
+    vertical: Iterable[npt.ArrayLike],
+    H: npt.ArrayLike,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+    noise: float | None = None,
+) -> Estimate:
+    """Factors of a separable camera from its responses to striped light.
+
+    Parameters
+    ----------
+    horizontal, vertical
+        responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order i = 0 .. N-1, each the difference of a
+        pattern's positive and negative capture; read one at a time, so generators keep memory small.
+    H
+        (n, N) of +1 and -1 with orthogonal rows. Its column 0 is all +1 unless ``uniform`` is given.
+    centre
+        True takes row and column means out of every response and of the factors: for a FlatCam mask, whose
+        constant term vanishes so.
+    uniform
+        (m, m') response under all light, a better estimate than responses number 0 (for example the mean
+        over pairs of positive + negative captures). Default: the mean of ``horizontal[0]`` and
+        ``vertical[0]``.
+    noise
+        root mean square sensor noise of a response [frame unit]; None: unknown. Where it is known, few photons alone
+        do not make the responses look inseparable, and a small keystone is not taken for noise.
+
+    Raises
+    ------
+    MitsimError
+        for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+    """
+    signs = _checked_signs(H, uniform is not None)
+    count = signs.shape[1]
+    rows, columns = iter(horizontal), iter(vertical)
+    first = _next(rows, "horizontal", 0, count), _next(columns, "vertical", 0, count)
+    left, right = stripe_sums(*first, count, centre, uniform)
+    for sums, rest in ((left, rows), (right, columns)):
+        while sums.done < count:
+            sums.add(_next(rest, sums.side, sums.done, count))
+        if next(rest, None) is not None:
+            raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
+    return factors_of_sums(left, right, signs, noise)
+
+
+def factors_of_sums(
+    left: StripeSums,
+    right: StripeSums,
+    signs: FloatArray,
+    stated_noise: float | None = None,
+    extra: tuple[float, float] = (0.0, 0.0),
+) -> Estimate:
+    """Factors from finished sums.
+
+    Parameters
+    ----------
+    left, right
+        of horizontal and of vertical stripes, all responses in.
+    signs
+        H (n, N), as :func:`estimate_factors` takes it.
+    stated_noise
+        root mean square sensor noise of a response [frame unit]; None: unknown.
+    extra
+        squared error of each side's vectors, all in all, that is not the noise of their responses.
+    """
+    v, a = left.common, right.common
+    count = signs.shape[1]
+    phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
+    energy = left.energy + right.energy
+    residual = float(np.sqrt((left.misfit + right.misfit) / energy))
+    # Each response of m m' numbers spends one fitted number a sensor row (or column).
+    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
+    noise = float(np.sqrt((left.misfit + right.misfit) / spare))
+    expected = spare * (stated_noise or 0.0) ** 2 / energy
+    unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
+    allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
+    singular = _Singular.of(phi[0]), _Singular.of(phi[1])
+    condition = max(values.squared_condition for values in singular)
+    predicted, rank = [], []
+    for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
+        error = predicted_error(factor, noise, float(np.linalg.norm(common)), count)
+        if more:
+            error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
+        predicted.append(error)
+        rank.append(values.rank(factor, error))
+    n = len(signs)
+    figures = (
+        f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
+        f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}."
+    )
+    return Estimate(
+        left=phi[0],
+        right=phi[1],
+        separability_residual=residual,
+        unexplained=unexplained,
+        condition=condition,
+        noise=noise,
+        predicted_error=(predicted[0], predicted[1]),
+        rank=(rank[0], rank[1]),
+        status=_status(unexplained > allowed, unexplained, max(predicted), (n - rank[0], n - rank[1]), figures),
+    )
+
+
+# ---- The error that noise makes ----
+
+
+def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
+    """Relative Frobenius error of a factor when every datum has independent noise.
+
+    Parameters
+    ----------
+    factor
+        Phi (m, n) [square root of the frames' unit].
+    noise
+        standard deviation of a datum [frame unit].
+    common_norm
+        |v|, the norm of what all responses of this side share [as ``factor``].
+    count
+        N, the responses.
+
+    Notes
+    -----
+    u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, and U H^T / N averages N of them with signs,
+    so the factor has variance noise^2 / (N |v|^2). The error of v itself enters at second order and as a
+    common scale of order noise / (|a| |v|), and is left out. Infinite for a factor that is zero.
+    """
+    deviation = noise / (np.sqrt(count) * common_norm)
+    norm = float(np.linalg.norm(factor))
+    return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
+
+
+# ---- Light that is no mask's ----
+
+
+class AmbientLight:
+    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
+
+    Parameters
+    ----------
+    common
+        (k,) v.
+    length
+        m, of the responses' vectors u.
+
+    Attributes
+    ----------
+    effects
+        (3, m) vectors that light of size 1 adds to u: even, tilted along u, tilted along v, by places -1 to 1.
+    variances
+        (3,) of the measured sizes for noise of variance 1.
+    """
+
+    def __init__(self, common: FloatArray, length: int) -> None:
+        self._places, even = np.linspace(-1, 1, length), np.ones(length)
+        shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
+        shares = common @ shapes / np.dot(common, common)
+        self.effects = np.stack([shares[0] * even, shares[0] * self._places, shares[1] * even])
+        self._across = shapes - np.outer(common, shares)
+        self._products = np.zeros((3, 3))
+        self._products[::2, ::2] = length * self._across.T @ self._across
+        self._products[1, 1] = np.dot(self._places, self._places) * np.square(self._across[:, 0]).sum()
+        self._inverse = np.linalg.pinv(self._products)
+        self.variances = np.diag(self._inverse)
+
+    def measure(self, response: FloatArray) -> FloatArray:
+        """Return (3,) the sizes of the light in a ``response`` (m, k)."""
+        seen = response @ self._across
+        return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
+
+    def energies(self, sizes: FloatArray) -> FloatArray:
+        """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
+        return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
+
+
+# ---- Whether the factors can be used ----
+
+
+def decibels(part: float) -> float:
+    """An rms ``part`` of a signal in dB, -20 for a tenth."""
+    return float(20 * np.log10(part))
+
+
+def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, int], figures: str) -> Status:
+    if inseparable:
+        return Status(
+            Verdict.NOT_SEPARABLE,
+            f"Responses are not separable: {residual:.1%} of them is left over ({decibels(residual):.1f} dB)",
+            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
+            figures,
+        )
+    if error > LARGEST_ERROR:
+        return Status(
+            Verdict.MOSTLY_NOISE,
+            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}",
+            "raise the exposure or average captures",
+            figures,
+        )
+    if any(lost):
+        return Status(
+            Verdict.RANK_DEFICIENT,
+            f"Factors are rank deficient: {lost[0]} directions of scene rows and {lost[1]} of columns are not above "
+            "noise and rounding",
+            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
+            figures,
+        )
+    return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+
+
+# ---- Singular values: condition and rank ----
+
+
+@dataclass(frozen=True, eq=False)
+class _Singular:
+    values: FloatArray
+    rounding: float
+    wide: bool
+
+    @classmethod
+    def of(cls, phi: FloatArray) -> _Singular:
+        values = np.asarray(np.linalg.svd(phi, compute_uv=False))
+        rounding = float(values[0] * max(phi.shape) * np.finfo(np.float64).eps)
+        return cls(values, rounding, phi.shape[0] < phi.shape[1])
+
+    @property
+    def squared_condition(self) -> float:
+        lost = self.wide or self.values[-1] <= self.rounding
+        return float("inf") if lost else float((self.values[0] / self.values[-1]) ** 2)
+
+    def rank(self, phi: FloatArray, error: float) -> int:
+        """Values beyond rounding and what an ``error``, as a part of ||``phi``||, makes of zero.
+
+        Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
+        norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+        """
+        if not phi.any():
+            return 0
+        deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
+        noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+        return int(np.count_nonzero(self.values > max(float(noise), self.rounding)))
+
+
+def squared_condition(phi: FloatArray) -> float:
+    """cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
+    return _Singular.of(phi).squared_condition
+
+
+def rank_above_noise(phi: FloatArray, error: float) -> int:
+    """Directions of scene pixels that a factor ``phi`` (m, n) of a relative ``error`` sees above noise and rounding."""
+    return _Singular.of(phi).rank(phi, error)
+
+
+# ---- The uniform response as a product of two vectors ----
+
+
+def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    right = _largest_right_vector(mean)
+    left = mean @ right
+    size = float(np.linalg.norm(left))
+    if size == 0:
+        raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
+    root = np.sqrt(size) if left.sum() >= 0 else -np.sqrt(size)
+    return left * (root / size), right * root
+
+
+def _largest_right_vector(matrix: FloatArray) -> FloatArray:
+    """(n,) right singular vector of the largest singular value of a ``matrix`` (m, n), of either sign.
+
+    By power iteration: a uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048. Where
+    the next singular value is so near that the iteration has not converged in time, by that SVD.
+    """
+    # No direction of the data: what starts across the first singular vector would not find it.
+    vector = _unit(np.random.default_rng(0).standard_normal(len(matrix)) @ matrix)
+    for _ in range(_TURNS):
+        before, vector = vector, _unit(_unit(matrix @ vector) @ matrix)
+        if np.linalg.norm(vector - before) <= _TURNED:
+            return vector
+    return np.asarray(np.linalg.svd(matrix, full_matrices=False)[2][0])
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    norm = float(np.linalg.norm(vector))
+    return vector / norm if norm else vector
+
+
+# ---- Responses and patterns as they are read ----
+
+
+def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:
+    response = next(responses, None)
+    if response is None:
+        raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
+    return response
+
+
+def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
+    values = np.asarray(response, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
+        raise MitsimError(f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first")
+    if not np.isfinite(values).all():
+        bad = np.count_nonzero(~np.isfinite(values))
+        raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
+    return centre_frame(values) if centre else values
+
+
+def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
+    signs = np.asarray(H, dtype=np.float64)
+    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
+        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
+    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
+        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
+    if not has_uniform and not (signs[:, 0] == 1).all():
+        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
+    return signs
+
 
 _LACKING = "lacking"
 """What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
@@ -266,12 +822,10 @@ class Factors:
 
 
 def _single(values: FloatArray) -> FloatArray:
-    """``values`` rounded to single precision."""
     return values.astype(np.float32).astype(np.float64)
 
 
 def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
-    """What the identity of a ``camera`` says, by names such as ``projector.n``."""
     found: dict[str, Any] = {}
     for part, value in camera.items():
         inner = value.items() if isinstance(value, Mapping) else ()
@@ -280,7 +834,6 @@ def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _factor_noise(estimate: Estimate) -> FactorNoise | None:
-    """How exact the factors of an ``estimate`` are; None where all is noise."""
     left, right = (
         error * float(np.linalg.norm(side)) / np.sqrt(side.size)
         for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
@@ -297,7 +850,6 @@ def load_calibration(folder: Path | str) -> Factors:
     manifest = read_manifest(folder, CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         verify(folder, name, manifest.checksums, "calibrate again")
         return read_frame(folder / name)
 

@@ -1,26 +1,36 @@
-"""Factors of a calibrated depth in; out come those of another depth, and the part of the sensor where they are known.
+"""Factors of another depth or of a wider window, and light that no projector pixel sends.
 
-A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d tau, and
-projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the calibrated
-one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the board.
-Columns change slowly (a mask feature is some ten pixels wide), so values between them are interpolated. Beyond the
-window no column was calibrated; but sensor pixels further on saw the same part of the mask in a column within, at u + v
-and tau - v (1/d - 1/z_0), for any v. Only at the sensor's own edge there is nothing left to see, and these few rows are
-left out, of frames and factors alike.
-
-What moves is the shadow, not the light: an image is light relative to the board's, pixel by pixel, so each pixel keeps
-the brightness that it had at z_0, while values are taken from columns that fall off more or less than its own. Sensor
-pixels that see one part of the mask in two columns tell how much.
+*Depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d
+tau, and projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the
+calibrated one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the
+board. Beyond the window no column was calibrated, but sensor pixels further on saw the same part of the mask in a
+column within, at u + v and tau - v (1/d - 1/z_0) for any v. Rows at the sensor's edge without such a column are left
+out of frames and factors. Each pixel keeps the brightness that it had at z_0.
 
 *Between columns.* Sensor row u + k sees in column i what row u sees at i + k s, s being the columns that one sensor
-pixel's step makes up for: the mask's shadow hangs on one coordinate. So each row has the numbers of its neighbours too,
-at places between its own, and a cubic spline with knots finer than columns is fitted to all of them: where a projector
-pixel is wide, a polynomial through columns alone misses the edges of the mask's features.
-"""
+pixel's step makes up for. So each row uses the numbers of its neighbours too, and a cubic spline with knots finer than
+columns is fitted to all of them.
+
+*Margin.* A wall beside the window scatters light of directions that no projector pixel has. Cells beyond the window
+cast the shadow of the window's edge, moved along the sensor, so that no calibration needs to light them. They count as
+lit in every pattern, which keeps the model separable (benchmarks/margin.py).
+
+*Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij the
+patterns,
+
+    Y_ij = Phi_L (P_ij o X) Phi_R^T + F,        F = Phi_L H_L g H_R^T Phi_R^T
+
+X is direct, F global light, whose image H_L g H_R^T is linear between nodes as far apart as the dots. With Phi H = Q R
+on each side and A = (sum_i U_i)^T Q, the least squares of all K frames over X and F = Q_L f Q_R^T have
+
+    K f - A_L^T (A_L f A_R^T) A_R = Q_L^T (sum_ij Y_ij) Q_R - A_L^T W A_R
+
+An eigenvalue of the left side over K is the part of a mode of F that lit pixels do not explain: 0 under uniform light,
+near 1 where the dots' shadows leave gaps. Global light that changes from frame to frame stays in X."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -32,9 +42,11 @@ from scipy.linalg import solveh_banded
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import check_parallax
+from mitsim.reconstruct.solver import Prepared
 
 STEP = 0.5
 """Projector pixels of parallax between displacements that are looked at; a dot's image is some two wide."""
@@ -175,11 +187,9 @@ class FactorOfDepths:
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
     def _source_columns(self, shift: float | FloatArray) -> FloatArray:
-        """(m, n) column that each sensor row saw at the calibrated depth where it now sees each scene pixel."""
         return np.arange(self.factor.shape[1]) + (self.edges - self._parallax_pixels[2] * self._place[:, None]) * shift
 
     def _transmission(self, column: FloatArray) -> FloatArray:
-        """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through."""
         stop = self.parallax.stop_tan
         if stop is None:
             return np.ones_like(column)
@@ -208,7 +218,6 @@ class FactorOfDepths:
     def _sources(
         self, column: npt.NDArray[np.floating | np.integer]
     ) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
-        """Rows and columns of the factor that saw the shadow of places between columns (m, k), and whether any did."""
         rows, count = self.factor.shape
         # Columns that one sensor pixel's step along the sensor makes up for.
         step = self._step
@@ -230,7 +239,6 @@ class FactorOfDepths:
 
     @cached_property
     def _own_brightness(self) -> FloatArray:
-        """(n,) of the calibrated columns."""
         return self.brightness(np.arange(self.factor.shape[1]))
 
     @property
@@ -250,13 +258,11 @@ class FactorOfDepths:
         return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
     def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """Places from the window's middle, its edges being 1 away."""
         middle = (self.factor.shape[1] - 1) / 2
         return np.asarray((column - middle) / middle)
 
     @cached_property
     def _falloff(self) -> FloatArray:
-        """(degrees + 1,) coefficients of the polynomial that the logarithm of brightness is; that of degree 0 is 0."""
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
@@ -280,14 +286,12 @@ class FactorOfDepths:
 
     @property
     def _step(self) -> float:
-        """Columns that one pixel's step along the sensor sees the mask's shadow move."""
         parallax = self.parallax
         inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
         return self._pitch * inverse * self._parallax_pixels[2]
 
     @cached_property
     def _place(self) -> FloatArray:
-        """(m,) place of each sensor row, from their middle [mm]."""
         rows = len(self.factor)
         return np.asarray((np.arange(rows) - (rows - 1) / 2) * self._pitch)
 
@@ -300,13 +304,11 @@ class FactorOfDepths:
 
 
 def _whole(known: npt.NDArray[np.bool_]) -> slice:
-    """Rows of which all numbers are ``known``."""
     inside = np.flatnonzero(known.all(axis=1))
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
 def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-    """Lagrange's cubic through the four columns around each ``column`` of each ``row``, exact at whole numbers."""
     start = np.clip(np.floor(column).astype(np.intp) - 1, 0, factor.shape[1] - _NEIGHBOURS)
     t = column - start
     weights = (
@@ -344,20 +346,16 @@ class DerivedCapture(Capture):
 
 
 class _Part(DerivedCapture):
-    """What a part of the sensor saw of a capture."""
-
     def __init__(self, whole: Capture, part: MovedFactors) -> None:
         super().__init__(whole)
         self._part = part
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """As of the whole sensor, whose frames must have the shape that the calibration's have."""
         for each in self.whole.pattern_measurements(self._part.sensor):
             yield replace(each, frame=self._cut(each.frame), light=self._cut(each.light))
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """The ambient frame of that part."""
         whole = self.whole.ambient
         return whole and Ambient(self._cut(whole.rate), self._cut(whole.variance), whole.shots)
 
@@ -454,7 +452,6 @@ class ColumnSpline:
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
 
     def _fit(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        """(len(``rows``), coefficients) of the spline of each row, from its ``neighbours``' numbers."""
         normal, start, weights = self._normal(neighbours[None])
         data = np.zeros((self._last + 3, len(rows)))
         for k, first, parts in zip(neighbours, start[0], np.moveaxis(weights[:, 0], 1, 0), strict=True):
@@ -466,16 +463,12 @@ class ColumnSpline:
         return np.asarray(solveh_banded(normal[0], data, lower=True).T)
 
     def _fit_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        """(rows, coefficients) of the spline of each row, from what is ``seen`` (rows, k, n) in the ``neighbours``
-        (rows, k) of its own."""
         normal, start, weights = self._normal(neighbours)
         data = np.sum([self._collect(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
         found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
         return np.array(found).reshape(len(seen), self._last + 3)
 
     def _normal(self, neighbours: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
-        """Of fits to rows that are ``neighbours`` (fits, k): normal matrices (fits, 4, coefficients) by diagonal, first
-        coefficient (fits, k, n) and weights (4, fits, k, n) of each number, 0 beyond the last knot."""
         place = (np.arange(self._last // _SPLINE_KNOTS + 1) + neighbours[..., None] * self._step) * _SPLINE_KNOTS
         start, parts = self._weights(place)
         weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
@@ -487,14 +480,11 @@ class ColumnSpline:
         return normal, start, weights
 
     def _collect(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
-        """(fits, coefficients) sums of the ``values`` (fits, k, n) at each ``place`` (fits, k, n)."""
         fits, size = len(place), self._last + 3
         own = (np.arange(fits) * size)[:, None, None] + place
         return np.asarray(np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size), dtype=np.float64)
 
     def _weights(self, place: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
-        """First of the four coefficients at each ``place`` [knots], and the weights of all four: uniform cubic
-        B-splines."""
         start = np.clip(np.floor(place).astype(np.intp), 0, self._last - 1)
         t = place - start
         square = t * t
@@ -502,3 +492,169 @@ class ColumnSpline:
         first = (1 + 3 * (square - t)) / 6 - last
         third = (1 + 3 * (t + square)) / 6 - 3 * last
         return start, (first, 1 - first - third - last, third, last)
+
+
+# ---- A margin of cells beside the window -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """``cells`` more on each side of the projector's window, 1 or more."""
+
+    cells: int
+
+    def factors(self, factors: Factors) -> MovedFactors:
+        """The ``factors`` with columns of these cells, on the part of the sensor where these are known.
+
+        MitsimError where they do not state their parallax, and for more cells than the window, or the sensor, tells of.
+        """
+        parallax, sides = parallax_of(factors), (factors.left, factors.right)
+        if self.cells > (most := min(factor.shape[1] for factor in sides)):
+            raise ArgumentError("margin", f"{self.cells}: give at most {most}, the projector's pixels a side")
+        widened = [FactorOfDepths(factor, parallax, axis).beyond(self.cells) for axis, factor in enumerate(sides)]
+        part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
+        if part < LEAST_PART:
+            raise ArgumentError(
+                "margin",
+                f"{self.cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer",
+            )
+        (left, rows), (right, columns) = widened
+        sizes = factors.left.shape[1], factors.right.shape[1]
+        manifest = factors.manifest.model_copy(update={"parallax": _wider(parallax, sizes, self.cells)})
+        shape = len(factors.left), len(factors.right)
+        wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
+        return MovedFactors(wider, rows, columns, shape)
+
+    def of(self, shots: Capture) -> Capture:
+        """The ``shots`` with patterns that light these cells always; MitsimError for patterns of -1."""
+        if any(shot.sign for shot in shots.manifest.patterns.captures):
+            raise MitsimError(
+                f"margin {self.cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what "
+                "is lit always is not there; leave margin out"
+            )
+        return _Padded(shots, self.cells)
+
+    def inside(self, image: FloatArray) -> FloatArray:
+        """The window's part of an ``image``."""
+        return image[self.cells : -self.cells, self.cells : -self.cells]
+
+
+class _Padded(DerivedCapture):
+    def __init__(self, whole: Capture, cells: int) -> None:
+        super().__init__(whole)
+        self._cells = cells
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        pad = (self._cells, self._cells), (0, 0)
+        left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in self.whole.patterns)
+        return left, right
+
+
+def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
+    def extend(edges: tuple[float, float], size: int) -> tuple[float, float]:
+        more = (edges[1] - edges[0]) * cells / size
+        return edges[0] - more, edges[1] + more
+
+    names = ("row_tan", "row_mm"), ("column_tan", "column_mm")
+    update = {
+        name: extend(getattr(parallax, name), size) for size, own in zip(sizes, names, strict=True) for name in own
+    }
+    return parallax.model_copy(update=update)
+
+
+# ---- Global light, the same in all frames ----------------------------------------------------------------------------
+
+
+_LEAST_EIGENVALUE = 1e-3
+"""Part of a mode that must remain: noise in it is magnified by the root of one over that, thirtyfold, which the mean
+over all frames makes up for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Light that is in all frames alike.
+
+    Attributes
+    ----------
+    common
+        (m, m') of each frame, in the frames' unit; to be taken off.
+    image
+        (n, n') reflectance that it looks like under uniform light, all of it from lit pixels.
+    eigenvalues
+        (modes,) part of each mode of it that lit pixels do not explain, smallest first.
+    """
+
+    common: FloatArray
+    image: FloatArray
+    eigenvalues: FloatArray
+
+
+@single_threaded_blas()
+def separate(
+    model: Prepared,
+    seen: tuple[FloatArray, FloatArray],
+    patterns: tuple[FloatArray, FloatArray],
+    weights: FloatArray,
+    total: FloatArray,
+) -> Separation:
+    """Global light of frames under patterns of 0 and 1.
+
+    Parameters
+    ----------
+    model
+        the factorised model of these patterns.
+    seen
+        Phi_L (m, n + 2 w) and Phi_R (m', n' + 2 w'): factors with w columns beside the window on either side, as
+        :meth:`mitsim.reconstruct.focus.FactorOfDepths.beyond` makes them, or none.
+    patterns
+        P_L (n, K) and P_R (n', K'), shifting dots.
+    weights, total
+        W (r, r') and the sum (m, m') of all frames.
+
+    Raises
+    ------
+    MitsimError
+        for patterns under which global light looks like an image: uniform light, +-1, a factor of centred frames.
+    """
+    if model.centre or any((side < 0).any() for side in patterns):
+        raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
+    nodes = [_hats(factor.shape[1], side.shape[1]) for factor, side in zip(seen, patterns, strict=True)]
+    bases, triangles = zip(*(np.linalg.qr(side @ hats) for side, hats in zip(seen, nodes, strict=True)), strict=True)
+    lit = [side.common.T @ basis for side, basis in zip((model.left, model.right), bases, strict=True)]
+    shape = bases[0].shape[1], bases[1].shape[1]
+    count = model.left.pattern_count * model.right.pattern_count
+    measured = (model.sigma > 0).astype(np.float64)
+    target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
+    unexplained: FloatArray = np.eye(target.size) - _explained_matrix(lit, measured) / count
+    reported, modes = np.linalg.eigh(unexplained)
+    if reported[-1] < _LEAST_EIGENVALUE:
+        raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
+    inverse = np.divide(1.0, count * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
+    found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(shape)
+    left, right = (
+        _inside(hats, len(side)) @ np.linalg.inv(triangle)
+        for hats, side, triangle in zip(nodes, patterns, triangles, strict=True)
+    )
+    part = float(np.prod([side.mean() for side in patterns]))
+    return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, reported)
+
+
+def _inside(hats: FloatArray, pixels: int) -> FloatArray:
+    margin = (len(hats) - pixels) // 2
+    return hats[margin : margin + pixels]
+
+
+def _hats(pixels: int, period: int) -> FloatArray:
+    """(pixels, J) functions that are linear between J nodes ``period`` apart, the outer ones at the window's ends."""
+    count = max(2, 1 + -(-(pixels - 1) // period))
+    place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
+    return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))
+
+
+def _explained_matrix(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
+    pairs = [(side[:, :, None] * side[:, None, :]).reshape(len(side), -1) for side in lit]
+    sizes = [side.shape[1] for side in lit]
+    product = (pairs[0].T @ measured @ pairs[1]).reshape(sizes[0], sizes[0], sizes[1], sizes[1])
+    size = sizes[0] * sizes[1]
+    return np.asarray(product.transpose(0, 2, 1, 3).reshape(size, size))

@@ -45,6 +45,7 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.solvers import Prior
 
 Array = npt.NDArray[Any]
@@ -101,12 +102,36 @@ class ShiftedLight:
     def __post_init__(self) -> None:
         if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
             raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
-        for size, most in zip(self.sensor, self._whole, strict=True):
+        for size, most in zip(self.sensor, self.whole, strict=True):
             if size > most:
                 raise MitsimError(
-                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self._whole[0]} x "
-                    f"{self._whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
+                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self.whole[0]} x "
+                    f"{self.whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
                 )
+
+    @classmethod
+    def of(cls, psf: FloatArray, n: int, sensor: tuple[int, int] | None = None) -> ShiftedLight:
+        """Return a camera before an evenly lit scene of ``n`` x ``n`` pixels, whose sensor gets all light."""
+        if n < 1:
+            raise MitsimError(f"scene of {n} pixels a side; give at least 1")
+        rows, columns = (size + n - 1 for size in psf.shape)
+        return cls(psf, sensor or (rows, columns), (np.ones((n, 1)), np.ones((n, 1))))
+
+    def under(self, family: PatternFamily) -> ShiftedLight:
+        """Return the same camera under the patterns of a ``family``."""
+        if (family.n, family.n) != self.scene:
+            raise MitsimError(
+                f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}; both need the same"
+            )
+        return replace(self, patterns=(family.left.astype(np.float64), family.right.astype(np.float64)))
+
+    def check_frames(self, frames: Array) -> None:
+        """Raise MitsimError unless ``frames`` fit the patterns and the sensor and are finite."""
+        if frames.shape != (self.count, *self.sensor) or not np.isfinite(frames).all():
+            raise MitsimError(
+                f"frames of shape {frames.shape}: give {self.count} of {self.sensor[0]} x {self.sensor[1]} finite "
+                "numbers"
+            )
 
     @property
     def scene(self) -> tuple[int, int]:
@@ -191,7 +216,7 @@ class ShiftedLight:
     @cached_property
     def grid(self) -> tuple[int, int]:
         """Rows and columns of transforms: light that wraps round lands beside the sensor."""
-        sides = zip(self.scene, self._whole, self._origin, self.sensor, strict=True)
+        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
         rows, columns = (
             fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
             for scene, whole, origin, size in sides
@@ -204,18 +229,18 @@ class ShiftedLight:
         return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
 
     @property
-    def _whole(self) -> tuple[int, int]:
+    def whole(self) -> tuple[int, int]:
         rows, columns = (n + k - 1 for n, k in zip(self.scene, self.psf.shape, strict=True))
         return rows, columns
 
     @property
-    def _origin(self) -> tuple[int, int]:
-        rows, columns = ((whole - size) // 2 for whole, size in zip(self._whole, self.sensor, strict=True))
+    def origin(self) -> tuple[int, int]:
+        rows, columns = ((whole - size) // 2 for whole, size in zip(self.whole, self.sensor, strict=True))
         return rows, columns
 
     @property
     def _crop(self) -> tuple[slice, slice]:
-        (row, column), (rows, columns) = self._origin, self.sensor
+        (row, column), (rows, columns) = self.origin, self.sensor
         return slice(row, row + rows), slice(column, column + columns)
 
     @property
@@ -238,16 +263,6 @@ def reduce_frame(frame: Array, reduce: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """An image X (n, n') of ``light``, and what follows of it.
-
-    Attributes
-    ----------
-    residual
-        A X - Y.
-    smooth
-        the slope below which TV is quadratic.
-    """
-
     light: ShiftedLight
     prior: Prior
     image: Array
@@ -261,7 +276,6 @@ class _State:
 
     @cached_property
     def _flattened(self) -> float:
-        """How far the quadratic TV is below TV, times the weight."""
         if not self.prior.weight:
             return 0.0
         low = np.minimum(self._slopes[2], self.smooth)
@@ -269,7 +283,6 @@ class _State:
 
     @cached_property
     def objective(self) -> float:
-        """P(X)."""
         squares = _dot(self.residual, self.residual) + self.prior.ridge * _dot(self.image, self.image)
         if not self.prior.weight:
             return squares / 2
@@ -277,17 +290,14 @@ class _State:
 
     @property
     def smoothed(self) -> float:
-        """P(X) with the quadratic TV, which is what a step lowers."""
         return self.objective - self._flattened
 
     @cached_property
     def _stiffness(self) -> Array:
-        """Weight over slopes: Q of slopes of 1."""
         return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
 
     @cached_property
     def gradient(self) -> Array:
-        """Of the smoothed objective."""
         return self.light.correlate(self.residual) + self.bend(self.image)
 
     def bend(self, direction: Array) -> Array:
@@ -304,7 +314,6 @@ class _State:
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Pixels that no bound holds."""
         low, high = self.prior.bounds
         free = np.ones(self.image.shape, dtype=bool)
         if math.isfinite(low):
@@ -314,7 +323,6 @@ class _State:
         return free
 
     def move(self, direction: Array, seen: Array, length: float) -> _State:
-        """The state a ``length`` along a ``direction``, which the sensor sees as ``seen``, within the bounds."""
         image = self.image + self.precise(length) * direction
         if not self.prior.bounded:
             return replace(self, image=image, residual=self.residual + self.precise(length) * seen)
@@ -340,13 +348,11 @@ class _State:
         return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
 
     def precise(self, number: float) -> Any:
-        """A ``number`` that leaves arrays in their precision."""
         return self.image.dtype.type(number)
 
     # ---- how far above the minimum
 
     def gap(self) -> float:
-        """Upper bound of P(X) - min P; the module's text says of which images."""
         variation = 0.0
         if self.prior.weight:
             length = self._slopes[2]
@@ -394,7 +400,6 @@ class _State:
         return total, left
 
     def _most_lowered(self, slope: float) -> float:
-        """Most that a gradient of that norm can lower P within R."""
         ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
         if slope <= ridge * reach:
             return slope * slope / (2 * ridge) if ridge else 0.0
@@ -402,7 +407,6 @@ class _State:
 
 
 def _slopes(image: Array) -> tuple[Array, Array]:
-    """Differences of an ``image`` (n, n') to the next row and column; 0 at the last."""
     down, across = np.zeros_like(image), np.zeros_like(image)
     np.subtract(image[1:], image[:-1], out=down[:-1])
     np.subtract(image[:, 1:], image[:, :-1], out=across[:, :-1])
@@ -459,7 +463,6 @@ def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, 
 
 
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
-    """Where steps begin: at the image of half the size, or at none."""
     low, high = prior.bounds
     smaller = light.half_size()
     if smaller:
@@ -483,7 +486,6 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
 
 
 def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
-    """The state after at most so many steps, their number, and its fall."""
     sharp, most = state.smooth, _PASS if state.prior.bounded else _PASS_UNBOUND
     state = replace(state, smooth=_FIRST_SMOOTH * sharp)
     spent, fall, objectives = 0, math.inf, [(0, state.objective)]
@@ -508,8 +510,6 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
 
 
 def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
-    """Where conjugate gradients lead in the pixels that no bound holds, what the sensor sees of it, and what it lowers
-    the quadratic by that touches the objective in ``state``."""
     free = state.free
     left = np.where(free, state.gradient, state.precise(0))
     total, seen = np.zeros_like(left), np.zeros_like(state.residual)

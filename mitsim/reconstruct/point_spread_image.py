@@ -1,14 +1,28 @@
-"""A run and a measured point spread function in, the scene's image out, and how far it is above its minimum."""
+"""Image of a run by a measured point spread function, with the weight of its prior and a check of the fit.
+
+*Weight.* Blocks of sensor pixels are left out, the image of the rest is made, and the light that it sends to these
+blocks is compared with theirs. Where the lambda that predicts them best asks for clearly more noise than the frames
+have, the model is wrong by as much, and the weight follows from that error in place of the noise.
+
+*Fit.* A frame has fewer pixels than the scene, so that any point spread function fits it with some image. A wrong one
+needs a negative or rough image. So the least of
+
+    1/2 ||A X - Y||^2 + w TV(X),    X >= 0
+
+is compared with that of the same light mirrored and turned, which has the same spectrum and thus the same power to
+explain frames."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
@@ -16,13 +30,261 @@ from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
-from mitsim.reconstruct.convolution import check_lambda
 from mitsim.reconstruct.point_spread import Array, ShiftedLight, minimise, reduce_frame
-from mitsim.reconstruct.point_spread_fit import automatic_prior, find_fit
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
-from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
 from mitsim.reconstruct.solvers import Prior
+
+RIDGE, _WEIGHT = 50.0, 1.2
+"""Automatic lambda over the mean square of a scene pixel's light, by a frame's error over its mean; and automatic
+weight of TV in units of the error that the data term's gradient carries to a pixel. Chosen on photographs seen by a
+measured diffuser with noise of 0.1 to 8 %; losses on others: benchmarks/iterative_losses.py."""
+_CLEARLY = 2.0
+"""Error by held-out pixels over measured noise above which it counts: pixels without model errors predict best with up
+to 2.2 times the noise, and with less than it where that is large."""
+_SIDE, _STEPS = 128, 60
+"""Pixels a side below which frames are not reduced, and most steps for held-out pixels; twice as many to compare."""
+_BLOCKS, _KEPT = 12, 8
+"""Blocks along the shorter side, of which one in eight is held out: larger than what a model error spreads over."""
+_HALVES = range(-16, 7)
+"""Weights that are tried, in half decades."""
+_TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
+_MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
+"""Error of a frame over its mean below which no model of a real camera is trusted; TV's weight in a comparison, in
+units of the error that the data term's gradient carries to a pixel; and the chi-square above which the first weight
+takes away too much of the picture, so that the second one compares."""
+_ALIKE = 0.9
+"""Correlation, wherever it lies, above which light counts as equal to a turned copy, which then says nothing."""
+_BETTER, _EQUAL = 0.85, 0.98
+"""Cost of the best turned copy over that of the given light, below which the copy is recommended, and below which the
+light is wrong even if noise explains the frames: right light has 0.995 and more."""
+_LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
+"""Right light has more than the first times chi-square to the power of the second (1.032 and more at a chi-square of
+1.65, 1.13 of 2). Below the last chi-square noise explains the frames, and they decide nothing."""
+_OFF = 1 / 8
+"""Distance from the middle of the picture to the mean of the light, over its side, that is flagged: a dozen lenses are
+off by 0.04 (standard deviation)."""
+_GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
+"""Part of the frames, rms, and chi-square, above which a fit is flagged without any comparison."""
+
+
+def frame_noise(frame: Array) -> float:
+    """Return the standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer,
+    Comput. Vis. Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3
+    pixels."""
+    if min(frame.shape) < 3:
+        return 0.0
+    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
+    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
+    return float(np.median(np.abs(bent))) / 6 / 0.6745
+
+
+def _noise_variance(frames: Array) -> float:
+    rows, columns = (max(size // 16, 1) for size in frames.shape[1:])
+    strips = [strip for frame in frames for strip in np.array_split(frame, rows)]
+    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
+    return float(np.mean([frame_noise(tile) ** 2 for tile in tiles]))
+
+
+def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
+    factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape) // _SIDE, 1)
+    return light.reduce(factor), np.stack([reduce_frame(frame, factor) for frame in frames]), factor
+
+
+# ---- The weight ----
+
+
+def frame_error(light: ShiftedLight, frames: Array) -> float:
+    """Return the deviation of ``frames`` (K K', m, m') from what ``light`` explains: their noise or, under uniform
+    light, the noise whose ridge predicts held-out pixels best, if that is clearly more.
+
+    MitsimError for frames without light.
+    """
+    mean = float(frames.mean())
+    if mean <= 0:
+        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
+    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
+    if light.patterns is not None:
+        return noise
+    small, seen, _ = _shrink(light, frames)
+    row, column = np.indices(small.sensor) // max(min(small.sensor) // _BLOCKS, 1)
+    counted = (row + 3 * column) % _KEPT > 0
+    part = replace(small, seen=counted.astype(small.precision))
+
+    @cache
+    def error(half: int) -> float:
+        prior = Prior(ridge=10 ** (half / 2) * small.column_power, bounds=(0.0, math.inf))
+        scene = minimise(part, seen * part.seen, prior, _STEPS, 0.02).image
+        return float(np.square((small.image_of(scene) - seen)[:, ~counted]).sum())
+
+    best = 0
+    while best in _HALVES and error(lower := min((best - 1, best + 1), key=error)) < error(best):
+        best = lower
+    before, here, after = (error(half) for half in (best - 1, best, best + 1))
+    # The vertex of the parabola through these three.
+    place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
+    level = mean * 10 ** (place / 2) / RIDGE
+    return level if level > _CLEARLY * noise else noise
+
+
+def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
+    """Return ``prior`` with an automatic ridge or weight of TV.
+
+    Parameters
+    ----------
+    light, frames
+        the camera, and what it saw (K K', m, m').
+    prior
+        its bounds are kept.
+    kind
+        what is chosen.
+
+    Raises
+    ------
+    MitsimError
+        for frames without light, and for a ridge under other patterns than uniform light.
+    """
+    if kind == "weight":
+        return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
+    if light.patterns is not None:
+        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+    return replace(prior, ridge=RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power)
+
+
+# ---- The misfit ----
+
+
+@dataclass(frozen=True)
+class PointSpreadFit:
+    """How well frames fit a point spread function.
+
+    Attributes
+    ----------
+    chi_square, unexplained
+        energy of what that fit leaves over that of noise, and the part of the frames, rms, beyond noise.
+    stated
+        whether the sensor states its noise; otherwise it is measured from the frames.
+    gain
+        cost of the best turned or mirrored copy over the cost of the light as given: above 1 where that fits better;
+        None where all copies are alike.
+    reading
+        how that copy lies.
+    off
+        rows and columns from the middle of its picture to the light's centre.
+    size
+        rows and columns of the picture.
+    """
+
+    chi_square: float
+    unexplained: float
+    stated: bool
+    gain: float | None
+    reading: str
+    off: tuple[float, float]
+    size: tuple[int, int]
+
+    @property
+    def fault(self) -> tuple[str, str]:
+        """Sentence and remedy; empty where nothing is wrong."""
+        left = (
+            f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
+        )
+        same = "use the light of one point as this camera sees it, as it lies in the frames"
+        if self.gain is not None and self.gain < _BETTER:
+            return f"Misfit: the point spread function fits better {self.reading}; {left}", f"turn it so, or {same}"
+        least = _EQUAL if self.chi_square < _NOISY else _LEAST_GAIN * self.chi_square**_RISE
+        if self.gain is not None and self.gain < least:
+            return f"Misfit: the point spread function fits no better as given than {self.reading}; {left}", same
+        if self.unexplained > _GROSS and self.chi_square > _GROSS_CHI_SQUARE:
+            return f"Misfit: {left}", same
+        rows, columns = self.off
+        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > _OFF:
+            return (
+                f"Misfit: the point's light is centred {rows:+.0f} rows and {columns:+.0f} columns from the middle of "
+                "its picture, and the image is displaced as much",
+                "take the picture of a point in the middle of the field, or shift it there",
+            )
+        return "", ""
+
+    @property
+    def gist(self) -> str:
+        """The misfit in a few words."""
+        return f"{self.unexplained:.1%} unexplained"
+
+    def __str__(self) -> str:
+        noise = "its stated noise" if self.stated else "noise, measured from the frames"
+        cost = "" if self.gain is None else f"; turned or mirrored, the light costs {self.gain:.3g} times as much"
+        return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return what result.json and the command line's JSON say of the misfit."""
+        sentence, _ = self.fault
+        return {
+            "chi_square": self.chi_square,
+            "unexplained": self.unexplained,
+            "noise_stated": self.stated,
+            "flagged": bool(sentence),
+            "turned_cost": self.gain,
+            "reading": self.reading if self.gain is not None and self.gain < _BETTER else None,
+            "off_centre": list(self.off),
+        }
+
+    def judge(self, status: Status) -> Status:
+        """Return the ``status`` of a solution with this misfit."""
+        sentence, remedy = self.fault
+        if not sentence:
+            return status
+        if not status.verdict.good:
+            return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
+
+
+def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
+    """Return how well ``frames`` fit ``light``, whatever the weight of their image.
+
+    Parameters
+    ----------
+    light, frames
+        the camera, and what it saw (K K', m, m').
+    variance
+        mean noise variance of the frames; None: it is not stated, and measured.
+    """
+    small, seen, factor = _shrink(light, frames)
+    noise = max(_noise_variance(seen) if variance is None else variance / factor**2, 1e-300)
+    error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
+
+    def cost(psf: FloatArray, rough: float) -> tuple[float, float]:
+        camera = replace(small, psf=np.ascontiguousarray(psf))
+        prior = Prior(weight=rough * error * math.sqrt(camera.column_power), bounds=(0.0, math.inf))
+        found = minimise(camera, seen, prior, 2 * _STEPS, 0.002)
+        return found.objective, float(np.mean(np.square(camera.image_of(found.image) - seen))) / noise
+
+    rough, fine = _ROUGH
+    (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
+    rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
+    copies = {name: small.psf[::rows, ::columns] for name, (rows, columns) in _TURNED.items()}
+    others = {name: cost(copy, rough)[0] for name, copy in copies.items() if _likeness(small.psf, copy) < _ALIKE}
+    reading = min(others, key=lambda name: others[name], default="")
+    energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
+    off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
+    rows, columns = light.psf.shape
+    return PointSpreadFit(
+        chi_square=chi_square,
+        unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
+        stated=variance is not None,
+        gain=others[reading] / max(objective, 1e-300) if others else None,
+        reading=reading,
+        off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
+        size=(rows, columns),
+    )
+
+
+def _likeness(first: FloatArray, second: FloatArray) -> float:
+    grid = [2 * size for size in first.shape]
+    shifted = fft.irfft2(fft.rfft2(first, grid) * fft.rfft2(second, grid).conj(), grid)
+    return float(shifted.max() / math.sqrt(float(np.square(first).sum() * np.square(second).sum())))
+
 
 _NUMBERS = 24
 """Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
@@ -51,7 +313,7 @@ def solve_point_spread(
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`mitsim.reconstruct.point_spread_fit.automatic_prior`.
+        lambda, or the weight of ``tv``; ``auto``: :func:`mitsim.reconstruct.point_spread_image.automatic_prior`.
     bounds
         least and largest number; None: any of ``tikhonov``, 0 and inf of the others, as light is.
     iterations, tolerance
@@ -63,11 +325,7 @@ def solve_point_spread(
     MitsimError
         for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
     """
-    if frames.shape != (light.count, *light.sensor) or not np.isfinite(frames).all():
-        raise MitsimError(
-            f"frames of shape {frames.shape}: give {light.count} of {light.sensor[0]} x {light.sensor[1]} finite "
-            "numbers"
-        )
+    light.check_frames(frames)
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
@@ -211,7 +469,6 @@ def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageReque
 
 
 def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
-    """(k, k') of sum 1, or as it was given where that was an array."""
     if isinstance(psf, (str, Path)):
         return load_psf(psf, reduce)
     light = np.asarray(psf)
@@ -224,9 +481,6 @@ def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
 
 
 class _Frames:
-    """Frames of a capture, of which ``reduce`` x ``reduce`` pixels become one; and, once they are read, the mean
-    ``variance`` of their noise, where the sensor's is stated."""
-
     def __init__(self, shots: Capture, reduce: int) -> None:
         self._shots, self._reduce = shots, reduce
         self.saturated = 0
@@ -240,7 +494,6 @@ class _Frames:
         self._shape, self._columns, self._count = (first[0], first[1]), right.shape[1], left.shape[1] * right.shape[1]
 
     def read(self) -> FloatArray:
-        """(K K', m, m') of all patterns, row-major [electrons/s]."""
         frames = np.empty((self._count, *self.sensor), np.float32)
         for each in self._shots.pattern_measurements(self._shape):
             frames[each.row * self._columns + each.column] = reduce_frame(each.frame, self._reduce)

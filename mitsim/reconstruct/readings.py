@@ -83,7 +83,7 @@ def multiple(factor: int, chi_square: float) -> Reading | None:
 
 def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
     """Return the scene rows and the scene columns that are lit alike, group by group, of ``patterns`` P_L and P_R."""
-    return [[group.pixels for group in group_pixels(side, "block")] for side in patterns]
+    return [[group.pixels for group in group_pixels(side)] for side in patterns]
 
 
 def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:

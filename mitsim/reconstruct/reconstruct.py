@@ -20,12 +20,10 @@ from mitsim.core.images import card, from_above, normalise, png, span
 from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
-from mitsim.reconstruct.background import Margin
-from mitsim.reconstruct.depth import Depth, best_depth
-from mitsim.reconstruct.depth_map import DepthMap, depth_map
+from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
+from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import move_factors
+from mitsim.reconstruct.focus import Margin, move_factors
 from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
@@ -38,16 +36,15 @@ from mitsim.reconstruct.request import (
     holds_image,
     predict_cost,
 )
-from mitsim.reconstruct.solution import Solution, Verdict
+from mitsim.reconstruct.solver import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
-from mitsim.reconstruct.subpixel import print_energy
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
-    from mitsim.reconstruct.point_spread_fit import PointSpreadFit
+    from mitsim.reconstruct.point_spread_image import PointSpreadFit
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
@@ -254,7 +251,6 @@ class Reconstruction(Solution):
 
 
 def _check_stored(more: object) -> None:
-    """ArgumentError for entries of result.json that JSON cannot hold."""
     try:
         plain(more)
     except TypeError as error:
@@ -360,7 +356,7 @@ def reconstruct(
         ``tikhonov``.
     margin
         cells round the projector's window that are solved for too, lit in every pattern, and left out of the image:
-        they take up light from outside the window (:mod:`mitsim.reconstruct.background`). By ``tikhonov``, no focus.
+        they take up light from outside the window (:mod:`mitsim.reconstruct.focus`). By ``tikhonov``, no focus.
     **options
         ``depth_range``: nearest and farthest depth [mm] that ``auto`` and ``map`` look for, a quarter of 1/z either way
         of the calibrated depth unless given; ``bounds``, least and largest number of the image, and ``iterations``, at
@@ -461,8 +457,6 @@ def check_image(
 def _focus(
     shots: Capture, factors: Factors, request: ImageRequest, clock: Clock
 ) -> tuple[Depth | DepthMap | None, Capture, Factors, list[str]]:
-    """The depth that is asked for, or found; the part of ``shots`` and the ``factors`` that are known there, and
-    doubts."""
     if request.focus is None:
         return None, shots, factors, []
     depth: Depth | DepthMap
@@ -484,14 +478,12 @@ def _focus(
 
 
 def _by_pixel(depth: Depth | DepthMap | None) -> DepthMap | None:
-    """A depth for each pixel, where these were looked for and are told."""
     return depth if isinstance(depth, DepthMap) and not depth.doubt else None
 
 
 def _fit(
     data: Accumulation, depth: Depth | DepthMap | None, lam: float | Literal["auto"], clock: Clock
 ) -> tuple[Accumulation, Solution, Misfit | None]:
-    """The image at ``lam`` and its misfit, and the sums that they are of: without defective pixels."""
     by_pixel = _by_pixel(depth)
     with clock.stage("solve"):
         solution = by_pixel.solution if by_pixel else data.solution(lam)
@@ -540,7 +532,6 @@ def _without_defects(
 
 
 def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
-    """Sentences on why the capture or the calibration was flagged: an image made of them is flagged too."""
     return tuple(
         f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
         for what, warnings in (("capture", shots.warnings), ("calibration", factors.warnings))

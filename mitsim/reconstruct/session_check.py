@@ -28,7 +28,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, UNIFORM, Half, Side
-from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
+from mitsim.reconstruct.factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.picture_check import robust_scatter
 
@@ -189,7 +189,7 @@ class CheckedSession:
         signs
             (n, N) H.
         noise
-            as ``stated_noise`` of :func:`mitsim.reconstruct.estimate_factors.factors_of_sums`.
+            as ``stated_noise`` of :func:`mitsim.reconstruct.factors.factors_of_sums`.
         """
         return factors_of_sums(*self.sums, signs, noise, self.extra)
 

@@ -25,7 +25,7 @@ light; formulas are the same.
 
 Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
 light g / 12 pixels off the centre; what that does to the image stands for print that may have hard edges or none, which
-is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.subpixel`).
+is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.accumulation`).
 
 Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
 image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
@@ -61,11 +61,9 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.accumulation import PRINT, Accumulation, Model, disagreement
 from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.subpixel import PRINT, Model, disagreement
+from mitsim.reconstruct.solver import DiagonalProblem, Solution, coefficient_noise
 
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
 
@@ -173,7 +171,6 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     usual = np.square(_CONTRAST) * frequencies.sum() / detail_energy * fall
 
     def mean(power: FloatArray) -> tuple[float, float]:
-        """The mean and its variance, by least squares weighted for the spectrum S = ``power`` (J,)."""
         weights = sigma * even / (np.square(sigma) * np.tensordot(power, shares, axes=1) + level)
         variance = 1 / (_BRIGHT**-2 + float(np.sum(weights * sigma * even)))
         return variance * float(np.sum(weights * problem.projected)), variance
@@ -189,12 +186,10 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
 
 
 def _cosines(side: Side) -> FloatArray:
-    """(n, n) orthonormal cosines of a ``side``'s scene pixels, by column."""
     return np.asarray(dct(np.eye(side.scene_size), axis=0, norm="ortho").T)
 
 
 def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.intp]]:
-    """First of ``size`` frequencies, mean and number of frequencies, of bands in which S hardly differs."""
     every = np.arange(size)
     band = np.floor(_BANDS * np.log2(np.maximum(every, _SINGLE) / _SINGLE)) + np.minimum(every, _SINGLE)
     starts = np.flatnonzero(np.diff(band, prepend=-1))
@@ -468,13 +463,6 @@ class Propagation:
         return variance * self._image_variance(left.response, right.response)
 
     def _image_variance(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """(n, n') variance of the image of W = left^T E right, E (s, s') independent numbers of variance 1.
-
-        Parameters
-        ----------
-        left, right
-            (s, r) and (s', r').
-        """
         products = []
         for side, own, seen in zip(self.model.sides, self.terms, (left, right), strict=True):
             taken = np.stack([(side.basis * term) @ seen.T for term in own.T], axis=1)
@@ -500,7 +488,6 @@ class Propagation:
         detail = problem.projected - spectrum.mean * self._sigma * spectrum.even
 
         def seen_part(energy: FloatArray) -> FloatArray:
-            """(r, r') share of each coefficient that its own datum tells where its mean square is ``energy``."""
             return np.divide(power * energy, power * energy + noise, out=np.zeros_like(power), where=power > 0)
 
         spread = spectrum.spread(np.square(lost) * (1 - seen_part(spectrum.energy)))
@@ -541,11 +528,9 @@ class Propagation:
         )
 
     def _spread(self, variances: FloatArray) -> FloatArray:
-        """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
         return self._pixel_variance(np.square(self.gain) * variances)
 
     def _pixel_variance(self, variances: FloatArray) -> FloatArray:
-        """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self.model.sides)
         return np.asarray(left @ variances @ right.T)
 
@@ -598,7 +583,6 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
 def _of_factor(
     own: Side, other: Side, patterns: FloatArray, terms: tuple[FloatArray, FloatArray], image: FloatArray
 ) -> FloatArray:
-    """(n, n') variance of an ``image`` by independent numbers of variance 1 in the factor of its ``own`` side."""
     seen = image @ other.response
     # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
@@ -626,7 +610,6 @@ def _responses(side: Side, kinds: FloatArray) -> FloatArray:
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:
-    """Root of the sum of squares."""
     return np.sqrt(sum(np.square(part) for part in parts))
 
 

@@ -7,7 +7,7 @@ interpolated. *Joint*: all planes for all lines (:mod:`mitsim.reconstruct.colour
 lines has the one factor that is nearest to them; only the joint solve knows that each line has its own.
 
 Lambda is found without a truth: each plane, or channel, chooses its own as any other frames do
-(:mod:`mitsim.reconstruct.regularisation`), and the joint solve takes the geometric mean of the planes'. They have the
+(:mod:`mitsim.reconstruct.solver`), and the joint solve takes the geometric mean of the planes'. They have the
 same scene, and nearly the same noise, which lambda weighs against each other.
 """
 
@@ -36,10 +36,8 @@ from mitsim.reconstruct.colour import PLANES, JointMosaic
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import check_same_inputs
-from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, check_joint
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import Solution, automatic_lambda, prepare
 from mitsim.report.colour_image import ColourImage, JudgedColours, begin_image, board_of
 
 # ---- From a run to its images ----

@@ -31,8 +31,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import DRIFT_WORDS, SIDES, BoardShape, Drift, SessionRecipe, load_recipe
 from mitsim.light.light import SampledLight
-from mitsim.reconstruct.estimate_factors import Estimate, decibels
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report import plots
 from mitsim.report.lit_scene import LitScene
 from mitsim.report.pages import Mean, Table, with_error

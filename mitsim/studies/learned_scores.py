@@ -18,8 +18,7 @@ from mitsim.metrics import psnr, ssim
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solver import Accumulator, Prepared, Solution
 from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.pages import Value
@@ -132,7 +131,7 @@ def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, 
     other = prepared.with_correlation()
     turns = []
     for before, after in ((prepared.left, other.left), (prepared.right, other.right)):
-        turn = np.zeros((before.accumulated_size, after.accumulated_size))
+        turn = np.zeros((len(before.singular), len(after.singular)))
         for index, (one, two) in enumerate(zip(before.slabs, after.slabs, strict=True)):
             turn[before.columns(index)] += one.matrix.T @ two.matrix
         turns.append(turn)

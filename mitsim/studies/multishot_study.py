@@ -41,8 +41,7 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
+from mitsim.reconstruct.solver import Solution, centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Table
@@ -226,7 +225,7 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
     its row and the right one of its column.
 
     The sessions are rendered without the sensor's noise, and what it does to factors is added in closed form
-    (:func:`mitsim.reconstruct.estimate_factors.predicted_error`): seven times 512 noisy frames take four times as long.
+    (:func:`mitsim.reconstruct.factors.predicted_error`): seven times 512 noisy frames take four times as long.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.estimate_factors import (
+from mitsim.reconstruct.factors import (
     AmbientLight,
     StripeSums,
     _rank_one_split,
@@ -18,8 +18,7 @@ from mitsim.reconstruct.estimate_factors import (
     squared_condition,
     stripe_sums,
 )
-from mitsim.reconstruct.solution import Verdict
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import Verdict, prepare
 
 N, M = 16, 40
 H = hadamard(N).astype(float)

@@ -18,9 +18,14 @@ from mitsim.reconstruct.point_spread import (
     minimise,
     reduce_frame,
 )
-from mitsim.reconstruct.point_spread_fit import automatic_prior, find_fit, frame_error, frame_noise
-from mitsim.reconstruct.point_spread_image import solve_point_spread
-from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.point_spread_image import (
+    automatic_prior,
+    find_fit,
+    frame_error,
+    frame_noise,
+    solve_point_spread,
+)
+from mitsim.reconstruct.solver import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
 
