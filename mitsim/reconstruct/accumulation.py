@@ -38,45 +38,31 @@ from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Solution, h
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9
-"""Energy of hard edges at any place within a pixel over that of the ramp that their image shows: the dipole of an edge
-at t is t (1 - t) / 2 with a mean square of 1/120; the slopes that the image shows around it bring 1/346."""
+"""Energy of hard edges within a pixel over that of the ramp that the image shows: the dipole of an edge at t is t (1 -
+t) / 2 with a mean square of 1/120, and the slopes around it bring 1/346."""
 PRINT = (1 + EDGES) / 2
-"""The same of print that may have hard edges or none: their mean."""
+"""Mean of :data:`EDGES` and 1, for print that may have hard edges or none."""
 _ALIKE = 0.5
-"""Correlation with the moved neighbour from which responses count as one moving shadow: 0.9 behind a mask of features
-wider than a sensor pixel, 0.3 by chance of 64 pixels."""
+"""Correlation with the moved neighbour above which responses are one moving shadow."""
 _LEAST_EIGENVALUE = 0.01
-"""Least energy that halves disagree on over that of the image's error, as noise is magnified by its inverse: a ninth to
-a half under patterns, nothing under uniform light where neighbours in the scene tell the slope."""
+"""Least energy of the halves' disagreement over that of the image's error."""
 _SIGNIFICANT = 3.0
 """Standard deviations of the known errors' energy above which halves disagree by more than chance."""
 _NEAR = 2.0
-"""Scene pixels around a place whose disagreement tells of its error, so that some 50 squares make a mean: 1, 2, 3 and 5
-cover alike (within 1 %, 48 arrangements of prints, mask and patterns)."""
+"""Standard deviation [scene pixels] of the neighbourhood that an error is averaged over."""
 _BLOCKS = 4
-"""Blocks a side of the scene in which a depth of their own is looked for: tilted and stepped surfaces leave a sixteenth
-of their dipoles' energy unexplained by blocks, and each has pixels enough to tell a depth from print."""
+"""Blocks a side of the scene, each of which may have a depth of its own."""
 _EDGE = 0.5
-"""Scene pixels from the centre of one to its edge."""
+"""Scene pixels from the centre of a pixel to its edge."""
 _PLACES = (0.1, 0.3), (0.4, 0.8), (0.7, 0.1), (0.9, 0.6)
-"""Groups of lit rows and columns that are looked at, as parts of their number: four that are spread over both."""
+"""Examined groups of lit rows and columns, as parts of their number."""
 _RANK = 1e-6
-"""Relative eigenvalue below which a block's depth is not told: chosen, blocks without light have none."""
+"""Relative eigenvalue below which the depth of a block is undetermined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A factorised model, and what it sees of light beside the centres of its pixels.
-
-    Parameters
-    ----------
-    prepared
-        the factorised model.
-    factors
-        Phi_L (m, n) and Phi_R (m', n'), centred where the model is.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    """
+    """Factorised model with factors (centred where it is) and patterns, and its response to light beside centres."""
 
     prepared: Prepared
     factors: tuple[FloatArray, FloatArray]
@@ -84,12 +70,12 @@ class Model:
 
     @property
     def sides(self) -> tuple[Side, Side]:
-        """The factorised sides."""
+        """Factorised sides."""
         return self.prepared.left, self.prepared.right
 
     @cached_property
     def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """Phi_L' and Phi_R', see :func:`factor_slope`."""
+        """Slopes Phi_L' and Phi_R', see :func:`factor_slope`."""
         return factor_slope(self.factors[0]), factor_slope(self.factors[1])
 
     @cached_property
@@ -100,11 +86,11 @@ class Model:
 
 
 def print_energy(model: Model, image: FloatArray) -> float:
-    """Energy outside a ``model``'s range of print that changes within a projector pixel, when its ``image`` is (n, n').
+    """Return the energy outside a ``model``'s range of print within projector pixels, for an ``image`` (n, n').
 
-    Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T, Phi_R' being the slope of Phi_R along
-    its columns. With C = S_L V_L^T g / 12 that is sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which
-    |C T|^2 is in the range, T being :func:`offset_responses`; and the same of the other side.
+    Light of slope g a pixel moves the frames by Phi_L (P_ij o g / 12) Phi_R'^T. With C = S_L V_L^T g / 12 that is
+    sum_pq (C^T C o P_R P_R^T o Phi_R'^T Phi_R')[p, q] in all, of which |C T|^2 is in the range, T being
+    :func:`offset_responses`; likewise for the other side.
     """
     total = 0.0
     own = tuple(zip(model.sides, model.slopes, model.patterns, model.moved, strict=True))
@@ -118,16 +104,16 @@ def print_energy(model: Model, image: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class LitFrame:
-    """Light of few pixels alone.
+    """Frame of few lit pixels.
 
     Attributes
     ----------
     frame, variance
-        (m, m') of it, and the noise variance of each number.
+        Frame (m, m'), and the noise variance of each number.
     factors, slopes
-        columns of both sides' factors at the lit pixels, (m, c) and (m', c'), and their slopes.
+        Columns of both factors at the lit pixels, (m, c) and (m', c'), and their slopes.
     blocks
-        (c,) and (c',) block of the scene, along its side, that each lit pixel is in.
+        Block of the scene of each lit pixel, (c,) and (c',).
     """
 
     frame: FloatArray
@@ -138,26 +124,26 @@ class LitFrame:
 
     @cached_property
     def ranges(self) -> tuple[FloatArray, FloatArray]:
-        """Orthonormal columns that span the factors' of both sides."""
+        """Orthonormal columns that span the columns of both factors."""
         return orthonormal(self.factors[0]), orthonormal(self.factors[1])
 
     @cached_property
     def wider(self) -> tuple[FloatArray, FloatArray]:
-        """The same of factors and slopes."""
+        """Orthonormal columns that span the columns of both factors and their slopes."""
         left, right = (
             orthonormal(np.hstack([columns, slope])) for columns, slope in zip(self.factors, self.slopes, strict=True)
         )
         return left, right
 
     def beyond(self, left: FloatArray, right: FloatArray) -> float:
-        """Energy beyond the noise that two orthonormal ranges leave, ``left`` (m, r) and ``right`` (m', r')."""
+        """Return the energy beyond the noise outside the orthonormal ranges ``left`` (m, r) and ``right`` (m', r')."""
         seen = left.T @ self.frame @ right
         beyond = np.square(self.frame).sum() - np.square(seen).sum() - (self.frame.size - seen.size) * self.variance
         return float(beyond)
 
     @cached_property
     def moments(self) -> FloatArray:
-        """(3,) sums of squares of the lit pixels' light, and of its dipoles along rows and along columns."""
+        """Sums of squares of the lit pixels' light, and of its dipoles along rows and along columns."""
         inverse = [np.linalg.pinv(np.hstack(both)) for both in zip(self.factors, self.slopes, strict=True)]
         found = inverse[0] @ self.frame @ inverse[1].T
         rows, columns = (side.shape[1] for side in self.factors)
@@ -165,8 +151,7 @@ class LitFrame:
         return np.array([np.square(part).sum() for part in parts])
 
     def of_depths(self) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix and right side of the dipoles, along rows and columns of each block, that are the same multiple
-        of all its pixels' light, fitted to what the factors alone leave."""
+        """Return normal matrix and right side of dipoles that are one multiple of the light in a block."""
         (left, right), (wide, wide_) = self.ranges, self.wider
         image = np.linalg.pinv(self.factors[0]) @ self.frame @ np.linalg.pinv(self.factors[1]).T
         own, own_ = wide.T @ left, wide_.T @ right
@@ -184,15 +169,7 @@ class LitFrame:
 
 
 class LitFrames:
-    """Adds measurements up to light of a few groups of scene pixels alone.
-
-    Parameters
-    ----------
-    factors
-        both factors of the model.
-    patterns
-        P_L (n, K) and P_R (n', K').
-    """
+    """Sums of measurements that show a few groups of scene pixels alone."""
 
     def __init__(self, factors: tuple[FloatArray, FloatArray], patterns: tuple[FloatArray, FloatArray]) -> None:
         self._factors = factors
@@ -205,17 +182,7 @@ class LitFrames:
         self._variances = [0.0] * len(self._groups)
 
     def collect(self, measurement: Measurement, frame: FloatArray, variance: float) -> None:
-        """Add a measurement.
-
-        Parameters
-        ----------
-        measurement
-            its pattern.
-        frame
-            (m, m') as the solver takes it.
-        variance
-            mean noise variance of its data.
-        """
+        """Add a ``measurement`` as the centred ``frame`` (m, m') with its mean noise ``variance``."""
         for k, ((_, rows), (_, columns)) in enumerate(self._groups):
             weight = rows[measurement.row] * columns[measurement.column]
             if weight:
@@ -244,13 +211,12 @@ def _lit_groups(patterns: FloatArray) -> list[tuple[IndexArray, FloatArray]]:
 
 
 def print_part(frames: Sequence[LitFrame]) -> float:
-    """Part of what lit pixels leave of ``frames`` that is light beside these pixels' centres, but not because of depth.
+    """Return the part of the misfit of ``frames`` that is light beside pixels' centres, but not because of depth.
 
-    Print has its light on either side of the centres; a surface beside the calibrated distance has all of it on one, by
-    the same part of a pixel nearby. So what depths explain, the same for all frames, is no print: of the whole scene or
-    block by block, told from all frames but that which they explain, as dipoles of print may add up to any depth in
-    one. No light is further from its pixel's centre than the edge: more has been moved by something else. Wider ranges
-    explain a part of anything, too, in proportion to their size.
+    Print has its light on either side of the centres. A surface beside the calibrated distance has all of it on one
+    side, by the same part of a pixel nearby. So the energy that depths explain, for the scene or block by block, is no
+    print. The depths are estimated from the other frames, because dipoles of print may add up to any depth in one.
+    Light beyond a pixel's edge has another cause.
     """
     light, *dipoles = np.sum([each.moments for each in frames], axis=0)
     if max(dipoles) > _EDGE**2 * light:
@@ -285,25 +251,18 @@ def _predicted_energy(problems: Sequence[tuple[FloatArray, FloatArray]]) -> floa
 
 
 def orthonormal(matrix: FloatArray) -> FloatArray:
-    """Orthonormal columns that span those of ``matrix``, but for directions that are rounding."""
+    """Return orthonormal columns that span those of ``matrix``, without directions that are rounding."""
     left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
     return np.asarray(left[:, singular > singular[0] * max(matrix.shape) * np.finfo(np.float64).eps])
 
 
 def block_indices(pixels: IndexArray, size: int) -> IndexArray:
-    """Which of the blocks along a side of ``size`` scene pixels each of the ``pixels`` is in."""
+    """Return the block along a side of ``size`` scene pixels of each of the ``pixels``."""
     return pixels * _BLOCKS // size
 
 
 def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> FloatArray:
-    """(2, n, r) sum_j diag(p_j) Phi'^T U_j over each half of the sensor: what coefficients see of light one pixel
-    beside the centre of its own.
-
-    Parameters
-    ----------
-    side, slope, patterns
-        one side of the model, the slope Phi' (m, n) of its factor, and its patterns (n, K).
-    """
+    """Return sum_j diag(p_j) Phi'^T U_j (2, n, r) over each half of the sensor, for light beside centres."""
     total = np.zeros((2, slope.shape[1], len(side.singular)))
     for half, strips in zip(total, side.halves, strict=True):
         own = np.concatenate([slope[strip] for strip in strips]).T if strips else np.zeros((slope.shape[1], 0))
@@ -314,18 +273,11 @@ def offset_responses(side: Side, slope: FloatArray, patterns: FloatArray) -> Flo
 
 
 def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
-    """(m, n) Phi', change of a ``factor`` (m, n) by scene pixel.
+    """Return the change Phi' (m, n) of a ``factor`` (m, n) by scene pixel.
 
-    Where a shadow moves by more than a sensor pixel from one scene pixel to the next, its slope is that along the
-    sensor, since neighbours in the scene may be a whole feature of the mask apart; otherwise that of neighbours.
-
-    Parameters
-    ----------
-    factor
-        of one side.
-    spline
-        whether by a cubic spline through neighbours instead of their differences: half as much is missed at the edges
-        of features, 6 instead of 11 % of the energy of points in pixels of 1.9 mm, and noise counts twice.
+    Where a shadow moves by more than a sensor pixel from one scene pixel to the next, the slope is computed along the
+    sensor, because neighbours in the scene may be a whole feature of the mask apart. A ``spline`` misses half as much
+    at the edges of features, and doubles the noise.
     """
     rows, columns = factor.shape
     if columns == 1:
@@ -338,16 +290,10 @@ def factor_slope(factor: FloatArray, spline: bool = False) -> FloatArray:
 
 
 def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """(n, n') variance of an image by what halves of the sensor disagree on; 0 where that is no more than chance.
+    """Return the variance (n, n') of an image by the disagreement of the sensor's halves; 0 where it may be chance.
 
-    Parameters
-    ----------
-    model, gain
-        and its G (r, r').
-    halves
-        of its data.
-    known
-        (n, n') variances of the image by known errors that change from sensor row to row, and from column to column.
+    ``gain`` is G (r, r'), and ``known`` are the variances (n, n') by known errors that change from sensor row to row,
+    and from column to column.
     """
     total = np.zeros_like(known[0])
     sides = model.sides, model.sides[::-1]
@@ -369,7 +315,7 @@ def disagreement(model: Model, gain: FloatArray, halves: Halves, known: tuple[Fl
 
 
 def _shift(factor: FloatArray) -> float:
-    """Sensor pixels by which a shadow moves from one scene pixel to the next; 0 where it is no moving shadow."""
+    """Return the sensor pixels that a shadow moves by from one scene pixel to the next; 0 if it is no moving shadow."""
     rows = len(factor)
     shadows = np.ascontiguousarray((factor - factor.mean(axis=0)).T)  # transforms are faster along lines of memory
     spectra = np.fft.rfft(shadows, 2 * rows)
@@ -389,30 +335,24 @@ def _shift(factor: FloatArray) -> float:
 class FrameNoise:
     """Noise of all measurements of a run, as its manifest states the sensor.
 
-    Parameters
-    ----------
-    manifest
-        of the run.
-    ambient
-        (m,) and (m',) mean noise variance by sensor row, and by sensor column, of the ambient frame that was taken off
-        every shot [(electrons/s)^2]: one draw, common to all; None without one.
-
     Attributes
     ----------
-    variance
-        (K, K') mean noise variance of a datum of each pattern by its own shots [(electrons/s)^2].
-    rows, columns
-        (K, K', m) and (K, K', m') the same of each sensor row, and of each sensor column.
+    ambient
+        Mean noise variance of the ambient frame by sensor row (m,) and column (m',) [(electrons/s)^2], or None.
+    variance : (K, K') array, (electrons/s)^2
+        Mean noise variance of a datum of each pattern, without the ambient frame.
+    rows, columns : (K, K', m) and (K, K', m') arrays, (electrons/s)^2
+        Likewise of each sensor row and column.
     light_error
-        standard error of single projector pixels' light in simulated frames, 1 is the board's; 0: not stated.
+        Standard error of single projector pixels' light in simulated frames, relative to the board's; 0: not stated.
     power, light
-        sum of the squares of all shots [(electrons/s)^2], and (m, m') of all shots [electrons/s].
-    means
-        (K, K') mean light of each pattern's shots [electrons/s].
+        Sum of the squares of all shots [(electrons/s)^2], and sum (m, m') of all shots [electrons/s].
+    means : (K, K') array, electrons/s
+        Mean light of each pattern's shots.
     shots, saturated, readings
-        shots of a pattern; readings at the full well or the ADC's end, and all of them.
+        Shots of a pattern, saturated readings, and all readings.
     factor
-        largest whole number that divides all digital numbers; 1 where they are not whole.
+        Largest whole number that divides all digital numbers; 1 where they are not whole.
     """
 
     def __init__(self, manifest: RunManifest, ambient: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -432,33 +372,27 @@ class FrameNoise:
 
     @property
     def stated(self) -> bool:
-        """Whether all of the sensor's noise is known; otherwise :attr:`variance` is that of its light alone."""
+        """Whether all of the sensor's noise is known, and not only that of its light."""
         return self._digital.noise_is_stated
 
     @property
     def rendering(self) -> float:
-        """Energy of what simulated frames are off by, as they state it: Monte Carlo error and discretisation."""
+        """Energy of the Monte Carlo error and discretisation of simulated frames, as they state it."""
         return float((self._sampling**2 + self._systematic**2) * self.power)
 
     @property
     def discretisation(self) -> float:
-        """The part of :attr:`rendering` that :attr:`light_error` does not tell; all of it where that is not stated."""
+        """Part of :attr:`rendering` without :attr:`light_error`."""
         return float(self._systematic**2 * self.power) if self.light_error else self.rendering
 
     def of(self, light: FloatArray | float, shots: int) -> FloatArray:
-        """Noise variance [(electrons/s)^2] of a measurement, with that of the frame that was taken off it.
-
-        Parameters
-        ----------
-        light, shots
-            sum of its shots [electrons/s], any shape, and their number.
-        """
+        """Return the noise variance of a measurement of ``light`` [electrons/s], with that of the ambient frame."""
         # The difference of a pair has no ambient frame.
         ambient = float(self.ambient[0].mean()) if self.ambient and shots == 1 else 0.0
         return self._own(light, shots) + ambient
 
     def add(self, measurement: Measurement) -> None:
-        """Count in one ``measurement``."""
+        """Add a ``measurement``."""
         pattern, light, shots = (measurement.row, measurement.column), measurement.light, measurement.shots
         if not self.rows.size:
             self.rows, self.columns = (np.zeros((*self.variance.shape, size)) for size in light.shape)
@@ -491,20 +425,10 @@ def _number(plan: dict[str, Any] | None, name: str) -> float:
 def factor_energy(
     prepared: Prepared, patterns: tuple[FloatArray, FloatArray], noise: FactorNoise, image: FloatArray
 ) -> float:
-    """Energy that noisy factors add to all frames of an image, less what the fit takes up.
+    """Return the energy that ``noise`` of the factors adds to all frames of an ``image``, less what the fit takes up.
 
-    Frames move by d_L (P_ij o X) Phi_R^T with d_L the error of Phi_L, independent numbers of variance s^2: in the mean
-    by m s^2 sum_ij ||(P_ij o X) Phi_R^T||^2 = m s^2 sum_p |P_L[p]|^2 ||X[p] V_R S_R||^2; and by the same of the other
-    side.
-
-    Parameters
-    ----------
-    prepared, patterns
-        the factorised model, and P_L (n, K) and P_R (n', K').
-    noise
-        of its factors.
-    image
-        (n, n').
+    With d_L the error of Phi_L, independent numbers of variance s^2, frames move by d_L (P_ij o X) Phi_R^T: in the mean
+    by m s^2 sum_p |P_L[p]|^2 ||X[p] V_R S_R||^2, and likewise for the other side.
     """
     left, right = prepared.left, prepared.right
     total = 0.0
@@ -518,7 +442,7 @@ def factor_energy(
 
 @dataclass(frozen=True, eq=False)
 class Lack:
-    """What ``terms`` beside a ``model``'s factors, centred as these are, do to its ``image`` (n, n'); one or more."""
+    """Effect of separable ``terms`` that a ``model``'s factors lack, for an ``image`` (n, n')."""
 
     model: Model
     terms: tuple[SeparableTerm, ...]
@@ -526,7 +450,7 @@ class Lack:
 
     @property
     def energy(self) -> float:
-        """Energy that they put into all frames outside of the model's range."""
+        """Energy of the terms in all frames outside of the model's range."""
         left, right = (lit @ lit.T for lit in self.model.patterns)
         total = 0.0
         for a, b in self.terms:
@@ -536,7 +460,7 @@ class Lack:
 
     @cached_property
     def struck(self) -> FloatArray:
-        """(r, r') what they add to the coefficients W of all frames."""
+        """Contribution (r, r') of the terms to the coefficients W."""
         sides, patterns = self.model.sides, self.model.patterns
         return np.asarray(
             sum(
@@ -558,22 +482,18 @@ def _term_response(side: Side, term: FloatArray, patterns: FloatArray) -> FloatA
 
 @dataclass(frozen=True, eq=False)
 class Accumulation:
-    """A run's frames added up.
+    """Sums of a run's frames.
 
     Attributes
     ----------
-    shots, factors, solver
-        of which, and for what image.
-    model
-        that the frames are of, factorised.
     frames, noise
-        sums of all frames, and of their noise.
+        Sums of all frames, and of their noise.
     kept
-        the frames themselves while they are few; all or none.
+        The frames themselves while they are few, else none.
     coefficients
-        by pattern, what its frame adds to W (c, c'), while the frames are kept.
+        Contribution (c, c') of each kept frame to W, by pattern.
     iterative
-        what the method is told besides (:attr:`mitsim.reconstruct.request.ImageRequest.iterative`).
+        Options of the solver (:attr:`mitsim.reconstruct.request.ImageRequest.iterative`).
     """
 
     shots: Capture
@@ -588,52 +508,42 @@ class Accumulation:
 
     @property
     def prepared(self) -> Prepared:
-        """The factorised model."""
+        """Factorised model."""
         return self.model.prepared
 
     @property
     def digital(self) -> Digital:
-        """How numbers of the frames were read."""
+        """Reading of the sensor's numbers."""
         return self.shots.manifest.digital
 
     @property
     def weights(self) -> FloatArray:
-        """(r, r') W of all frames."""
+        """W (r, r') of all frames."""
         problem = self.prepared.problem(self.frames)
         return np.where(problem.sigma > 0, problem.projected, 0.0)
 
     def measurements_again(self) -> Iterable[Measurement]:
-        """All measurements once more: those that are kept, or reads them."""
+        """Return the kept measurements, or read them again."""
         return self.kept or self.shots.pattern_measurements()
 
     def solution(self, lam: float | Literal["auto"]) -> Solution:
-        """Their image at ``lam``."""
+        """Return the image at ``lam``."""
         return self.solver.compute(self.prepared, self.frames, lam, **self.iterative)
 
     def lack(self, image: FloatArray) -> Lack | None:
-        """What the factors are known to lack of the camera, of an ``image`` (n, n'); None where nothing is known."""
+        """Return the effect of the terms that the factors are known to lack, or None."""
         return Lack(self.model, self.factors.lacking, image) if self.factors.lacking else None
 
     def factor_energy(self, image: FloatArray) -> float | None:
-        """What the factors' noise adds to all frames of an ``image`` (n, n'); None where it is not stated."""
+        """Return the energy of the factors' stated noise in all frames of an ``image`` (n, n'), or None."""
         stated = self.factors.manifest.noise
         return factor_energy(self.prepared, self.shots.patterns, stated, image) if stated else None
 
 
 def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHONOV], **iterative: Any) -> Accumulation:
-    """The model of shots and factors factorised, and every frame added.
+    """Factorise the model of shots and factors, and add every frame.
 
-    Parameters
-    ----------
-    shots, factors
-        that fit each other.
-    solver, **iterative
-        of the image that they are for, as in :class:`Accumulation`.
-
-    Raises
-    ------
-    MitsimError
-        when that takes more memory than is free, or a frame cannot be read.
+    Raises MitsimError when that takes more memory than is free, or a frame cannot be read.
     """
     check_factorising(shots, factors, solver)
     prepared = solver.init(factors, shots.patterns)
@@ -656,14 +566,6 @@ def accumulate(shots: Capture, factors: Factors, solver: Solver = SOLVERS[TIKHON
 
 
 def check_factorising(shots: Capture, factors: Factors, solver: Solver) -> None:
-    """MitsimError where factorising the model takes more memory than is free.
-
-    Parameters
-    ----------
-    shots, factors
-        the patterns, and the camera.
-    solver
-        that the model is for.
-    """
+    """Raise MitsimError if factorising the model takes more memory than is free."""
     cost = Cost(memory_bytes=BYTES_A_NUMBER * slab_numbers(shots, factors, whole=solver.whole))
     cost.check(f"{shots.name}: factorising its patterns", Limits())

@@ -1,13 +1,12 @@
-"""A folder with the frames of a real calibration session in; the camera's factors, and what nobody knows of them, out.
+"""Factors of a camera from a folder with the frames of a real calibration session.
 
 Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
 
-*Exposures of one frame.* No frame of a session is brighter than the uniform one. A pixel that this one, read at the
-shortest exposure, would not bring near saturation at a longer one is saturated by no frame at that exposure. So the
-weights of all exposures are found once, and belong to pixels: found by a uniform frame of the other side's stripes,
-they hang on no noise of the frames that they merge, which keeps merged rates without bias, of the variance sum_k w_k^2
-v_k. With w_k in proportion to 1/v_k that is least (Granados et al. 2010, "Optimal HDR reconstruction with linear
-digital cameras", CVPR).
+*Exposures of one frame.* No frame of a session is brighter than the uniform one, so that a pixel that the uniform frame
+would not bring near saturation at an exposure is saturated by no frame. Weights of all exposures are therefore found
+once, by a uniform frame of the other side's stripes, and do not depend on noise of the merged frames. Merged rates have
+no bias and the variance sum_k w_k^2 v_k, which is least with w_k in proportion to 1/v_k (Granados et al. 2010, "Optimal
+HDR reconstruction with linear digital cameras", CVPR).
 """
 
 from __future__ import annotations
@@ -42,16 +41,15 @@ from mitsim.reconstruct.factors import Estimate, Factors, ResponseFit, StripeSum
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
-"""Of a list's `digital`, what a camera's file states where the list does not."""
+"""Fields of a list's `digital` that a camera's file may supply."""
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
-"""What both state, and from which relative and absolute difference they contradict: published gains are good to a few
-percent, level and end are settings, true to a digital number."""
+"""Fields that list and camera must agree on, with relative and absolute tolerance."""
 _UNLIKE, _MATTERS = 4.0, 0.02
-"""Squared difference of two frames that should be alike, in the session's median one, and its root as a part of their
-light, from which one is wrong: light that is twice the usual doubles the first, less than the second costs less than
-most sessions' noise."""
+"""Squared difference of repeated frames over the session's median, and difference over their light, above which one is
+wrong.
+"""
 _LIT = 0.01
-"""Light of a dark frame beyond the others', as a part of the uniform frame's, from which it is wrong."""
+"""Light of a dark frame beyond the others', over the uniform frame's, above which it is wrong."""
 
 
 # ---- From the frames of a real session to factors ----
@@ -64,31 +62,30 @@ def calibrate_frames(
     job: Job | None = None,
     camera: Path | str | None = None,
 ) -> Factors:
-    """The camera's two factors, from the frames of a real session.
+    """Calibrate a camera by the frames of a real session.
 
     Parameters
     ----------
     folder
-        with the frames and their list, as docs/formats.md describes it; or what :func:`load_frames` says of it.
+        Folder with the frames and their list (docs/formats.md), or what :func:`load_frames` returns.
     output
         CAL folder that is written; None keeps the factors in memory.
     job
-        clock and progress.
+        Clock and progress.
     camera
-        name of a shipped camera, or its TOML file: what the list does not state of noise and saturation is the
-        camera's, and what it states is compared.
+        Name of a shipped camera, or its TOML file: it supplies noise and saturation that the list does not state, and
+        is compared with the list.
 
     Returns
     -------
     Factors
-        flagged where they cannot be trusted: for saturated frames, responses that are not separable, and a list that
-        contradicts the camera.
+        Flagged for saturated frames, responses that are not separable, and a list that contradicts the camera.
 
     Raises
     ------
     MitsimError
-        for frames that are missing, there twice, of different sizes or cannot be read, for a list that breaks a rule,
-        and an output that cannot be written.
+        For frames that are missing, given twice, of different sizes or unreadable, a list that breaks a rule, and an
+        output that cannot be written.
     """
     job = job or Job()
     session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
@@ -109,17 +106,7 @@ def calibrate_frames(
 def calibrate_planes(
     session: SessionFrames, output: Path, job: Job | None = None, camera: Path | str | None = None
 ) -> dict[str, Factors]:
-    """The camera's factors of every plane of a mosaic, from frames of all planes, by the plane's name.
-
-    Parameters
-    ----------
-    session
-        whose list has prepare.channel = "all".
-    output
-        coloured CAL folder that is written.
-    job, camera
-        as for :func:`calibrate_frames`, whose errors it raises.
-    """
+    """Calibrate every plane of a mosaic by a session with prepare.channel = "all", and write a coloured CAL folder."""
     job, colours = job or Job(), lines_of_planes(CALIBRATION, session.listed.prepare.wavelengths_nm)
     with output_folder(output) as place:
         found = {
@@ -147,10 +134,9 @@ def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFra
 
 
 def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:
-    """Response (rows, columns) to each of the ``chosen`` +-1 patterns, side and number, of a real ``session``, and the
-    standard deviation of its noise [electrons/s]; where the list does not state the sensor's, that of its light alone.
+    """Yield the response to each ``chosen`` +-1 pattern (side, number) of a ``session``, and the noise [electrons/s].
 
-    MitsimError for a frame with pixels at the full well or the ADC's end, where a model's fit would be misled.
+    Raises MitsimError for a saturated frame.
     """
     _check_sizes(session)
     session, _ = _without_factor(session)
@@ -405,8 +391,7 @@ class _Readings:
         }
 
     def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
-        """Dark ``frames`` of one exposure without one that has light which the others have not; it is noted in
-        ``odd``."""
+        """Return the dark ``frames`` of one exposure without those that contain light, which are noted in ``odd``."""
         levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
         uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
         parts = (levels - np.median(levels)) / uniform
@@ -505,42 +490,34 @@ def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, 
 # ---- One frame at several exposure times ----
 
 Chosen = npt.NDArray[np.bool_] | bool
-"""Pixels (rows, columns) that are chosen, or all or none."""
+"""Chosen pixels (rows, columns), or all or none."""
 _ROOM = 5.0
-"""Deviations of its noise that a uniform frame's pixel must stay below saturation: one of 3 million goes beyond."""
+"""Standard deviations that a uniform frame's pixel must stay below saturation."""
 _STRIPES_LIGHT = 0.5
-"""Light of stripes over that of the uniform frame, whose noise decides on the weights."""
+"""Light of stripes over that of the uniform frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ladder:
-    """Exposures of every frame, and how their rates are merged.
-
-    Attributes
-    ----------
-    digitals
-        how numbers of each exposure become rates, the shortest first.
-    weights
-        (exposures, rows, columns), 1 in sum; None where there is one exposure.
-    """
+    """Exposures of every frame, the shortest first, and their weights (exposures, rows, columns), or None for one."""
 
     digitals: tuple[Digital, ...]
     weights: FloatArray | None = None
 
     @classmethod
     def of(cls, digitals: Sequence[Digital], uniform: FloatArray, shots: int, merge: Merge) -> Ladder:
-        """Weights of several exposures.
+        """Return the weights of several exposures.
 
         Parameters
         ----------
         digitals
-            of each, the shortest first.
-        uniform
-            (rows, columns) rate of the uniform frame at the shortest [electrons/s].
+            Reading of each exposure, the shortest first.
+        uniform : (rows, columns) array, electrons/s
+            Rate of the uniform frame at the shortest exposure.
         shots
-            that it is the mean of.
+            Number of shots of that frame.
         merge
-            ``weighted``: by variance; ``longest``: the longest exposure that does not saturate a pixel, alone.
+            ``weighted`` by variance, or ``longest`` exposure that does not saturate a pixel.
         """
         first = digitals[0]
         light = np.maximum(uniform, 0.0)
@@ -562,7 +539,7 @@ class Ladder:
         return cls(tuple(digitals), weights)
 
     def merge(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
-        """``rates`` (rows, columns) of one frame at each exposure as one; ``rows`` are those that they are of."""
+        """Return the merged ``rates`` of one frame; ``rows`` are those of the sensor that they show."""
         each = iter(rates)
         if self.weights is None:
             return next(each)
@@ -572,18 +549,13 @@ class Ladder:
         return total
 
     def used_pixels(self, exposure: int) -> Chosen:
-        """(rows, columns) whether pixels are read at an ``exposure``."""
+        """Return the pixels (rows, columns) that are read at an ``exposure``."""
         return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> float:
-        """Mean noise variance [(electrons/s)^2] of a merged sum or difference of frames.
+        """Return the mean noise variance [(electrons/s)^2] of a merged sum or difference of ``shots`` frames.
 
-        Parameters
-        ----------
-        light
-            (rows, columns) sum of their rates [electrons/s]; one number will do where there is one exposure.
-        shots
-            their number.
+        ``light`` is the sum of their rates; a single number is enough for one exposure.
         """
         if self.weights is None:
             return float(self.digitals[0].variance(float(np.mean(light)), shots))

@@ -39,7 +39,7 @@ from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""
 Watch = Callable[[FloatArray], bool]
-"""Looks at an image (n, n) under way, and says whether it is good enough."""
+"""Return True for an image (n, n) during the iterations that is good enough."""
 
 
 def solve_iteratively(
@@ -82,15 +82,15 @@ def conjugate_gradients(
     Parameters
     ----------
     normal
-        a symmetric operator without negative eigenvalues.
+        Symmetric operator without negative eigenvalues.
     target
-        right-hand side, of the shape of X.
+        Right-hand side, of the shape of X.
     lam
-        lambda >= 0.
+        Lambda >= 0.
     inverse
-        something near the inverse of normal + lambda, symmetric and positive, which saves steps.
+        Preconditioner: symmetric, positive, and near the inverse of normal + lambda.
     tolerance, most, watch
-        relative residual at which it ends, the most steps, and what ends it before: :data:`Watch`.
+        Relative residual and number of steps that end the iterations, and a function that may end them before.
     """
     lam = check_lambda(lam)
     image, left = np.zeros_like(target), target
@@ -122,13 +122,12 @@ def conjugate_gradients(
 
 
 MOST_FACTORISED = 2048
-"""Pixels of a class up to which it is factorised: at 128 x 128 scene pixels all classes then take 270 MB, and their
-factors as much; one of 4096 pixels takes 23 Gflop, more than its conjugate gradients."""
+"""Largest number of pixels of a factorised class; all classes of 128 x 128 scene pixels then take 270 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Classes:
-    """A ``camera`` under shifting dots of period ``k``; 1 is uniform light. Frames are those of ``dots:k``."""
+    """Camera under shifting dots of period ``k``; 1 is uniform light."""
 
     camera: ShiftedLight
     k: int
@@ -157,7 +156,7 @@ class Classes:
 
     @property
     def largest(self) -> float:
-        """Largest of S: what lambda is to be compared with."""
+        """Largest number of S, which lambda is relative to."""
         return float(self._power.max())
 
     def project(self, frames: FloatArray) -> FloatArray:
@@ -176,9 +175,9 @@ class Classes:
         return self._join(classes)
 
     def factorise(self, lam: float) -> FactorisedClasses:
-        """All classes at ``lam``, ready for any number of scenes.
+        """Return all classes at ``lam``, ready for any number of scenes.
 
-        MitsimError for another lambda, or where a class is too ill-conditioned for it.
+        Raises MitsimError where a class is too ill-conditioned.
         """
         lam = check_lambda(lam)
         if not self.factorised:
@@ -202,7 +201,7 @@ class Classes:
     # ---- equations
 
     def normal(self, image: FloatArray) -> FloatArray:
-        """(n, n) product of the normal matrix of all classes with an ``image`` (n, n)."""
+        """Return the normal matrix of all classes times an ``image`` (n, n)."""
         if not self.cropped:
             classes = fft.rfft2(self._split_classes(image), self._section[0])
             whole = fft.irfft2(classes * self._section[1], self._section[0])
@@ -210,7 +209,7 @@ class Classes:
         return self._lit.correlate(self._lit.image_of(image))
 
     def inverse(self, lam: float) -> Operator:
-        """Division of an image by S + ``lam``: near the normal matrix's inverse, symmetric and positive."""
+        """Return the division of an image by S + ``lam``, symmetric, positive and near the normal matrix's inverse."""
         least = max(lam, float(np.finfo(np.float64).eps) * self.largest)
         weight = 1 / (self._power[:, : self._grid[1] // 2 + 1] + least)
 
@@ -280,7 +279,7 @@ class Classes:
         return grams
 
     def _shared_light(self, below: int, right: int) -> FloatArray:
-        """(n, n) sum over the sensor of each pixel's light times that of the pixel so far above and to the left."""
+        """Return the sum (n, n) over the sensor of each pixel's light times that of a pixel above and to the left."""
         psf, (rows, columns) = self.camera.psf, self.camera.psf.shape
         first, last = max(-right, 0), columns - max(right, 0)
         if below >= rows or last <= first:
@@ -299,22 +298,14 @@ class Classes:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedClasses:
-    """``classes`` at one ``lam``; with the Cholesky factors of each, or None where conjugate gradients solve them."""
+    """Classes at one ``lam`` with their Cholesky factors, or None where conjugate gradients solve them."""
 
     classes: Classes
     lam: float
     factors: list[FloatArray] | None
 
     def solve(self, projected: FloatArray, tolerance: float = 1e-6) -> Solution:
-        """The Tikhonov image of frames.
-
-        Parameters
-        ----------
-        projected
-            (n, n) :meth:`Classes.project` of them.
-        tolerance
-            relative residual of the normal equations at which conjugate gradients end.
-        """
+        """Return the Tikhonov image of ``projected`` frames (:meth:`Classes.project`)."""
         classes = self.classes
         if self.factors is None:
             # On a section's small grids the division would take longer than the steps that it saves.

@@ -48,24 +48,21 @@ from mitsim.reconstruct.residuals import CHANCE
 from mitsim.reconstruct.solver import Solution, Status, Verdict, centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0
-"""Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
+"""Projector pixels of parallax between depths that are tried first."""
 _RESOLUTION = 0.01
-"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm; chosen, below
-the millimetre that is asked for."""
+"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm."""
 _FEWEST = 32
-"""Steps at least, where there is no baseline and only the sensor's own width tells depth."""
+"""Least number of steps, for devices without a baseline."""
 _LEAST_RISE = 2e-5
-"""Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told.
-Uniform light stays below it (5e-8 to 2e-5), and there print within pixels moves depth by up to 12 standard errors."""
+"""Part of the measurements' energy that a pixel of parallax must add, or depth is undetermined. Uniform light stays
+below."""
 _SIMILAR = 2.0
-"""A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
-one scene are alike in shape."""
+"""Largest ratio of a valley's depth to that of the lowest valley."""
 _OPPOSED = 4.0
-"""Times the unexplained energy S by which two depths must differ: r being what the wrong one does not explain of the
-light of the right one, less is left of it than of the right one only if 2 r.d > |r|^2 for the misfit d of energy S; so
-|r|^2 < 4 S."""
+"""Times the unexplained energy S by which two depths must differ. With r the light of the right depth that the wrong
+one does not explain, the wrong one leaves less only if 2 r.d > |r|^2 for the misfit d of energy S, so |r|^2 < 4 S."""
 _LAMBDA = 1e-3
-"""Of the image by which the noise of factors is weighed, over the largest sigma^2: chosen, like that of pixeldepths."""
+"""Lambda over the largest sigma^2 of the image that weighs the noise of factors."""
 
 
 # ---- A depth, its error and its alternatives ----
@@ -73,8 +70,7 @@ _LAMBDA = 1e-3
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another depth [mm] that explains the measurements as well, and how much less it explains (rms, relative to all
-    measurements)."""
+    """Another depth [mm] that explains the measurements as well, and its residual beyond the best (rms, relative)."""
 
     mm: float
     difference: float
@@ -82,22 +78,20 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Depth:
-    """A depth whose factors are used.
+    """Depth whose factors are used.
 
     Attributes
     ----------
-    mm
-        depth.
     error_mm
-        standard error of one that was found; where another depth explains as much, the distance to it.
+        Standard error, or the distance to an alternative; None for a given depth.
     doubt
-        why it is not to be trusted, or nothing.
+        Reason for not trusting the depth, or nothing.
     range_mm
-        nearest and farthest depth that were tried; None where it was given.
+        Nearest and farthest tried depth.
     alternatives
-        depths that explain the measurements as well.
+        Depths that explain the measurements as well.
     at_end
-        whether it is an end of what was tried, where nothing fits.
+        Whether the depth is an end of the tried range.
     """
 
     mm: float
@@ -120,41 +114,20 @@ class Depth:
 
 
 def chance_difference(difference: float, variance: float, unknowns: int) -> float:
-    """Energy by which noise may make what two models leave over differ.
+    """Return the energy by which noise may make the residuals of two models differ.
 
-    The light that the wrong one does not explain, of energy D, meets noise: 4 v D. The noise that one of them takes up
-    and the other does not has the variance 4 v^2 times the unknowns, or less.
-
-    Parameters
-    ----------
-    difference
-        D that was found.
-    variance
-        v of a datum.
-    unknowns
-        of each model.
+    Light of energy D (``difference``) that the wrong model does not explain meets noise of variance v: 4 v D. Noise
+    that only one of the models takes up has the variance 4 v^2 times the ``unknowns``, or less.
     """
     return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
 
 
 @single_threaded_blas()
 def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
-    """The one depth whose factors explain most of the measurements.
+    """Return the depth whose factors explain most of the measurements.
 
-    Parameters
-    ----------
-    shots
-        of a scene.
-    factors
-        of the same camera, with their parallax.
-    depth_range
-        nearest and farthest depth [mm] that are tried; None: a quarter of 1/z either way of the calibrated one.
-
-    Raises
-    ------
-    MitsimError
-        for a calibration without parallax, or a frame that cannot be read; ArgumentError for a range that too little of
-        the sensor knows.
+    ``depth_range`` are the nearest and farthest tried depth [mm], by default a quarter of 1/z either way. Raises
+    MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
     """
     return _Search(shots, factors, depth_range).find()
 
@@ -247,8 +220,7 @@ class _Search:
             yield left, shift
 
     def _beyond(self, shift: float, margin: float) -> Iterator[tuple[float, float]]:
-        """The same of depths beyond the range that are a period of the dots from the best ``shift`` within it, or
-        several; and of all beyond an end that it is, within the ``margin``."""
+        """Yield valleys beyond the range, whole periods of the dots from the best ``shift`` or beside it at an end."""
         for end, tried, step in zip(self._ends, self._tried, (-self._period, self._period), strict=True):
             if tried == end:
                 continue
@@ -280,7 +252,7 @@ class _Search:
         return float(least / max(self._all.data - self._unknowns, 1))
 
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
-        """Energy by which two depths may differ of which either is the right one."""
+        """Return the energy by which two depths may differ of which either is the right one."""
         return max(chance_difference(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
 
     def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
@@ -317,43 +289,35 @@ class _Search:
 # ---- A basis that factors of all depths share ----
 
 RANGE = 0.25
-"""Depths that are looked for where no range is given, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm
-moves light by an eighth of a window of 0.3 rad."""
+"""Searched part of 1/z on either side: 320 to 533 mm for 400."""
 _LEFT_OUT = 1e-6
-"""Part of the factors' energy that the common basis of all depths may leave out: below their noise's."""
+"""Part of the factors' energy that the common basis may omit."""
 _STILL, _BETWEEN = 2.0, 4
-"""Projector pixels of parallax up to which dots have a basis of their own along an axis, as depth hardly moves their
-shadows there: a quarter of the vectors (54 of 200, 20 of 126), where more parallax leaves none out; and depths a pixel
-that these are made of, as no neighbour's column makes up for one between."""
+"""Projector pixels of parallax up to which dots have a basis of their own along an axis, and depths a pixel of the
+basis."""
 
 
 class CommonBasis:
-    """Frames of a capture, and factors of any depth within a range.
+    """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
 
     Parameters
     ----------
-    shots, factors
-        of the same camera; MitsimError for factors without parallax.
     shifts
-        least and largest change of 1/z [1/mm]; ArgumentError where too little of the sensor knows all these depths.
+        Least and largest change of 1/z [1/mm].
     groups
-        scene pixels along both axes that patterns light apart
-        (:func:`mitsim.reconstruct.factorisation.group_pixels`): where each pattern lights one group, its frames may be
-        on a basis of that alone, and so are the columns of :meth:`side`. None: all frames of an axis share one.
+        Groups of scene pixels that patterns light apart (:func:`mitsim.reconstruct.factorisation.group_pixels`), each
+        of which may have a basis of its own. None: all frames of an axis share one.
 
     Attributes
     ----------
-    parallax, patterns
-        of the factors and the shots.
     noise
-        of the measurements on the whole sensor.
+        Noise of the measurements on the whole sensor.
     frames, stack
-        measurements on the bases, one by one and all in one (K, r, K', r').
+        Measurements on the bases, one by one and in one array (K, r, K', r').
     energy, outside
-        squared norm of the measurements on the part of the sensor where all depths are known, and what of it no depth
-        explains.
+        Squared norm of the measurements where all depths are known, and the part that no depth explains.
     data, part
-        their number, and what part of the sensor they are of.
+        Number of these measurements, and their part of the sensor.
     """
 
     def __init__(
@@ -409,12 +373,11 @@ class CommonBasis:
         return self._sides[0].factor.shape[1], self._sides[1].factor.shape[1]
 
     def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
+        """Return the factor (r, n) of an ``axis`` on its basis, with 1/z changed by ``shift`` [1/mm]."""
         return self._bases[axis].project(self._own(self._columns_at(axis, shift)))
 
     def widen(self, axis: int, pixels: int) -> FloatArray:
-        """(r, ``pixels`` + n + ``pixels``) columns of an ``axis`` on its basis, with those that light beside the window
-        has: of the outermost pixels, moved there by their depth."""
+        """Return the columns of an ``axis`` with ``pixels`` more a side, of the outermost pixels at other depths."""
         edges = self.edges(axis)
         before, beyond = (self._columns_at(axis, offset / edges) for offset in (-pixels, pixels))
         count = before.shape[1]
@@ -422,15 +385,15 @@ class CommonBasis:
         return self._bases[axis].project(self._own(columns))
 
     def edges(self, axis: int) -> FloatArray:
-        """(n,) projector pixels along an ``axis`` that a change of 1/z by 1/mm moves the light of each."""
+        """Return the projector pixels (n,) along an ``axis`` that a change of 1/z by 1/mm moves each pixel's light."""
         return self._sides[axis].edges
 
     def reach(self, axis: int) -> float:
-        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
+        """Return the largest parallax along an ``axis`` by a change of 1/z by 1/mm [projector pixels]."""
         return self._sides[axis].reach
 
     def smoothing(self, shift: float) -> float:
-        """Variance of noise in the factors at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones."""
+        """Return the variance of noise in the factors at 1/z changed by ``shift``, over that of the calibrated ones."""
         return float(np.mean([side.noise(shift) ** 2 for side in self._sides]))
 
     def _columns_at(self, axis: int, shift: float | FloatArray) -> FloatArray:
@@ -444,15 +407,7 @@ class CommonBasis:
 
 
 def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
-    """Least and largest change of 1/z [1/mm] of the depths that are looked for.
-
-    Parameters
-    ----------
-    factors
-        with their parallax.
-    depth_range
-        nearest and farthest depth [mm], ArgumentError where the mask is beyond the nearest; None: :data:`RANGE`.
-    """
+    """Return the least and largest change of 1/z [1/mm] of the searched depths."""
     parallax = parallax_of(factors)
     if depth_range is None:
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
@@ -497,49 +452,41 @@ class _Basis:
 
 
 _STEPS, _STEP_POOLED = 4, 3.0
-"""Gauss-Newton steps at most, and the standard deviation [pixels] over which changes of depth are pooled: with 2 and
-1.5 noise of dark pixels spreads (cookie_bag 29.7, 29.2, 28.8 dB)."""
+"""Largest number of Gauss-Newton steps, and the standard deviation [pixels] over which changes of depth are pooled."""
 _ROUNDS, _BESIDE = 4, 5
-"""Rounds at most in which single pixels take another depth of the 5 x 5 around them: pooling rounds the edges of cards,
-and what lies a pixel or two beside is then the depth of what is there."""
+"""Largest number of rounds in which single pixels take another depth of the 5 x 5 around them."""
 _SURE = 25.0
 """Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
 _RIVAL, _ASTRAY = 2.0, 0.05
-"""Starts that leave less than twice as much as the best one must not place more than this part of the told pixels half
-a period beside it: two cards under dots too near to each other come out either way, and 1.8 times as much is left."""
+"""Starts that leave less than twice as much as the best one may place at most this part of the reliable pixels half a
+period beside it.
+"""
 _RELIABLE = 0.5
-"""Confidence from which a pixel's depth counts as told: twice as much light arrives there as anywhere else."""
+"""Least confidence of a reliable depth: twice as much light arrives there as anywhere else."""
 SPARE = 2.0
-"""Projector pixels of the period that told depths must leave free, or they may be another's by a whole period: as many
-as a dot's image is wide. With one, two cards that span 3 of 4 pixels came out 2 dB worse than at one depth."""
+"""Projector pixels of the period that reliable depths must leave free, as many as a dot's image is wide."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depths by projector pixel, and the image that they give.
+    """Depths by projector pixel, and their image.
 
     Attributes
     ----------
-    image
-        (n, n') reflectance.
-    mm
-        (n, n') depth.
-    confidence
-        (n, n') 1 less what arrives at the second place over what arrives at the first; 0 where nothing does.
+    image, mm, confidence : (n, n') arrays
+        Reflectance; depth; and 1 less the light at the second place over that at the first.
     lam
-        lambda of the image.
+        Lambda of the image.
     left_over, energy, data
-        energy that image and depths leave of the measurements, all of their energy, and their number.
+        Residual energy, energy and number of the measurements.
     part
-        of the sensor, which these measurements are of.
+        Part of the sensor of these measurements.
     doubt
-        why it is not to be trusted, or nothing.
+        Reason for not trusting the depths, or nothing.
     range_mm
-        nearest and farthest depth that were looked for.
+        Nearest and farthest searched depth.
     smoothing
-        variance of the factors' noise at these depths, over that of the calibrated ones.
-    alternatives
-        none: depths by pixel that may be others are not told at all.
+        Variance of the factors' noise at these depths, over that of the calibrated ones.
     """
 
     image: FloatArray
@@ -564,27 +511,21 @@ class DepthMap:
 
     @property
     def solution(self) -> Solution:
-        """The image; solved, as dots leave fewer unknowns in a frame than the sensor has data."""
+        """Image as a solution; dots leave fewer unknowns in a frame than the sensor has data."""
         residual = float(np.sqrt(self.left_over / self.energy))
         status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
         return Solution(self.image, self.lam, residual, status)
 
     @property
     def reliable(self) -> np.ndarray:
-        """(n, n') whether each depth is reliable."""
+        """Whether each depth (n, n') is reliable."""
         return np.asarray(self.confidence >= _RELIABLE)
 
     def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
-        """What of the measurements fits no image at these depths, over the sensor as a whole.
+        """Return the misfit of the measurements at these depths, over the sensor as a whole.
 
-        Parameters
-        ----------
-        noise
-            of all measurements.
-        factor_energy
-            what noise of the calibrated factors adds to all frames; None: not stated.
-        print_energy
-            what print within a pixel may add to them.
+        ``factor_energy`` and ``print_energy`` are the energies that noise of the calibrated factors and print within a
+        pixel may add to all frames.
         """
         spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
         variance = float(noise.variance.mean()) * self.data * spare
@@ -594,11 +535,11 @@ class DepthMap:
         return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
 
     def channels(self) -> dict[str, npt.NDArray[np.float32]]:
-        """As a file has it: depth [mm], and confidence."""
+        """Return the channels of depth.exr: depth [mm] and confidence."""
         return {"depth_mm": self.mm.astype(np.float32), "confidence": self.confidence.astype(np.float32)}
 
     def summary(self) -> dict[str, float]:
-        """What result.json and the command line's JSON say of it."""
+        """Return the entries of result.json."""
         reliable = self.mm[self.reliable] if self.reliable.any() else self.mm
         low, middle, high = (float(value) for value in np.percentile(reliable, (1, 50, 99)))
         return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
@@ -611,24 +552,10 @@ def depth_map(
     lam: float | Literal["auto"] = "auto",
     depth_range: tuple[float, float] | None = None,
 ) -> DepthMap:
-    """The depth of each projector pixel, and the image with all of them in focus.
+    """Return the depth of each projector pixel under shifting dots, and the image with all of them in focus.
 
-    Parameters
-    ----------
-    shots
-        under shifting dots.
-    factors
-        of the same camera, with their parallax.
-    lam
-        of the image; ``auto``: what its own residual asks for.
-    depth_range
-        nearest and farthest depth [mm] that are looked for; None: a quarter of 1/z either way of the calibrated one.
-
-    Raises
-    ------
-    MitsimError
-        for other patterns than dots, devices without parallax, a calibration that does not state it, or a frame that
-        cannot be read.
+    ``depth_range`` are the nearest and farthest searched depth [mm], by default a quarter of 1/z either way. Raises
+    MitsimError for other patterns, and without parallax.
     """
     return _MapSearch(shots, factors, depth_range).find(lam)
 
@@ -743,19 +670,18 @@ class _MapSearch:
 # -------- Measurements and a depth for each projector pixel in, the image out
 
 _SMALL = 1e-3
-"""Lambda over the mean diagonal of the normal matrix while depths are looked for: images under 98 dots differ by 0.1 dB
-from 1e-2 to 1e-4."""
+"""Lambda over the mean diagonal of the normal matrix while depths are searched."""
 _LARGEST = 1e-2
-"""The same of the last image at most: noise asks for more only where there is no image."""
+"""Largest such lambda of the final image."""
 _MOST_LIT = 4096
-"""Pixels of one frame: their normal matrix has 128 MiB, and takes seconds to factorise."""
+"""Pixels of one frame whose normal matrix has 128 MiB."""
 _CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6
-"""Lagrange's cubic through -1, 0, 1, 2: weight of each by power of the place."""
+"""Lagrange cubic through -1, 0, 1, 2: weight of each by power of the place."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """An ``image`` (n, n') at given depths, its ``lam``, and the energy that it leaves over."""
+    """Image (n, n') at given depths, its lambda, and the residual energy."""
 
     image: FloatArray
     lam: float
@@ -763,15 +689,10 @@ class Solved:
 
 
 class PixelDepths:
-    """The model with a depth for each projector pixel.
+    """Model with a depth for each projector pixel.
 
-    Parameters
-    ----------
-    depths
-        frames and factors.
-    limit, step
-        largest change of 1/z [1/mm], and the distance between those that columns are computed at; others lie on a cubic
-        between them.
+    ``limit`` and ``step`` are the largest change of 1/z [1/mm], and the distance between those that columns are
+    computed at.
     """
 
     def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
@@ -789,7 +710,7 @@ class PixelDepths:
         self._scale = left * right
 
     def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
-        """The image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
+        """Return the image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
         lam = _SMALL * self._scale if lam is None else lam
         image, left_over = np.zeros(shift.shape), self._all.outside
         for frame in self._all.frames:
@@ -802,22 +723,16 @@ class PixelDepths:
         return Solved(image, lam, left_over)
 
     def variance(self, solved: Solved) -> float:
-        """Of a datum, from what a ``solved`` image leaves over, less a reflectance and a depth for each pixel."""
+        """Return the variance of a datum from the residual of a ``solved`` image."""
         return float(solved.left_over / max(self._all.data - 2 * solved.image.size, 1))
 
     def final(self, shift: FloatArray, solved: Solved) -> Solved:
-        """The image at the lambda that its own residual asks for: variance of a datum over the mean square of pixels.
-
-        Parameters
-        ----------
-        shift, solved
-            depths, and the image at them.
-        """
+        """Return the image at the lambda of its own residual: variance of a datum over the mean square of pixels."""
         ideal = self.variance(solved) / max(float(np.square(solved.image).mean()), np.finfo(float).tiny)
         return self.solve(shift, min(ideal, _LARGEST * self._scale))
 
     def step(self, shift: FloatArray, unit: float) -> tuple[FloatArray, FloatArray]:
-        """Image X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
+        """Return X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
         lam, image, moved = _SMALL * self._scale, np.zeros(shift.shape), np.zeros(shift.shape)
         for frame in self._all.frames:
             lit = self._pixels(frame)
@@ -837,16 +752,9 @@ class PixelDepths:
         return image, moved
 
     def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
-        """(len(``others``), n, n') energy that each pixel alone explains more at another change of 1/z.
+        """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z.
 
-        Pixels of a frame lie a period apart and hardly share measurements, so each is weighed with all else as it is.
-
-        Parameters
-        ----------
-        shift, image
-            (n, n') changes of 1/z, and the image at them.
-        others
-            (n, n') changes of 1/z that are tried.
+        Pixels of a frame are a period apart and hardly share measurements, so that each is judged with all else fixed.
         """
         gains = np.zeros((len(others), *shift.shape))
         for frame in self._all.frames:
@@ -869,7 +777,7 @@ class PixelDepths:
         return rows.ravel(), columns.ravel()
 
     def _columns(self, axis: int, pixels: np.ndarray, shift: FloatArray, slope: bool = False) -> FloatArray:
-        """(k, r) columns of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivative by it."""
+        """Return columns (k, r) of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivatives."""
         step = self._shifts[1] - self._shifts[0]
         place = (shift - self._shifts[0]) / step
         start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
@@ -885,44 +793,37 @@ class PixelDepths:
 
 
 LAMBDAS = 1e-5, 1e-6, 1e-7
-"""Of the largest sigma^2: at less, noise rules, at more, dots blur (cookie_bag under dots:7x16 at 1.4 s: median errors
-of 1.2, 0.6, 0.4 mm)."""
+"""Tried lambdas over the largest sigma^2: smaller ones add noise, larger ones blur dots."""
 OFFSETS = -1.0, -0.5, 0.5, 1.0
-"""Projector pixels by which the range of displacements may be moved: it is the period wide, and a surface at its end
-would else be taken for one at the other."""
+"""Projector pixels by which the range of displacements may be moved, because a surface at its end is ambiguous."""
 MEDIAN = 5
-"""Projector pixels: width of the median of places; wider ones round the edges of cards."""
+"""Width of the median of places [projector pixels]."""
 _POOLED = 1.0
-"""Projector pixels: standard deviation over which light is pooled before its place is taken; with 2 edges blur, with
-none single pixels go astray."""
+"""Standard deviation over which light is pooled [projector pixels]."""
 _BESIDE_LARGEST = 2
 """Projector pixels beyond the largest displacement, so that a dot's image is not cut."""
 _LEAST_PARALLAX = 0.5
-"""Projector pixels that the range of depths must move light along an axis, or it is one without parallax."""
+"""Least parallax of an axis over the range of depths [projector pixels]."""
 _NEIGHBOURHOOD = 2.0
-"""Projector pixels of displacement beside the largest light that belong to it: a second one further off is a doubt."""
+"""Projector pixels beside the largest light that belong to it."""
 
 
 class Arrivals:
-    """Where light arrives, by pixel and change of 1/z.
+    """Places where light arrives, by pixel and change of 1/z.
 
     Parameters
     ----------
-    shots, factors
-        under shifting dots, and of the same camera; MitsimError for other patterns, and for devices without parallax.
     ends
-        least and largest change of 1/z [1/mm] of the depths that are looked for.
+        Least and largest change of 1/z [1/mm] of the searched depths.
     beside
-        change of 1/z [1/mm] of the middle of those that are told apart, at most.
+        Largest change of 1/z [1/mm] of the middle of the distinguishable depths.
 
     Attributes
     ----------
-    depths
-        frames and factors.
     pixel
-        change of 1/z [1/mm] that moves light by one projector pixel.
+        Change of 1/z [1/mm] that moves light by one projector pixel.
     width, reach
-        changes of 1/z that are told apart, and the largest that is tried, either way.
+        Distinguishable changes of 1/z, and the largest tried one, either way.
     """
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
@@ -951,14 +852,9 @@ class Arrivals:
         return self.width < self._span
 
     def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
-        """Changes of 1/z by pixel where most light arrives, and how much more than elsewhere.
+        """Return changes of 1/z by pixel where most light arrives, and the confidence.
 
-        Parameters
-        ----------
-        lam
-            of the look, over the largest sigma^2.
-        offset
-            middle of the displacements [projector pixels].
+        ``lam`` is relative to the largest sigma^2, ``offset`` the middle of the displacements [projector pixels].
         """
         count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel

@@ -34,23 +34,23 @@ if TYPE_CHECKING:
 
 SEPARABLE_RESIDUAL = 0.01
 """Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
-light. Falloff and diffraction leave less than 1e-3."""
+light, while falloff and diffraction leave less than 1e-3.
+"""
 
 UNKNOWN_NOISE = 0.05
-"""The same where the sensor's noise was not stated, so that a good session's own few percent do not count."""
+"""Limit of the unexplained residual where the sensor's noise is not stated."""
 
 NOISE_MODEL = 0.2
 """Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
 
 LARGEST_ERROR = 0.1
-"""Relative error of a factor, as its noise predicts it, above which the status warns: a tenth is 20 dB."""
+"""Relative error of a factor above which the status warns."""
 _NUMBERS_AT_ONCE = 2**15
-"""Numbers of a response whose misfit is summed at a time: they and what is subtracted stay in the cache."""
+"""Numbers of a response whose misfit is summed at a time, so that they stay in the cache."""
 _NEGATIVE = 0.1
-"""Sum over the sum of absolute values below which a uniform response counts as negative: noise alone makes 0.01."""
+"""Sum over the sum of absolute values below which a uniform response counts as negative."""
 _TURNS, _TURNED = 30, 1e-13
-"""Steps of the power iteration that splits a uniform response, and the change at which it has converged: where it has,
-each step took away 63 % or more, so that no more than the last change is left. A board's responses take four."""
+"""Steps of the power iteration that splits a uniform response, and the change at which it has converged."""
 
 
 # ---- Estimated factors ----
@@ -58,28 +58,24 @@ each step took away 63 % or more, so that no more than the last change is left. 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Factors as :func:`estimate_factors` found them, and how far to trust them; once they are those of a camera, with
-    its identity and in a file's precision, they are :class:`mitsim.reconstruct.factors.Factors`.
+    """Estimated factors and their quality.
 
     Attributes
     ----------
     left, right
         Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
     separability_residual
-        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses: noise plus what no separable
-        camera explains.
+        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses.
     unexplained
-        the part of that residual which the stated sensor noise does not account for; equal to it when none was stated.
+        Part of that residual beyond the stated noise of the sensor.
     condition
-        the larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient.
+        Larger cond(Phi)^2 of the two; inf when rank deficient.
     noise
-        root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
+        Root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
     predicted_error
-        relative error of (left, right), in the Frobenius norm, that independent noise of that size leaves.
+        Relative error (Frobenius norm) of both factors by independent noise of that size.
     rank
-        of (left, right): singular values that are more than rounding, and than that noise alone would make.
-    status
-        not ok when the responses cannot be trusted; with error, rank and condition.
+        Number of singular values of both factors above rounding and noise.
     """
 
     left: FloatArray
@@ -94,7 +90,7 @@ class Estimate:
 
     @property
     def ok(self) -> bool:
-        """Whether the factors can be used as they are."""
+        """Whether the factors can be used without a correction."""
         return self.status.ok
 
 
@@ -103,19 +99,19 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
-    """What one response adds to :class:`StripeSums`.
+    """Contribution of one response to :class:`StripeSums`.
 
     Attributes
     ----------
-    vector
-        (m,) u_i, or w_i: least squares in Y_i = u_i common^T.
+    vector : (m,) array
+        Least-squares u_i or w_i in Y_i = u_i common^T.
     misfit, energy
         ||Y_i - u_i common^T||^2 and ||Y_i||^2.
-    ambient
-        (3,) light that the mask does not cast, measured across the common vector: even, and tilted along the response's
-        vector and along the common one, whose places are -1 to 1. Zeros where responses are centred.
-    light
-        (m,) the sum of its two frames, projected as the response is; None: not known.
+    ambient : (3,) array
+        Light that the mask does not cast: even, tilted along the response's vector, and tilted along the common one.
+        Zeros where responses are centred.
+    light : (m,) array
+        Sum of the response's two frames, projected likewise, or None.
     """
 
     vector: FloatArray
@@ -127,27 +123,26 @@ class ResponseFit:
 
 @dataclass
 class StripeSums:
-    """Running sums over the responses of one side; saved after any response and continued, they come to the same bits.
+    """Running sums over the responses of one side, which continue to the same bits after being saved.
 
     Attributes
     ----------
     side
         ``horizontal`` or ``vertical`` stripes.
     centre
-        whether row and column means are taken out of every response.
+        Whether row and column means are removed from every response.
     common
         v (k,) of Y_i = u_i v^T; for vertical stripes a of Y_i^T = w_i a^T.
-    vectors
-        (m, N) u_i, or w_i, as columns; those of responses to come are undefined.
+    vectors : (m, N) array
+        u_i or w_i as columns.
     misfit, energy
-        sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
+        Sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
     done
-        responses that are in.
+        Number of added responses.
     misfits, energies, ambient
         (N,), (N,) and (N, 3) of each response.
     lights
-        (m, N) the sums of the two frames of each response, projected as the response is; (m, 0) where responses are not
-        the differences of two frames, or where the sums are not known.
+        (m, N) projected sums of the two frames of each response; (m, 0) where they are unknown.
     """
 
     side: str
@@ -168,22 +163,13 @@ class StripeSums:
         self.lights = np.zeros((len(self.vectors), 0))
 
     def add(self, response: npt.ArrayLike) -> None:
-        """Add the next ``response`` (rows, columns); MitsimError for another shape or values that are not finite."""
+        """Add the next ``response`` (rows, columns)."""
         self.put(self.fit_response(response, self.done))
 
     def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
-        """What a response adds; MitsimError as :meth:`add`.
+        """Return the contribution of response ``number`` without adding it, so that several threads may call this.
 
-        Changes nothing, so that responses are looked at in several threads.
-
-        Parameters
-        ----------
-        response
-            (rows, columns).
-        number
-            of its pattern.
-        light
-            (rows, columns) the sum of the two frames whose difference it is; None: not known.
+        ``light`` (rows, columns) is the sum of the two frames whose difference the response is.
         """
         shape = len(self.vectors), len(self.common)
         shape = shape if self.side == "horizontal" else shape[::-1]
@@ -210,7 +196,7 @@ class StripeSums:
         return ResponseFit(vector, misfit, energy, shown * (not self.centre), light)
 
     def put(self, seen: ResponseFit) -> None:
-        """Count in what was ``seen`` of the next response."""
+        """Add a fitted response."""
         self.vectors[:, self.done] = seen.vector
         self.misfit += seen.misfit
         self.energy += seen.energy
@@ -230,19 +216,7 @@ def stripe_sums(
     uniform: npt.ArrayLike | None = None,
     lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
-    """Sums of horizontal and of vertical stripes, with the first response of each.
-
-    Parameters
-    ----------
-    horizontal, vertical
-        responses number 0 (rows, columns).
-    count
-        N, the responses of each side.
-    centre, uniform
-        as :func:`estimate_factors`, which also says what is refused.
-    lights
-        (rows, columns) sums of the two frames that each of both responses is the difference of.
-    """
+    """Return sums of horizontal and of vertical stripes of ``count`` responses each, with the first of each."""
     first = _response(horizontal, "horizontal response 0", None, centre)
     second = _response(vertical, "vertical response 0", first.shape, centre)
     mean = (upright(first, horizontal) + upright(second, vertical)) / 2
@@ -259,8 +233,7 @@ def stripe_sums(
 
 
 def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
-    """Return a uniform ``response``, its sign turned if its ``light`` (before centring) is negative because its two
-    frames are exchanged. Light that was centred before has no sign."""
+    """Return a uniform ``response``, with its sign turned if its uncentred ``light`` is negative."""
     negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
     return -response if negative else response
 
@@ -276,30 +249,26 @@ def estimate_factors(
     uniform: npt.ArrayLike | None = None,
     noise: float | None = None,
 ) -> Estimate:
-    """Factors of a separable camera from its responses to striped light.
+    """Estimate the factors of a separable camera from its responses to striped light.
 
     Parameters
     ----------
     horizontal, vertical
-        responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order i = 0 .. N-1, each the difference of a
-        pattern's positive and negative capture; read one at a time, so generators keep memory small.
-    H
-        (n, N) of +1 and -1 with orthogonal rows. Its column 0 is all +1 unless ``uniform`` is given.
+        Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order, each the difference of a pattern's positive and
+        negative capture. Generators keep memory small.
+    H : (n, N) array
+        +1 and -1 with orthogonal rows; column 0 is all +1 unless ``uniform`` is given.
     centre
-        True takes row and column means out of every response and of the factors: for a FlatCam mask, whose
-        constant term vanishes so.
-    uniform
-        (m, m') response under all light, a better estimate than responses number 0 (for example the mean
-        over pairs of positive + negative captures). Default: the mean of ``horizontal[0]`` and
-        ``vertical[0]``.
+        True removes row and column means, for a FlatCam mask.
+    uniform : (m, m') array
+        Response under all light, by default the mean of the first horizontal and vertical responses.
     noise
-        root mean square sensor noise of a response [frame unit]; None: unknown. Where it is known, few photons alone
-        do not make the responses look inseparable, and a small keystone is not taken for noise.
+        Root mean square sensor noise of a response [frame unit]; None if unknown.
 
     Raises
     ------
     MitsimError
-        for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+        For a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
     """
     signs = _checked_signs(H, uniform is not None)
     count = signs.shape[1]
@@ -321,19 +290,7 @@ def factors_of_sums(
     stated_noise: float | None = None,
     extra: tuple[float, float] = (0.0, 0.0),
 ) -> Estimate:
-    """Factors from finished sums.
-
-    Parameters
-    ----------
-    left, right
-        of horizontal and of vertical stripes, all responses in.
-    signs
-        H (n, N), as :func:`estimate_factors` takes it.
-    stated_noise
-        root mean square sensor noise of a response [frame unit]; None: unknown.
-    extra
-        squared error of each side's vectors, all in all, that is not the noise of their responses.
-    """
+    """Return the factors of complete sums; ``extra`` is the squared error of each side's vectors beyond their noise."""
     v, a = left.common, right.common
     count = signs.shape[1]
     phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
@@ -376,24 +333,10 @@ def factors_of_sums(
 
 
 def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
-    """Relative Frobenius error of a factor when every datum has independent noise.
+    """Return the relative Frobenius error of a factor by independent noise of each datum.
 
-    Parameters
-    ----------
-    factor
-        Phi (m, n) [square root of the frames' unit].
-    noise
-        standard deviation of a datum [frame unit].
-    common_norm
-        |v|, the norm of what all responses of this side share [as ``factor``].
-    count
-        N, the responses.
-
-    Notes
-    -----
-    u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, and U H^T / N averages N of them with signs,
-    so the factor has variance noise^2 / (N |v|^2). The error of v itself enters at second order and as a
-    common scale of order noise / (|a| |v|), and is left out. Infinite for a factor that is zero.
+    u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, with |v| the ``common_norm``, and U H^T / N averages N
+    (``count``) of them. The error of v enters at second order and as a common scale, and is neglected.
     """
     deviation = noise / (np.sqrt(count) * common_norm)
     norm = float(np.linalg.norm(factor))
@@ -406,19 +349,12 @@ def predicted_error(factor: FloatArray, noise: float, common_norm: float, count:
 class AmbientLight:
     """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
 
-    Parameters
-    ----------
-    common
-        (k,) v.
-    length
-        m, of the responses' vectors u.
-
     Attributes
     ----------
-    effects
-        (3, m) vectors that light of size 1 adds to u: even, tilted along u, tilted along v, by places -1 to 1.
-    variances
-        (3,) of the measured sizes for noise of variance 1.
+    effects : (3, m) array
+        Vectors that light of size 1 adds to u: even, tilted along u, tilted along v.
+    variances : (3,) array
+        Variances of the measured sizes for noise of variance 1.
     """
 
     def __init__(self, common: FloatArray, length: int) -> None:
@@ -434,12 +370,12 @@ class AmbientLight:
         self.variances = np.diag(self._inverse)
 
     def measure(self, response: FloatArray) -> FloatArray:
-        """Return (3,) the sizes of the light in a ``response`` (m, k)."""
+        """Return the sizes (3,) of the light in a ``response`` (m, k)."""
         seen = response @ self._across
         return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
 
     def energies(self, sizes: FloatArray) -> FloatArray:
-        """Return (N,) the squares that light of ``sizes`` (N, 3) adds to the misfits of responses."""
+        """Return the squares (N,) that light of ``sizes`` (N, 3) adds to the misfits of responses."""
         return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
 
 
@@ -447,7 +383,7 @@ class AmbientLight:
 
 
 def decibels(part: float) -> float:
-    """An rms ``part`` of a signal in dB, -20 for a tenth."""
+    """Return an rms ``part`` of a signal in dB, -20 for a tenth."""
     return float(20 * np.log10(part))
 
 
@@ -498,10 +434,10 @@ class _Singular:
         return float("inf") if lost else float((self.values[0] / self.values[-1]) ** 2)
 
     def rank(self, phi: FloatArray, error: float) -> int:
-        """Values beyond rounding and what an ``error``, as a part of ||``phi``||, makes of zero.
+        """Return the number of singular values above rounding and the noise of a relative ``error``.
 
-        Along a scene direction that the sensor does not see the factor holds m independent numbers of that noise: their
-        norm squared is chi-square with m degrees of freedom, taken at three standard deviations above its mean.
+        Along a direction that the sensor does not see the factor has m independent numbers of noise. Their squared norm
+        is chi-square with m degrees of freedom, of which the limit is three standard deviations above the mean.
         """
         if not phi.any():
             return 0
@@ -511,12 +447,12 @@ class _Singular:
 
 
 def squared_condition(phi: FloatArray) -> float:
-    """cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
+    """Return cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
     return _Singular.of(phi).squared_condition
 
 
 def rank_above_noise(phi: FloatArray, error: float) -> int:
-    """Directions of scene pixels that a factor ``phi`` (m, n) of a relative ``error`` sees above noise and rounding."""
+    """Return the number of singular values of ``phi`` (m, n) above rounding and noise of a relative ``error``."""
     return _Singular.of(phi).rank(phi, error)
 
 
@@ -534,10 +470,10 @@ def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _largest_right_vector(matrix: FloatArray) -> FloatArray:
-    """(n,) right singular vector of the largest singular value of a ``matrix`` (m, n), of either sign.
+    """Return the right singular vector (n,) of the largest singular value of a ``matrix`` (m, n), of either sign.
 
-    By power iteration: a uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048. Where
-    the next singular value is so near that the iteration has not converged in time, by that SVD.
+    A uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048, so that power iteration is
+    used unless it does not converge.
     """
     # No direction of the data: what starts across the first singular vector would not find it.
     vector = _unit(np.random.default_rng(0).standard_normal(len(matrix)) @ matrix)
@@ -585,32 +521,30 @@ def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
 
 
 _LACKING = "lacking"
-"""What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
+"""Prefix of channels with terms that a factor lacks."""
 _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
-"""Parts of an identity that manifests of 0.4.0 do not state; where one of two states none, its light may be any."""
+"""Parts of an identity that manifests of 0.4.0 do not state."""
 
 
 @checked_fields
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """A camera's factors, as a CAL folder holds them: a frame under pattern P is Phi_L (P o X) Phi_R^T.
+    """Factors of a calibrated camera: a frame under pattern P is Phi_L (P o X) Phi_R^T.
 
     Attributes
     ----------
     left, right
-        Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)], numbers of single precision, so that factors from memory and
-        from disk are the same.
+        Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)], in single precision as in files.
     manifest
-        of which camera they are, and how they are used.
+        Camera, and use of the factors.
     status
-        what the estimator thought of them.
+        Status of the estimate.
     name
-        the folder, or what messages call factors in memory.
+        Folder, or name in messages.
     estimate
-        what they were fitted as, with residual and predicted error; None for factors from a folder.
+        Estimate with residual and predicted error; None for factors from a folder.
     lacking
-        separable terms [(m, n), (m', n')] of the camera that the factors lack, where a model of it tells them: they
-        predict what images leave unexplained. Of other pixels, or scaled, factors have none.
+        Separable terms [(m, n), (m', n')] of the camera's model that the factors lack.
     """
 
     left: FloatArray
@@ -629,17 +563,7 @@ class Factors:
     @classmethod
     @check_arguments
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
-        """The factors of an estimate.
-
-        Parameters
-        ----------
-        estimate
-            as it was fitted.
-        manifest
-            which names the camera.
-        lacking
-            what the factors lack of the camera, as separable terms.
-        """
+        """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
         update = {
             "estimate": str(estimate.status),
@@ -651,13 +575,12 @@ class Factors:
 
     @cached_property
     def condition(self) -> float:
-        """The larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient."""
+        """Larger cond(Phi)^2 of the two; inf when rank deficient."""
         return max(squared_condition(self.left), squared_condition(self.right))
 
     @property
     def stated_rank(self) -> tuple[int, int] | None:
-        """Directions of scene rows and of columns that the calibration states to be above its noise; None: not stated,
-        as of sessions, which are flagged where they lack any."""
+        """Ranks of both factors above the noise, as the calibration states them; None for sessions."""
         match self.manifest.result.get("rank"):
             case [int(rows), int(columns)]:
                 return rows, columns
@@ -665,19 +588,19 @@ class Factors:
 
     @property
     def sides(self) -> tuple[FloatArray, FloatArray]:
-        """Both factors as the solver takes them: without their columns' means where frames are centred."""
+        """Both factors, centred if frames are."""
         if not self.manifest.centre:
             return self.left, self.right
         return centre_columns(self.left), centre_columns(self.right)
 
     @property
     def ok(self) -> bool:
-        """Whether the factors can be used as they are: a good status, and no warnings."""
+        """Whether the status is good and there are no warnings."""
         return self.status.ok and not self.warnings
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the calibration is flagged."""
+        """Warnings of the calibration."""
         return self.manifest.warnings
 
     @cached_property
@@ -688,16 +611,13 @@ class Factors:
 
     @check_arguments
     def save(self, folder: Path | str) -> Path:
-        """Write the CAL folder that `mitsim calibrate` writes, to a new or empty ``folder``; returns it.
-
-        MitsimError when it holds something, or cannot be written.
-        """
+        """Write the CAL folder of `mitsim calibrate` to a new or empty ``folder``, and return it."""
         with output_folder(folder) as place:
             return self.write(place)
 
     @check_arguments
     def write(self, folder: Path | str) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
+        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         folder = Path(folder)
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
@@ -712,8 +632,7 @@ class Factors:
 
     @check_arguments
     def check_fit(self, shots: Capture) -> None:
-        """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: names first, then
-        the first thing that differs."""
+        """Raise MitsimError if ``shots`` are of another camera, mask, distance, projector or light."""
         ours, theirs = (_parts(each.manifest.camera) for each in (shots, self))
         for name in sorted({*ours, *theirs}, key=lambda name: (not name.endswith("name"), name)):
             own, other = ours.get(name), theirs.get(name)
@@ -735,25 +654,20 @@ class Factors:
 
     @check_arguments
     def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:
-        """The whole model as a linear operator, with its adjoint.
+        """Return the whole model as a linear operator, with its adjoint.
 
         Parameters
         ----------
         patterns
-            a family, or its name such as ``dots:7``.
+            Pattern family, or its name such as ``dots:7``.
         seed
-            of the patterns of a ``random`` family given by name.
+            Seed of a ``random`` family given by name.
 
         Returns
         -------
         LinearOperator
-            (K K' m m', n n'): takes an image (n, n'), row by row, to the measurements (K, K', m, m') [electrons/s] of
-            all patterns (i, j), the differences of signed pairs; centred where the calibration is.
-
-        Raises
-        ------
-        MitsimError
-            for patterns that do not fit the factors.
+            (K K' m m', n n'): from an image (n, n'), row by row, to the measurements (K, K', m, m') [electrons/s] of
+            all patterns (i, j), centred where the calibration is.
         """
         from scipy.sparse.linalg import LinearOperator
 
@@ -788,20 +702,11 @@ class Factors:
 
     @check_arguments
     def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
-        """Draw a factor with a colour bar; returns the axes.
-
-        Parameters
-        ----------
-        side
-            ``left``: of rows; ``right``: of columns.
-        ax
-            matplotlib's axes to draw on; None: those of a new figure.
-        """
+        """Draw a factor (``left`` of rows, ``right`` of columns) with a colour bar, and return the axes."""
         return from_above("report.result_plots", "draw_factor")(self, side, ax)
 
     def to_xarray(self) -> Dataset:
-        """Both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm; MitsimError
-        where xarray, an extra, is not installed."""
+        """Return both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm."""
         return from_above("exchange.labelled", "label_factors")(self)
 
     def __repr__(self) -> str:
@@ -845,7 +750,7 @@ def _factor_noise(estimate: Estimate) -> FactorNoise | None:
 
 @check_arguments
 def load_calibration(folder: Path | str) -> Factors:
-    """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
+    """Return the factors in a CAL ``folder``, or raise MitsimError if it is not a complete calibration."""
     folder = Path(folder)
     manifest = read_manifest(folder, CalibrationManifest)
 
@@ -859,22 +764,7 @@ def load_calibration(folder: Path | str) -> Factors:
 def factors_of(
     manifest: CalibrationManifest, read: Callable[[str], tuple[Channels, Metadata]], name: str = "in memory"
 ) -> Factors:
-    """Factors from a calibration's manifest and files.
-
-    Parameters
-    ----------
-    manifest
-        of the calibration.
-    read
-        channels and metadata of a file, by its name.
-    name
-        where they lie, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when a factor is not there, or not finite.
-    """
+    """Return the factors of a calibration's manifest and files, which ``read`` returns by name."""
     files = [(Path(name) / f"{side}.exr", read(f"{side}.exr")[0]) for side in SIDES]
     left, right = (finite_channel(channels, "factor", path) for path, channels in files)
     terms = max(sum(channel.startswith(_LACKING) for channel in channels) for _, channels in files)

@@ -49,18 +49,17 @@ from mitsim.reconstruct.request import check_parallax
 from mitsim.reconstruct.solver import Prepared
 
 STEP = 0.5
-"""Projector pixels of parallax between displacements that are looked at; a dot's image is some two wide."""
+"""Projector pixels of parallax between tried displacements; a dot's image is about two wide."""
 _NEIGHBOURS = 4
-"""Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
-of the measurements); more neighbours add noise."""
+"""Columns of a cubic; fewer leave more of a sheet at 360 mm, more add noise."""
 _DEGREE = 4
-"""Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
+"""Degree of the polynomial of brightness over columns: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
 _HIDDEN = 0.5
-"""Part of a pixel's light from which it counts as hidden: chosen, as more of it is then missing than seen."""
+"""Part of a pixel's light that must be missing for a hidden pixel."""
 LEAST_PART = 0.5
-"""Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
+"""Least part of the sensor's rows that must remain."""
 
 
 # ---- Factors moved to another depth ----
@@ -68,8 +67,11 @@ LEAST_PART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
-    """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
-    shape, and ``hidden`` the part of the scene's pixels that the field stop takes most of the light of."""
+    """Factors of a depth on the sensor's ``rows`` and ``columns`` where they are known.
+
+    ``sensor`` is the shape of the whole sensor, and ``hidden`` the part of scene pixels whose light the field stop
+    blocks.
+    """
 
     factors: Factors
     rows: slice
@@ -78,15 +80,14 @@ class MovedFactors:
     hidden: float = 0.0
 
     def of(self, shots: Capture) -> Capture:
-        """What that part of the sensor saw of ``shots``."""
+        """Return the part of ``shots`` on these rows and columns."""
         return _Part(shots, self)
 
 
 def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
-    """The factors of a surface at ``depth_mm`` from the sensor, from calibrated ``factors``.
+    """Return the factors of a surface at ``depth_mm`` from the sensor.
 
-    ArgumentError for a depth where too little of them is known, MitsimError for a calibration that does not state its
-    parallax.
+    Raises ArgumentError for a depth where too little of them is known, and MitsimError without a stated parallax.
     """
     parallax = parallax_of(factors)
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
@@ -119,7 +120,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 
 
 def parallax_of(factors: Factors) -> Parallax:
-    """How ``factors`` move with depth; MitsimError where their calibration does not state it."""
+    """Return the parallax of ``factors``, or raise MitsimError if their calibration does not state it."""
     parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
         raise MitsimError(
@@ -130,17 +131,10 @@ def parallax_of(factors: Factors) -> Parallax:
 
 
 def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float, float, float]:
-    """Projector pixels that a change of 1/z by 1/mm moves, at the window's first and at its last edge; and what one mm
-    along the sensor takes off.
+    """Return projector pixels of parallax: two for a change of 1/z by 1/mm, one for a step along the sensor by 1 mm.
 
-    Parameters
-    ----------
-    parallax
-        of the calibration.
-    axis
-        0 for rows, 1 for columns.
-    count
-        n, projector pixels along it.
+    The first two are at the window's first and last edge. ``axis`` is 0 for rows and 1 for columns, ``count`` the
+    number of projector pixels along it.
     """
     window, edges = (parallax.row_tan, parallax.row_mm) if axis == 0 else (parallax.column_tan, parallax.column_mm)
     pixel = (window[1] - window[0]) / count
@@ -152,19 +146,16 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class FactorOfDepths:
-    """A calibrated ``factor`` (m, n), the left one (``axis`` 0) or the right one (1), and how it moves with depth."""
+    """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth."""
 
     factor: FloatArray
     parallax: Parallax
     axis: int
 
     def at(self, shift: float | FloatArray) -> tuple[FloatArray, slice]:
-        """The columns of another depth, and the sensor rows where all of them are known.
+        """Return the factor at another depth, and the sensor rows where all of its columns are known.
 
-        Parameters
-        ----------
-        shift
-            1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
+        ``shift`` is 1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
         column = self._source_columns(shift)
         row, within, known = self._sources(column)
@@ -175,13 +166,11 @@ class FactorOfDepths:
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
-        """(n,) part of each column's light that the field stop keeps from the sensor at another depth: 1/z changed by
-        ``shift`` [1/mm]; 0 where the calibration states no stop, or its own window was cut."""
+        """Return the part (n,) of each column's light that the field stop blocks at 1/z changed by ``shift`` [1/mm]."""
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
 
     def noise(self, shift: float) -> float:
-        """Standard deviation of noise in columns at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones:
-        less, as each number is fitted to many."""
+        """Return the noise of columns at 1/z changed by ``shift`` [1/mm], relative to that of the calibrated ones."""
         white = np.random.default_rng(0).standard_normal(self.factor.shape)
         row, within, _ = self._sources(self._source_columns(shift))
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
@@ -205,9 +194,7 @@ class FactorOfDepths:
     # ---- Columns beside the window, and shadows between columns ----
 
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
-        """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
-        projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel. And the
-        sensor rows where that is nothing."""
+        """Return the factor with ``margin`` more columns a side, and the sensor rows where all of them are known."""
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
         row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
@@ -243,18 +230,18 @@ class FactorOfDepths:
 
     @property
     def edges(self) -> FloatArray:
-        """(n,) projector pixels that a change of 1/z by 1/mm moves the light of each."""
+        """Projector pixels (n,) that a change of 1/z by 1/mm moves the light of each pixel."""
         first, last, _ = self._parallax_pixels
         return np.asarray(np.linspace(first, last, 2 * self.factor.shape[1] + 1)[1::2])
 
     @property
     def reach(self) -> float:
-        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees."""
+        """Largest number of projector pixels that a change of 1/z by 1/mm moves what a sensor pixel sees."""
         first, last, by_place = self._parallax_pixels
         return float(max(abs(first), abs(last), by_place * len(self.factor) * self._pitch / 2))
 
     def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """How bright places at each ``column`` and between are, the mask's shadow apart; 1 in the window's middle."""
+        """Return the brightness at each ``column`` without the mask's shadow; 1 in the window's middle."""
         return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
     def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
@@ -324,7 +311,7 @@ def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) ->
 
 
 class DerivedCapture(Capture):
-    """A ``whole`` capture of which something is changed; all else is its own."""
+    """Capture that differs from the ``whole`` capture in one respect."""
 
     def __init__(self, whole: Capture) -> None:
         super().__init__(whole.manifest, whole.folder)
@@ -337,11 +324,11 @@ class DerivedCapture(Capture):
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """What is taken off every frame."""
+        """Ambient frame that is subtracted from every frame."""
         return self.whole.ambient
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """What was measured, of a ``shape`` that is asked for."""
+        """Return the measurements of the whole capture."""
         return self.whole.pattern_measurements(shape)
 
 
@@ -367,16 +354,7 @@ class _Part(DerivedCapture):
 
 
 def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
-    """Change of 1/z [1/mm] that moves the light of dots onto the place of others; inf for other patterns, and where
-    depth moves no light.
-
-    Parameters
-    ----------
-    patterns
-        P_L (n, K) and P_R (n', K').
-    parallax
-        of the calibration.
-    """
+    """Return the change of 1/z [1/mm] that moves the light of dots onto other dots; inf for other patterns."""
     ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
     moves = np.array([max(map(abs, each)) for each in ends])
     if not (moves.any() and all(are_dots(lit) for lit in patterns)):
@@ -386,20 +364,15 @@ def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax)
 
 
 def are_dots(patterns: FloatArray) -> bool:
-    """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
+    """Return True if exactly one of the (n, K) ``patterns`` lights each pixel."""
     values = np.sort(patterns, axis=1)
     return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
 
 
 def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
-    """Projector pixels of parallax by which light moves onto the place of another dot's of the same frame.
+    """Return the parallax in projector pixels that moves light onto another dot of the same frame.
 
-    Parameters
-    ----------
-    moves
-        projector pixels along both axes for one of parallax; 0 of an axis that has none.
-    periods
-        of the dots.
+    ``moves`` are the projector pixels along both axes for a parallax of one, and ``periods`` those of the dots.
     """
     for parallax in np.arange(1.0, np.prod(periods) + 1, STEP / 4):
         turns = moves * parallax / periods
@@ -412,28 +385,18 @@ def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
 
 
 _SPLINE_ROWS = 5
-"""Sensor rows to either side whose numbers a row is given: of 2, 3 and 5 the most leave least, 1.9e-3, 1.7e-3, 1.5e-3
-of columns of 15 um with noise of 2e-3 (a polynomial through their own row: 2.8e-2); more are another shadow behind
-masks with thickness."""
+"""Sensor rows to either side that a row's spline is fitted to: of 2, 3 and 5 the most leave least (1.9e-3, 1.7e-3,
+1.5e-3)."""
 _SPLINE_KNOTS = 4
-"""Knots a column: with 2, columns of 15 um are off by 2.5e-3 with noise of 2e-3 instead of 1.5e-3."""
+"""Knots for each column."""
 _STIFFNESS = 1e-2
-"""Weight of the squared third differences of neighbouring coefficients over that of a number's error: with 1e-3 noise
-of 2e-3 leaves 1.7e-3 instead of 1.5e-3, without noise 1.0e-3 instead of 1.2e-3."""
+"""Weight of squared third differences of coefficients over that of a number's error."""
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 """Third difference of four neighbours."""
 
 
 class ColumnSpline:
-    """A ``factor`` (m, n) at any place between its columns.
-
-    Parameters
-    ----------
-    factor
-        free of what changes from column to column but the shadow.
-    step
-        columns by which the next sensor row sees the shadow moved.
-    """
+    """Spline of a ``factor`` (m, n) between its columns, whose shadow moves by ``step`` columns from row to row."""
 
     def __init__(self, factor: FloatArray, step: float) -> None:
         rows, count = factor.shape
@@ -446,7 +409,7 @@ class ColumnSpline:
         self._coefficients[edges] = self._fit_each(factor[nearest], nearest - edges[:, None])
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-        """Numbers of each ``row`` at each ``column``, from 0 to n - 1, whole or not; the two broadcast."""
+        """Return numbers of each ``row`` at each ``column``, from 0 to n - 1; the two broadcast."""
         start, weights = self._weights(column * _SPLINE_KNOTS)
         first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
@@ -499,14 +462,14 @@ class ColumnSpline:
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """``cells`` more on each side of the projector's window, 1 or more."""
+    """Additional ``cells`` on each side of the projector's window."""
 
     cells: int
 
     def factors(self, factors: Factors) -> MovedFactors:
-        """The ``factors`` with columns of these cells, on the part of the sensor where these are known.
+        """Return ``factors`` with columns of these cells, on the part of the sensor where they are known.
 
-        MitsimError where they do not state their parallax, and for more cells than the window, or the sensor, tells of.
+        Raises MitsimError without a stated parallax, and for more cells than the window or the sensor covers.
         """
         parallax, sides = parallax_of(factors), (factors.left, factors.right)
         if self.cells > (most := min(factor.shape[1] for factor in sides)):
@@ -526,7 +489,7 @@ class Margin:
         return MovedFactors(wider, rows, columns, shape)
 
     def of(self, shots: Capture) -> Capture:
-        """The ``shots`` with patterns that light these cells always; MitsimError for patterns of -1."""
+        """Return ``shots`` with patterns that always light these cells, or raise MitsimError for patterns of -1."""
         if any(shot.sign for shot in shots.manifest.patterns.captures):
             raise MitsimError(
                 f"margin {self.cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what "
@@ -535,7 +498,7 @@ class Margin:
         return _Padded(shots, self.cells)
 
     def inside(self, image: FloatArray) -> FloatArray:
-        """The window's part of an ``image``."""
+        """Return the window's part of an ``image``."""
         return image[self.cells : -self.cells, self.cells : -self.cells]
 
 
@@ -567,22 +530,21 @@ def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
 
 
 _LEAST_EIGENVALUE = 1e-3
-"""Part of a mode that must remain: noise in it is magnified by the root of one over that, thirtyfold, which the mean
-over all frames makes up for."""
+"""Least part of a mode that must remain; noise in the mode is magnified by the root of its inverse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Light that is in all frames alike.
+    """Light that all frames share.
 
     Attributes
     ----------
-    common
-        (m, m') of each frame, in the frames' unit; to be taken off.
-    image
-        (n, n') reflectance that it looks like under uniform light, all of it from lit pixels.
+    common : (m, m') array
+        Light of each frame, in the frames' unit.
+    image : (n, n') array
+        Reflectance that it looks like under uniform light.
     eigenvalues
-        (modes,) part of each mode of it that lit pixels do not explain, smallest first.
+        Part of each mode that lit pixels do not explain, smallest first.
     """
 
     common: FloatArray
@@ -598,24 +560,23 @@ def separate(
     weights: FloatArray,
     total: FloatArray,
 ) -> Separation:
-    """Global light of frames under patterns of 0 and 1.
+    """Return the global light of frames under shifting dots.
 
     Parameters
     ----------
     model
-        the factorised model of these patterns.
-    seen
-        Phi_L (m, n + 2 w) and Phi_R (m', n' + 2 w'): factors with w columns beside the window on either side, as
-        :meth:`mitsim.reconstruct.focus.FactorOfDepths.beyond` makes them, or none.
+        Factorised model of these patterns.
+    seen : (m, n + 2 w) and (m', n' + 2 w') arrays
+        Factors with w columns beside the window on either side (:meth:`FactorOfDepths.beyond`), or w = 0.
     patterns
-        P_L (n, K) and P_R (n', K'), shifting dots.
+        P_L (n, K) and P_R (n', K').
     weights, total
-        W (r, r') and the sum (m, m') of all frames.
+        W (r, r'), and the sum (m, m') of all frames.
 
     Raises
     ------
     MitsimError
-        for patterns under which global light looks like an image: uniform light, +-1, a factor of centred frames.
+        For uniform light, +-1 patterns or centred factors, under which global light looks like an image.
     """
     if model.centre or any((side < 0).any() for side in patterns):
         raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
@@ -646,7 +607,7 @@ def _inside(hats: FloatArray, pixels: int) -> FloatArray:
 
 
 def _hats(pixels: int, period: int) -> FloatArray:
-    """(pixels, J) functions that are linear between J nodes ``period`` apart, the outer ones at the window's ends."""
+    """Return (pixels, J) functions linear between J nodes ``period`` apart, the outer ones at the window's ends."""
     count = max(2, 1 + -(-(pixels - 1) // period))
     place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
     return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))

@@ -56,38 +56,34 @@ from mitsim.reconstruct.shifted_codes import (
 from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
 
 _KNOTS = 4
-"""Of the spline a sensor pixel: a shadow's edge is a pixel wide, and falls on all places between pixels."""
+"""Knots of the spline for each sensor pixel."""
 _STIFFNESS = 1e-3
-"""Weight of squared third differences of the spline's coefficients over that of a number of the factor: it fills what
-no number tells, as where s is whole."""
+"""Weight of squared third differences of the spline's coefficients over that of a number of the factor."""
 _WAY_ERROR = 0.02
-"""Pixels over the whole scene to which the way s n of a shadow is looked for: noise of 2e-3 scatters it by 0.003."""
+"""Tolerance of the shadow's way s n over the whole scene [pixels]."""
 _PASSES, _MOVED = 20, 0.05
-"""Steps of Gauss and Newton at most, and standard errors by which the last one may still move anything."""
+"""Largest number of Gauss-Newton steps, and the last step's largest size in standard errors."""
 _HALVINGS = 8
-"""Times that a step is halved which leaves more of the frames than there was before: to 0.4 % of it."""
+"""Largest number of halvings of a step that increases the misfit."""
 _REACH = 8
-"""Parts of the sensor, of which the shadow is looked for in one to either side: beyond, a mask has come off."""
+"""The shadow is sought within one part in so many of the sensor."""
 _STARTED = 4
-"""Frames by which the shadow is looked for, and which way pictures lie, at most."""
+"""Largest number of frames that start the search."""
 _CLEARER = 1.5
-"""Times what another orientation leaves of the frames that pictures as they are must leave to be refused: up to there
-noise, or a shadow between two pixels, may be the cause."""
+"""Ratio of residuals above which another orientation of the pictures is certain."""
 _MASK = "mask_rows_um", "mask_columns_um", "mask_axis_um"
-"""What `study drift` calls the ways of a mask [um]."""
+"""Names of the mask's displacements in results [um]."""
 
 
 def mend_factors(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, Factors]:
-    """The factors of a calibration, moved until the frames of known pictures fit.
+    """Move the factors of an aged calibration until frames of known pictures fit.
 
     Parameters
     ----------
     captures
-        runs and pictures, which lie as images by that calibration do.
+        Runs and pictures, which lie as images by that calibration do.
     folder
         CAL folder of this camera before its mask, projector or light moved.
-    job
-        clock and progress.
 
     Returns
     -------
@@ -97,8 +93,7 @@ def mend_factors(captures: KnownCaptures, folder: Path, job: Job) -> dict[str, F
     Raises
     ------
     MitsimError
-        for a list with fields that the calibration decides, pictures that lie otherwise, and a calibration of another
-        camera.
+        For fields that the calibration decides, other orientations of pictures, and another camera.
     """
     listed = captures.listed
     for name in ("orientation", "scale", "terms"):
@@ -235,7 +230,7 @@ class _AgedCamera:
         return np.asarray(known.all(axis=1))
 
     def _longer(self, line: str, axis: int) -> FloatArray:
-        """(m, n) pixels further along the sensor that a pixel sees the shadow of a mask at twice the distance."""
+        """Return the displacement (m, n) along the sensor [pixels] of the shadow of a mask at twice the distance."""
         shadow = self._shadows[line][axis]
         rows, count = shadow.factor.shape
         further = shadow.scale * (np.arange(count) - (count - 1) / 2)
@@ -505,7 +500,7 @@ def _aged_status(
 
 
 def moved_in_words(numbers: Mapping[str, Mapping[str, Any]]) -> str:
-    """The ``numbers`` of a mended calibration, in a line."""
+    """Return the ``numbers`` of a mended calibration in a line."""
     return ", ".join(
         f"{name.replace('_um', '').replace('_', ' ')} {each['value']:.4g} +-{each['standard_error']:.2g}"
         + (f" {each['unit']}" if each["unit"] != "1" else "")
@@ -514,7 +509,7 @@ def moved_in_words(numbers: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 _MOST_TRIED = 3
-"""Codes of a side that are tried where the list does not say how many."""
+"""Largest number of codes of a side that is tried."""
 
 
 @check_arguments
@@ -524,31 +519,31 @@ def calibrate_known(
     job: Job | None = None,
     aged: Path | str | None = None,
 ) -> dict[str, Factors]:
-    """A camera's factors by captures of known pictures.
+    """Calibrate a camera by captures of known pictures.
 
     Parameters
     ----------
     listed
-        list of runs and pictures, TOML or JSON; or what :func:`mitsim.devices.knownlist.load_known` says of it.
+        List of runs and pictures, TOML or JSON, or its contents.
     output
-        CAL folder that is written, of several planes a coloured one; None keeps the factors in memory.
+        CAL folder that is written, a coloured one for several planes; None keeps the factors in memory.
     job
-        clock and progress.
+        Clock and progress.
     aged
-        CAL folder of this camera before its mask, projector or light moved: its factors are moved until frames fit.
-        None: factors are made of pictures alone.
+        CAL folder of this camera before its mask, projector or light moved, whose factors are moved until frames fit.
+        None makes factors of the pictures alone.
 
     Returns
     -------
     dict
-        Factors by the runs' planes; "" where runs have none. Flagged where frames hold more than the codes, or factors
-        that moved, explain, or pictures do not tell how they lie.
+        Factors by the runs' planes; "" where runs have none. They are flagged where frames contain more than the model
+        explains, or pictures do not determine their orientation.
 
     Raises
     ------
     MitsimError
-        for a list, a run or a picture that breaks a rule, pictures of another size than the runs' scene or that lie
-        otherwise than images by ``aged``, a calibration of another camera, and an output that cannot be written.
+        For a list, run or picture that breaks a rule or does not fit, another camera, and an output that cannot be
+        written.
     """
     captures = listed if isinstance(listed, KnownCaptures) else load_known(listed)
     job = job or Job()

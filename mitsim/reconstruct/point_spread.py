@@ -1,34 +1,31 @@
-"""Frames, patterns and a measured point spread function in; the image within bounds, and how far it is above its
-minimum, out.
+"""Image within bounds from frames, patterns and a measured point spread function.
 
 A camera whose scene points all cast one light h, each shifted by its place (:mod:`mitsim.reconstruct.convolution`),
-sees Y_i = crop(h * (P_i o X)). Minimised is, over all X within bounds,
+sees Y_i = crop(h * (P_i o X)). Over all X within bounds
 
     P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
 
-**What is solved for.** Under uniform light everything that can put light on the sensor: frames of m pixels and h of k
-have m + k - 1 scene pixels a side. Convolutions on a grid of that size wrap round only where the sensor is not. The
-image is the middle of it, as large as the sensor; what is beside takes up light from outside, as a margin does. Under
-patterns the scene is theirs, and dark beyond.
+is minimised.
 
-**How.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each pass followed by a
-projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, of which the first three
-lie in some hundred low frequencies. A division by |H|^2 + mu takes these out; and a start from the image of frames and
-light at half the size, made the same way, has them right. TV is taken for quadratic where slopes are below a thousandth
-of the peak over a pixel, and in each pass for the quadratic that touches it.
+**Scene.** Under uniform light it is everything that can put light on the sensor: frames of m pixels and h of k have m +
+k - 1 scene pixels a side. The image is the middle of it, as large as the sensor; the rest takes up light from outside.
+Under patterns the scene is theirs, and dark beyond.
 
-**When it ends.** Where the last half of all steps has lowered the objective by no more than ``tolerance`` of itself,
-and the quadratic promised no more of the last pass. What steps have gained is the least that the objective was above
-its minimum before them (Strakos and Tichy, ETNA 13, 2002), so this is no proof; the next bound is.
+**Method.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each followed by a
+projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, so that steps are
+preconditioned by a division by |H|^2 + mu and start from the image at half the size. TV is quadratic where slopes are
+below a thousandth of the peak over a pixel, and in each pass replaced by the quadratic that touches it. The iterations
+end where the last half of all steps has lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy,
+ETNA 13, 2002).
 
-**How far above the minimum.** With r = sum of frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that
-pushes against bounds alone, and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the
-bounds, no farther than R = ||X|| from X,
+**Gap.** With r the frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that pushes against bounds alone,
+and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the bounds, no farther than R = ||X||
+from X,
 
     P(X) - min P <= weight TV(X) - Q . grad X + N . (X - bound) + ||e||^2 / 2 + R |g| - ridge R^2 / 2
 
-with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; and |g|^2 / (2 ridge) in place of the last two terms
-where not. d is a few steps of conjugate gradients on A^T A d = -g.
+with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; otherwise |g|^2 / (2 ridge) replaces the last two
+terms. d is a few steps of conjugate gradients on A^T A d = -g.
 """
 
 from __future__ import annotations
@@ -51,25 +48,24 @@ from mitsim.reconstruct.solvers import Prior
 Array = npt.NDArray[Any]
 
 _MU = 10.0
-"""mu over the mean of |H|^2: of 0.3 to 100 none ends sooner in all cases, on a measured diffuser."""
+"""mu over the mean of |H|^2."""
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
-"""Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
+"""Steps at each of the smaller sizes, and least side of these."""
 _SMOOTH = 1e-3
 """Slope below which TV is quadratic, over the image's largest number."""
 _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
-"""That of the first pass over this, and of each pass over that of the one before. Of none, 10 or 30, and 0.3 or 0.5,
-those that end soonest: with none, large weights take five times as many steps to within 5 %."""
+"""Smoothing slope of the first pass over the final one, and ratio between passes: without it large weights take five
+times as many steps."""
 _PASS, _PASS_UNBOUND = 6, 12
-"""Steps of a pass, with bounds and without: of 1 to 12 those that end soonest. Fewer forget what was found, and more go
-where bounds do not let them."""
+"""Steps of a pass, with bounds and without."""
 _TIGHTENED = 2
-"""Steps of conjugate gradients for the d of a bound: they lower it to a third."""
+"""Steps of conjugate gradients for the d of the gap."""
 _NOTHING = 1e-300
-"""In place of a zero that is divided by."""
+"""Divisor in place of a zero."""
 _FEWEST = 1e-12
-"""Shortest part of a pass that is taken: below it nothing is gained in double precision."""
+"""Shortest part of a pass."""
 _HUGE = 1e30
-"""In place of an infinite bound, where a distance to it is multiplied."""
+"""Inverse of the least distance to a bound."""
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -77,20 +73,20 @@ _HUGE = 1e30
 
 @dataclass(frozen=True, eq=False)
 class ShiftedLight:
-    """A point spread function under patterns.
+    """Camera whose scene points all cast one pattern of light.
 
     Attributes
     ----------
-    psf
-        (k, k') light of one scene pixel, in sensor pixels.
+    psf : (k, k') array
+        Light of one scene pixel, in sensor pixels.
     sensor
-        (m, m') rows and columns of the sensor.
+        Rows and columns (m, m') of the sensor.
     patterns
         P_L (n, K) and P_R (n', K'); None: uniform light of all that reaches the sensor.
     precision
-        of all numbers.
-    seen
-        (m, m') 1 for pixels that count, 0 for those that are held out; None: all count.
+        Type of all numbers.
+    seen : (m, m') array
+        1 for pixels that count, 0 for those that are held out; None: all count.
     """
 
     psf: FloatArray
@@ -157,7 +153,7 @@ class ShiftedLight:
         return rows, columns
 
     def image_of(self, scene: Array) -> Array:
-        """(K K', m, m') frames of a ``scene`` (n, n')."""
+        """Return the frames (K K', m, m') of a ``scene`` (n, n')."""
         frames = np.empty((self.count, *self.sensor), self.precision)
         rows, columns = self._crop
         for frame, light in zip(frames, self._lights, strict=True):
@@ -168,7 +164,7 @@ class ShiftedLight:
         return frames if self.seen is None else frames * self.seen
 
     def correlate(self, frames: Array) -> Array:
-        """Adjoint of :meth:`image_of`: (n, n') of ``frames`` (K K', m, m')."""
+        """Return the adjoint (n, n') of :meth:`image_of` for ``frames`` (K K', m, m')."""
         (rows, columns), total = self.scene, np.zeros(self.scene, self.precision)
         placed = np.zeros((self.sensor[0], self.grid[1]), self.precision)
         for frame, light in zip(frames, self._lights, strict=True):
@@ -181,19 +177,20 @@ class ShiftedLight:
         return total
 
     def half_size(self) -> ShiftedLight | None:
-        """Return the same camera at half the size; None under patterns, with pixels held out, and where that is too
-        small."""
+        """Return the camera at half the size, or None under patterns, with held-out pixels, and if too small."""
         small = min(*self.psf.shape, *self.sensor) // 2 < _LEAST_SIDE
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
     def reduce(self, factor: int) -> ShiftedLight:
-        """Return the same camera with pixels ``factor`` times as large; with 1 itself."""
+        """Return the camera with pixels ``factor`` times as large."""
         rows, columns = (size // factor for size in self.sensor)
         return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
 
     def double(self, smaller: Array) -> Array:
-        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
-        is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
+        """Return the image (n, n') of a ``smaller`` one of :meth:`half_size`, linear between its pixels.
+
+        Pixel p of the smaller image is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one.
+        """
         image = np.zeros(self.scene, self.precision)
         place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
         for axis in (0, 1):
@@ -206,7 +203,7 @@ class ShiftedLight:
 
     @property
     def column_power(self) -> float:
-        """Mean square of what one unit of a scene pixel puts into all frames, but for the crop."""
+        """Mean square of the light of one scene pixel in all frames, without the crop."""
         power = float(np.square(self.psf).sum())
         if self.patterns is None:
             return power
@@ -215,7 +212,7 @@ class ShiftedLight:
 
     @cached_property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of transforms: light that wraps round lands beside the sensor."""
+        """Rows and columns of transforms; light that wraps round lands beside the sensor."""
         sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
         rows, columns = (
             fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
@@ -225,7 +222,7 @@ class ShiftedLight:
 
     @cached_property
     def spectrum(self) -> Array:
-        """Of h, on the grid."""
+        """Spectrum of h on the grid."""
         return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
 
     @property
@@ -252,7 +249,7 @@ class ShiftedLight:
 
 
 def reduce_frame(frame: Array, reduce: int) -> Array:
-    """Means of ``reduce`` x ``reduce`` numbers of a ``frame``; rows and columns that remain are left out."""
+    """Return means of ``reduce`` x ``reduce`` numbers of a ``frame``, without the remaining rows and columns."""
     rows, columns = (size // reduce for size in frame.shape)
     blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
     return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
@@ -301,8 +298,7 @@ class _State:
         return self.light.correlate(self.residual) + self.bend(self.image)
 
     def bend(self, direction: Array) -> Array:
-        """What the second derivative of ridge and TV makes of a ``direction``, with TV for the quadratic that touches
-        it at X; of X itself their gradient."""
+        """Return the second derivative of ridge and the quadratic TV at X, times a ``direction``."""
         bent = self.prior.ridge * direction
         if self.prior.weight:
             down, across = (each * self._stiffness for each in _slopes(direction))
@@ -339,8 +335,7 @@ class _State:
         return np.asarray(1 / total, light.precision)
 
     def divide(self, image: Array) -> Array:
-        """Near what the inverse of the second derivative makes of an ``image`` under uniform light: a division in the
-        Fourier domain."""
+        """Return the approximate inverse of the second derivative times an ``image``, by a Fourier transform."""
         if self.light.patterns is not None:
             return image
         rows, columns = image.shape
@@ -377,7 +372,7 @@ class _State:
         return max(variation, 0.0) + best
 
     def _parts(self, slope: Array) -> tuple[float, Array]:
-        """N . (X - bound) and ``slope`` - N, for an N that makes little of both."""
+        """Return N . (X - bound) and ``slope`` - N, for an N that makes both small."""
         if not self.prior.bounded:
             return 0.0, slope
         reach = max(math.sqrt(_dot(self.image, self.image)), 1 / _HUGE)
@@ -422,21 +417,20 @@ def _dot(first: Array, second: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """An image near the minimum, and how near.
+    """Image near the minimum.
 
     Attributes
     ----------
-    image
-        the whole scene (n, n').
+    image : (n, n') array
+        The whole scene.
     iterations
-        steps at full size.
+        Steps at full size.
     objective
         P of the image.
     fall
-        what the last half of the steps lowered the objective by, or what the last pass promised, if that is more; over
-        the objective.
+        Relative fall of the objective in the last half of the steps, or promised by the last pass if that is more.
     gap
-        most that the objective is above its minimum, over the objective.
+        Bound of the objective's excess over its minimum, over the objective.
     """
 
     image: Array
@@ -447,17 +441,7 @@ class Minimum:
 
 
 def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float) -> Minimum:
-    """The image at which the fall is at most ``tolerance``, or that after ``iterations`` steps.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and what it saw (K K', m, m').
-    prior
-        what is known of scenes.
-    iterations, tolerance
-        most steps at full size, and the fall at which they end.
-    """
+    """Minimise P, until the fall is at most ``tolerance`` or after ``iterations`` steps at full size."""
     state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
     return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
 

@@ -37,42 +37,40 @@ from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
 from mitsim.reconstruct.solvers import Prior
 
 RIDGE, _WEIGHT = 50.0, 1.2
-"""Automatic lambda over the mean square of a scene pixel's light, by a frame's error over its mean; and automatic
-weight of TV in units of the error that the data term's gradient carries to a pixel. Chosen on photographs seen by a
-measured diffuser with noise of 0.1 to 8 %; losses on others: benchmarks/iterative_losses.py."""
+"""Automatic lambda over the mean square of a scene pixel's light, by a frame's relative error; and automatic weight of
+TV in units of the error of the data term's gradient. Chosen on photographs (benchmarks/iterative_losses.py)."""
 _CLEARLY = 2.0
-"""Error by held-out pixels over measured noise above which it counts: pixels without model errors predict best with up
-to 2.2 times the noise, and with less than it where that is large."""
+"""Ratio of the error by held-out pixels to the measured noise above which the model is wrong."""
 _SIDE, _STEPS = 128, 60
-"""Pixels a side below which frames are not reduced, and most steps for held-out pixels; twice as many to compare."""
+"""Least side of reduced frames, and steps for held-out pixels."""
 _BLOCKS, _KEPT = 12, 8
-"""Blocks along the shorter side, of which one in eight is held out: larger than what a model error spreads over."""
+"""Blocks along the shorter side, of which one in eight is held out."""
 _HALVES = range(-16, 7)
-"""Weights that are tried, in half decades."""
+"""Tried weights in half decades."""
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
 _MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
-"""Error of a frame over its mean below which no model of a real camera is trusted; TV's weight in a comparison, in
-units of the error that the data term's gradient carries to a pixel; and the chi-square above which the first weight
-takes away too much of the picture, so that the second one compares."""
+"""Least relative error of a model; TV's two weights in a comparison; and the chi-square above which the second one is
+used.
+"""
 _ALIKE = 0.9
-"""Correlation, wherever it lies, above which light counts as equal to a turned copy, which then says nothing."""
+"""Correlation above which light equals its turned copy."""
 _BETTER, _EQUAL = 0.85, 0.98
-"""Cost of the best turned copy over that of the given light, below which the copy is recommended, and below which the
-light is wrong even if noise explains the frames: right light has 0.995 and more."""
+"""Cost ratio of the best turned copy to the light as given: below the first the copy is recommended, below the second
+the light is wrong even if noise explains the frames."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
-"""Right light has more than the first times chi-square to the power of the second (1.032 and more at a chi-square of
-1.65, 1.13 of 2). Below the last chi-square noise explains the frames, and they decide nothing."""
+"""Least cost ratio of right light: the first times chi-square to the power of the second. Below the last chi-square
+noise explains the frames."""
 _OFF = 1 / 8
-"""Distance from the middle of the picture to the mean of the light, over its side, that is flagged: a dozen lenses are
-off by 0.04 (standard deviation)."""
+"""Flagged distance of the light's mean from the middle of the picture, over its side."""
 _GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
-"""Part of the frames, rms, and chi-square, above which a fit is flagged without any comparison."""
+"""Part of the frames, rms, and chi-square, above which a fit is flagged without a comparison."""
 
 
 def frame_noise(frame: Array) -> float:
-    """Return the standard deviation of a ``frame``'s noise, by the median of its mixed second differences (Immerkaer,
-    Comput. Vis. Image Underst. 64, 1996), which light of a few sharp lines does not move; 0 of fewer than 3 x 3
-    pixels."""
+    """Return the noise of a ``frame`` by the median of its mixed second differences; 0 for fewer than 3 x 3 pixels.
+
+    Light of a few sharp lines does not change that median (Immerkaer, Comput. Vis. Image Underst. 64, 1996).
+    """
     if min(frame.shape) < 3:
         return 0.0
     bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
@@ -96,10 +94,9 @@ def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, in
 
 
 def frame_error(light: ShiftedLight, frames: Array) -> float:
-    """Return the deviation of ``frames`` (K K', m, m') from what ``light`` explains: their noise or, under uniform
-    light, the noise whose ridge predicts held-out pixels best, if that is clearly more.
+    """Return the deviation of ``frames`` (K K', m, m') from the light that a model explains.
 
-    MitsimError for frames without light.
+    This is their noise or, under uniform light, the noise whose ridge predicts held-out pixels best, if clearly more.
     """
     mean = float(frames.mean())
     if mean <= 0:
@@ -131,19 +128,7 @@ def frame_error(light: ShiftedLight, frames: Array) -> float:
 def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
     """Return ``prior`` with an automatic ridge or weight of TV.
 
-    Parameters
-    ----------
-    light, frames
-        the camera, and what it saw (K K', m, m').
-    prior
-        its bounds are kept.
-    kind
-        what is chosen.
-
-    Raises
-    ------
-    MitsimError
-        for frames without light, and for a ridge under other patterns than uniform light.
+    Raises MitsimError for frames without light, and for a ridge under patterns.
     """
     if kind == "weight":
         return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
@@ -157,23 +142,22 @@ def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Lite
 
 @dataclass(frozen=True)
 class PointSpreadFit:
-    """How well frames fit a point spread function.
+    """Fit of frames to a point spread function.
 
     Attributes
     ----------
     chi_square, unexplained
-        energy of what that fit leaves over that of noise, and the part of the frames, rms, beyond noise.
+        Residual energy over that of noise, and residual beyond noise, rms, over the frames.
     stated
-        whether the sensor states its noise; otherwise it is measured from the frames.
+        Whether the sensor states its noise; otherwise it is measured from the frames.
     gain
-        cost of the best turned or mirrored copy over the cost of the light as given: above 1 where that fits better;
-        None where all copies are alike.
+        Cost of the best turned or mirrored copy over the cost of the light as given; None where all copies are alike.
     reading
-        how that copy lies.
+        Orientation of that copy.
     off
-        rows and columns from the middle of its picture to the light's centre.
+        Rows and columns from the middle of the picture to the light's centre.
     size
-        rows and columns of the picture.
+        Rows and columns of the picture.
     """
 
     chi_square: float
@@ -186,7 +170,7 @@ class PointSpreadFit:
 
     @property
     def fault(self) -> tuple[str, str]:
-        """Sentence and remedy; empty where nothing is wrong."""
+        """Sentence and remedy; empty for a good fit."""
         left = (
             f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
         )
@@ -209,7 +193,7 @@ class PointSpreadFit:
 
     @property
     def gist(self) -> str:
-        """The misfit in a few words."""
+        """Misfit in a few words."""
         return f"{self.unexplained:.1%} unexplained"
 
     def __str__(self) -> str:
@@ -218,7 +202,7 @@ class PointSpreadFit:
         return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
 
     def summary(self) -> dict[str, Any]:
-        """Return what result.json and the command line's JSON say of the misfit."""
+        """Return the misfit's entries of result.json."""
         sentence, _ = self.fault
         return {
             "chi_square": self.chi_square,
@@ -241,15 +225,7 @@ class PointSpreadFit:
 
 
 def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
-    """Return how well ``frames`` fit ``light``, whatever the weight of their image.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and what it saw (K K', m, m').
-    variance
-        mean noise variance of the frames; None: it is not stated, and measured.
-    """
+    """Return the fit of ``frames`` to ``light``; ``variance`` is their mean noise variance, None if not stated."""
     small, seen, factor = _shrink(light, frames)
     noise = max(_noise_variance(seen) if variance is None else variance / factor**2, 1e-300)
     error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
@@ -287,7 +263,7 @@ def _likeness(first: FloatArray, second: FloatArray) -> float:
 
 
 _NUMBERS = 24
-"""Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
+"""Single-precision numbers in memory for each of a grid and of all frames."""
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -302,28 +278,18 @@ def solve_point_spread(
     iterations: int = 300,
     tolerance: float = 0.02,
 ) -> Solution:
-    """The image of all frames.
+    """Return the image of all frames (K K', m, m').
 
     Parameters
     ----------
-    light
-        the camera under its patterns.
-    frames
-        (K K', m, m') row-major over patterns (i, j).
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`mitsim.reconstruct.point_spread_image.automatic_prior`.
+        Lambda, or the weight of ``tv``; "auto": :func:`automatic_prior`.
     bounds
-        least and largest number; None: any of ``tikhonov``, 0 and inf of the others, as light is.
+        Least and largest number; None: any for ``tikhonov``, otherwise 0 and inf.
     iterations, tolerance
-        it ends where the last half of its steps lowered the objective by at most ``tolerance`` of itself, or after so
-        many steps.
-
-    Raises
-    ------
-    MitsimError
-        for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
+        See :func:`mitsim.reconstruct.point_spread.minimise`.
     """
     light.check_frames(frames)
     if iterations < 1:
@@ -372,32 +338,31 @@ def reconstruct_psf(
     """Recover the image of a camera whose scene points all cast one pattern of light, each shifted by its place.
 
     One scene pixel shifts it by one pixel of the frames. Under uniform light the image is as large as the sensor, and
-    what lies beside is solved for too; under patterns it is theirs (:mod:`mitsim.reconstruct.point_spread`).
+    under patterns as large as these.
 
     Parameters
     ----------
     shots
-        in memory, or of :func:`mitsim.core.runs.load_run`.
+        Capture in memory, or of :func:`mitsim.core.runs.load_run`.
     psf
-        (k, k') light of a scene pixel, or a picture of it as :func:`mitsim.devices.mask_profile.load_psf` takes it, of
-        the same pixels as the frames.
+        Light (k, k') of a scene pixel, or a picture of it (:func:`mitsim.devices.mask_profile.load_psf`), of the same
+        pixels as the frames.
     reduce
-        pixels a side, of frames and of the picture, that become one.
+        Pixels a side, of frames and of the picture, that become one.
     lam
-        lambda >= 0 in the unit of the point spread function squared, for ``tv`` the weight of the total variation;
-        ``auto`` chooses it from the frames.
+        Lambda >= 0 in the unit of the point spread function squared, for ``tv`` the weight of the total variation;
+        "auto" chooses it from the frames.
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     bounds
-        least and largest number of the image [electrons/s], by ``nonnegative`` and ``tv``; None: 0 and inf.
+        Least and largest number of the image [electrons/s], for ``nonnegative`` and ``tv``; None: 0 and inf.
     iterations
-        most steps, by ``nonnegative`` and ``tv``; None: 300.
+        Largest number of steps, for ``nonnegative`` and ``tv``; None: 300.
 
     Raises
     ------
     MitsimError
-        for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
-        than is free, and another lambda, method or bounds.
+        For a picture without light, frames that do not fit, too little memory, and another lambda, method or bounds.
     """
     return reconstruct_psf_request(shots, psf, reduce, ImageRequest(lam, method, bounds=bounds, iterations=iterations))
 
@@ -406,15 +371,7 @@ def reconstruct_psf(
 def reconstruct_psf_request(
     shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
-    """The image that a request asks for, as :func:`reconstruct_psf`.
-
-    Parameters
-    ----------
-    shots, psf, reduce, request
-        as there.
-    job
-        of whose work it is a part.
-    """
+    """Recover the image of a request, see :func:`reconstruct_psf`."""
     request.check_point_spread(reduce)
     clock = (job or Job()).apart("").clock
     with clock.stage("read"):
@@ -448,15 +405,7 @@ def reconstruct_psf_request(
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    """What decides an image.
-
-    Parameters
-    ----------
-    shots, psf
-        whose fingerprints count, (k, k') of the second.
-    reduce, request
-        as for :func:`reconstruct_psf_request`.
-    """
+    """Return what decides an image: fingerprints of the ``shots`` and of the ``psf``, and the request."""
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {
         "run": shots.fingerprint,

@@ -1,4 +1,4 @@
-"""How an image is asked for in; a refusal, or what it takes, out, before the solver is imported."""
+"""Request for an image, its checks, and its predicted cost, without importing the solver."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
-"""Of solving: names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
+"""Names of :data:`mitsim.reconstruct.solvers.SOLVERS`."""
 MODEL = ".pt"
-"""Ending of a trained network's file, which may stand for the name of a method."""
+"""Ending of a trained network's file, which may replace the name of a method."""
 MOST_REDUCED = 1024
-"""Pixels a side that become one at most: those of a camera file's ``psf_reduce``."""
+"""Largest number of pixels a side that become one, as for ``psf_reduce``."""
 _MOST = 1e100
-"""Largest number of a request: far beyond any lambda, depth or reflectance, and its square is finite."""
+"""Largest number of a request, whose square is finite."""
 Bounds = tuple[float, float]
 """Least and largest number of an image; -inf and inf: any."""
 IMAGE_FILE, PICTURE_FILE, RESULT_FILE = "image.exr", "image.png", "result.json"
-"""Files of an image: its numbers, what people look at, and what is stated of it."""
+"""Files of an image."""
 
 
 def holds_image(folder: Path) -> bool:
@@ -35,29 +35,28 @@ def holds_image(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """How an image is asked for. ArgumentError for what no image is made by.
+    """Request for an image; ArgumentError for a combination that no image is made by.
 
     Attributes
     ----------
     lam
-        lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
-        from the data.
+        Lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; "auto" chooses it from
+        the data.
     method
-        one of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network, which has no
+        One of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network, which has no
         lambda.
     focus
-        depth of the scene [mm]; ``auto``: that which leaves least of the measurements unexplained; ``map``: one for
-        each projector pixel; None: the calibrated one.
-    margin
-        cells round the projector's window that are solved for too, and left out of the image.
-    depth_range
-        nearest and farthest depth [mm] that ``auto`` and ``map`` look for; None: a quarter of 1/z either way of the
+        Depth of the scene [mm]; "auto": that of the least misfit; "map": one for each projector pixel; None: the
         calibrated one.
+    margin
+        Cells round the projector's window that are solved for too, and left out of the image.
+    depth_range
+        Nearest and farthest depth [mm] for "auto" and "map"; None: a quarter of 1/z either way of the calibrated one.
     bounds
-        least and largest number of the image, by ``nonnegative`` and ``tv``; None: 0 and inf of ``nonnegative``, any of
-        ``tv``, by a point spread function 0 and inf of both.
+        Least and largest number of the image, for ``nonnegative`` and ``tv``; None: 0 and inf for ``nonnegative`` and
+        by a point spread function, any for ``tv``.
     iterations
-        most steps, by ``nonnegative`` and ``tv``; None: the method's own.
+        Largest number of steps, for ``nonnegative`` and ``tv``; None: the method's own.
     """
 
     lam: float | Literal["auto"] = "auto"
@@ -121,18 +120,18 @@ class ImageRequest:
 
     @property
     def iterative(self) -> dict[str, Any]:
-        """Those of ``bounds`` and ``iterations`` that are given, as methods by iterations take them."""
+        """Given options of ``bounds`` and ``iterations``."""
         given = {"bounds": self.bounds, "iterations": self.iterations}
         return {name: value for name, value in given.items() if value is not None}
 
     @property
     def plain(self) -> dict[str, Any]:
-        """What of an image's inputs JSON holds for these."""
+        """Entries of :attr:`iterative` for JSON."""
         return {**self.iterative, **({} if self.bounds is None else {"bounds": plain_bounds(self.bounds)})}
 
     @property
     def name(self) -> str:
-        """The method's."""
+        """Method name."""
         return str(self.method if isinstance(self.method, str) else self.method.name)
 
     @property
@@ -141,8 +140,7 @@ class ImageRequest:
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
-        """ArgumentError for what no image by a point spread function is made by, or where not ``reduce`` x ``reduce``
-        pixels, a whole number of them, can become one."""
+        """Raise ArgumentError for options that no image by a point spread function is made by."""
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
         for name, neutral in (("focus", None), ("margin", 0)):
@@ -157,7 +155,7 @@ class ImageRequest:
             )
 
     def inputs(self, shots: Capture, factors: Factors) -> dict[str, Any]:
-        """What decides an image: this, and fingerprints of its ``shots`` and ``factors``."""
+        """Return what decides an image: the request, and fingerprints of its ``shots`` and ``factors``."""
         asked: dict[str, Any] = {
             "run": shots.fingerprint,
             "calibration": factors.fingerprint,
@@ -171,12 +169,12 @@ class ImageRequest:
 
 
 def plain_bounds(bounds: Bounds) -> list[float | None]:
-    """``bounds`` as JSON holds them: None for an end that is infinite."""
+    """Return ``bounds`` for JSON, with None for an infinite end."""
     return [end if math.isfinite(end) else None for end in bounds]
 
 
 def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
-    """The ``parallax`` that a ``calibration`` states; MitsimError where it states none."""
+    """Return the ``parallax`` of a ``calibration``, or raise MitsimError if it states none."""
     if parallax is None:
         raise MitsimError(
             f"calibration {calibration}: does not state its parallax, which focus and margin need; calibrate again, or "
@@ -186,7 +184,7 @@ def check_parallax(parallax: Parallax | None, calibration: str) -> Parallax:
 
 
 def check_joint(lam: float | str) -> None:
-    """ArgumentError for a lambda ``lam`` that runs behind colour filters are not solved with."""
+    """Raise ArgumentError for a lambda that runs behind colour filters are not solved with."""
     if lam != "auto" and (isinstance(lam, str) or not 0 < lam <= _MOST):
         raise ArgumentError("lam", f"{short_text(lam)}: behind colour filters give a finite number above 0, or auto")
 
@@ -194,34 +192,33 @@ def check_joint(lam: float | str) -> None:
 # ---- What a Tikhonov image takes -------------------------------------------------------------------------------------
 
 KEPT_NUMBERS = 1 << 24
-"""Pixels of all measurements up to which they are kept for a second look: 64 of 512 x 512, at most 256 MiB."""
+"""Largest number of pixels of all measurements that are kept for a second pass: 64 frames of 512 x 512."""
 BYTES_A_NUMBER = 32.0
-"""Memory for each number of the factors' slabs: itself, and the copies that factorising makes."""
+"""Memory for each number of the factors' slabs, with the copies of the factorisation."""
 _FRAMES, _KEPT = 16.0, 2.0
-"""Frames in double precision that are held at once: one as it is read (its file, channels, numbers, rates), its
-residual and squares, and sums that tell causes; and of each measurement that is kept."""
+"""Frames in double precision that are in memory at once, and for each kept measurement."""
 _BASE_BYTES = 1e8
-"""What the solver's libraries take, and the tables of uncertainty."""
+"""Memory of the solver's libraries, and of the tables of uncertainty."""
 _READ_S, _ADD_S, _JUDGE_S = 3.5e-8, 1.5e-8, 2e-8
-"""A pixel of a frame, on one processor: read and checked, added up, and held against the model."""
+"""Seconds for a pixel of a frame: reading, adding, and comparing with the model."""
 _SHOT_S = 4e-3
-"""A shot of any size."""
+"""Seconds for a shot of any size."""
 _PRODUCT_S = 6e-10
-"""A multiplication of an SVD, of which one of (m, c) takes m c^2: dozens."""
+"""Seconds for a multiplication of an SVD, which needs m c^2 of them for (m, c)."""
 _PLAIN_S = 0.05
-"""Of any image of few pixels."""
+"""Seconds for an image of few pixels."""
 
 
 @dataclass(frozen=True)
 class ImageCost:
-    """What an image takes: ``seconds`` by stage as it will state them, and ``memory_bytes`` at most."""
+    """Predicted seconds by stage, and largest memory."""
 
     seconds: dict[str, float]
     memory_bytes: float
 
 
 def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
-    """What the Tikhonov image of ``shots`` by ``factors`` takes, at the calibrated depth."""
+    """Return the cost of the Tikhonov image of ``shots`` by ``factors`` at the calibrated depth."""
     pixels = float(len(factors.left) * len(factors.right))
     count, (left, right) = len(shots.manifest.patterns.captures), shots.patterns
     measured = left.shape[1] * right.shape[1]
@@ -241,22 +238,13 @@ def predict_cost(shots: Capture, factors: Factors) -> ImageCost:
 
 
 def keeps_frames(shots: Capture, factors: Factors) -> bool:
-    """Whether the measurements of ``shots`` are so few numbers that they are not read twice; ``factors`` tell the
-    sensor's pixels."""
+    """Return True if the measurements of ``shots`` are so few numbers that they are kept."""
     left, right = shots.patterns
     return bool(left.shape[1] * right.shape[1] * len(factors.left) * len(factors.right) <= KEPT_NUMBERS)
 
 
 def slab_numbers(shots: Capture, factors: Factors, whole: bool = False) -> float:
-    """Numbers of the factors and of all slabs that they are factorised into.
-
-    Parameters
-    ----------
-    shots, factors
-        the patterns, and the camera.
-    whole
-        whether every pattern's slab has all coefficients, not those of the pixels that it lights alone.
-    """
+    """Return the number of numbers in factors and slabs; ``whole`` slabs have all coefficients."""
     sides = zip((factors.left, factors.right), shots.patterns, strict=True)
     return float(
         sum(

@@ -46,20 +46,20 @@ from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """A frame and the light that it is of.
+    """Frame and the light that it shows.
 
     Attributes
     ----------
-    scene
-        (n, n') picture, times its pattern.
-    frame
-        (m, m') measurement [electrons/s], centred where the camera's factors are.
+    scene : (n, n') array
+        Picture times its pattern.
+    frame : (m, m') array, electrons/s
+        Measurement, centred where the camera's factors are.
     group
-        picture that it is of: frames of one picture are held out together.
+        Picture number; frames of one picture are held out together.
     plane
-        name of the sensor's plane; planes have gains of their own.
+        Name of the sensor's plane; planes have gains of their own.
     offset
-        of the plane's pixels, down and to the right, 0 to below 1 [pixels].
+        Offset of the plane's pixels, down and to the right, 0 to below 1 pixel.
     """
 
     scene: FloatArray
@@ -69,7 +69,7 @@ class Exposure:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def turn_scene(self, orientation: str) -> Exposure:
-        """The same with its scene as it lies in an ``orientation``."""
+        """Return the exposure with its scene in another ``orientation``."""
         return replace(self, scene=TURNS[orientation](self.scene))
 
 
@@ -83,22 +83,12 @@ TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "transposed, upside down": lambda scene: scene.T[::-1],
     "transposed, turned": lambda scene: scene.T[::-1, ::-1],
 }
-"""How a picture lies as the camera's code runs, by the orientations of a list."""
+"""Orientations of a picture relative to the camera's code."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What is fixed while codes are fitted.
-
-    Attributes
-    ----------
-    scales
-        s of rows and of columns [sensor pixels / scene pixel].
-    terms
-        number of codes a side.
-    centre
-        whether factors lose their columns' means, as frames do.
-    """
+    """Fixed quantities of a fit: ``scales`` s of both sides [sensor pixels / scene pixel], codes a side, centring."""
 
     scales: tuple[float, float]
     terms: int = 1
@@ -110,8 +100,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, ``terms``, and whether
-    it loses the means of its columns."""
+    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred."""
 
     sensor: int
     scene: int
@@ -121,24 +110,24 @@ class Side:
 
     @property
     def width(self) -> int:
-        """Of the window of the code that one sensor pixel sees."""
+        """Length of the window of the code that one sensor pixel sees."""
         return int(np.floor(self.scale * (self.scene - 1))) + 3
 
     @property
     def length(self) -> int:
-        """Of the code."""
+        """Length of the code."""
         return self.sensor + self.width - 1
 
     @cached_property
     def weights(self) -> FloatArray:
-        """(terms, n) b_k, of mean square 1."""
+        """Polynomials b_k (terms, n) of mean square 1."""
         place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
         return np.stack(
             [np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)]
         )
 
     def hats(self, offset: float) -> FloatArray:
-        """(n, width) what each scene pixel takes of its window, by linear interpolation, at an ``offset``."""
+        """Return the linear interpolation (n, width) of each scene pixel in its window, at an ``offset``."""
         place = offset + self.scale * np.arange(self.scene)
         first = np.floor(place).astype(int)
         found = np.zeros((self.scene, self.width))
@@ -148,21 +137,16 @@ class Side:
         return found
 
     def factor(self, codes: FloatArray, offset: float) -> FloatArray:
-        """Phi (m, n) of ``codes`` (terms, length), for pixels at an ``offset``."""
+        """Return Phi (m, n) of ``codes`` (terms, length) for pixels at an ``offset``."""
         hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
         for code, weight in zip(codes, self.weights, strict=True):
             phi += (sliding_window_view(code, self.width) @ hats.T) * weight
         return centre_columns(phi) if self.centre else phi
 
     def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix (terms length, terms length) and right-hand side of the codes.
+        """Return normal matrix and right-hand side of the codes.
 
-        Parameters
-        ----------
-        offset
-            of the frames.
-        gram, product
-            (n, n) sum of Z Z^T, and (m, n) sum of Y Z^T, both over the noise's variance.
+        ``gram`` (n, n) and ``product`` (m, n) are the sums of Z Z^T and Y Z^T over the noise's variance.
         """
         hats, w, k = self.hats(offset), self.width, self.terms
         spread = (self.weights[:, :, None] * hats[None]).transpose(1, 0, 2).reshape(self.scene, k * w)
@@ -187,26 +171,26 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Codes:
-    """Codes that were fitted.
+    """Fitted codes.
 
     Attributes
     ----------
     sides
-        geometry of rows and of columns.
-    codes
-        (terms, length) of either.
+        Geometry of rows and of columns.
+    codes : (terms, length) arrays
+        Codes of either side.
     gains
-        of each plane.
+        Gain of each plane.
     variances
-        (exposures,) mean square of what is left of each frame.
+        Mean square of what is left of each frame.
     explained
-        mean over the frames of the part of their energy that the fit explains.
+        Mean explained part of the frames' energy.
     errors
-        standard deviation of a number of the left and of the right factor, rms, what no frame tells included; gains 1.
+        Standard deviation of a number of each factor, rms, at gains of 1, undetermined numbers included.
     seen_errors
-        that of independent errors that change frames of these scenes as much as the factors' do.
+        Independent errors that change frames of these scenes as much as the factors' errors do.
     told
-        numbers of each side's codes that the frames tell.
+        Numbers of each side's codes that the frames determine.
     """
 
     sides: tuple[Side, Side]
@@ -219,7 +203,7 @@ class Codes:
     told: tuple[float, float]
 
     def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
-        """Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
+        """Return Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
         gain = self.gains[plane]
         left, right = (
             side.factor(codes, place) * np.sqrt(abs(gain))
@@ -229,14 +213,13 @@ class Codes:
 
     @property
     def evidence(self) -> float:
-        """Log-likelihood of the frames less that of as many numbers as they tell (Schwarz 1978): codes that are long
-        because the scale is large explain more, whatever the frames are of."""
+        """Log-likelihood of the frames, less the penalty of the determined numbers (Schwarz 1978)."""
         size = self.sides[0].sensor * self.sides[1].sensor
         likelihood = -0.5 * size * float(np.log(self.variances).sum())
         return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
 
     def explains(self, exposures: Sequence[Exposure]) -> float:
-        """Mean part of the energy of ``exposures`` that the codes, fitted to others, explain."""
+        """Return the mean part of the energy of other ``exposures`` that the codes explain."""
         parts = []
         for each in exposures:
             left, right = self.factors(each.offset, each.plane)
@@ -246,33 +229,28 @@ class Codes:
 
 
 _TURNS, _STILL = 20, 1e-5
-"""Times that the sides take turns at most, and gain of the explained part at which they have ended: frames of no more
-than a million numbers tell no smaller one."""
+"""Largest number of turns, and the gain of the explained part that ends them."""
 _VAGUE = 1e-3
-"""First guess of alpha, over the mean of N's diagonal; a few turns find the right one from there."""
+"""First guess of alpha, over the mean of N's diagonal."""
 
 
 @single_threaded_blas()
 def fit_codes(
     exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
 ) -> Codes:
-    """Codes of both sides.
+    """Fit the codes of both sides to ``exposures`` whose scenes lie as the code runs.
 
     Parameters
     ----------
-    exposures
-        scenes turned as the code runs.
-    shape
-        what is fixed.
     start
-        (any,) code of columns to begin with; None: that of the spectra.
+        Code of columns to begin with; None: that of the spectra.
     turns
-        that sides take at most.
+        Largest number of turns of both sides.
 
     Raises
     ------
     MitsimError
-        for frames or scenes without light.
+        For frames or scenes without light.
     """
     sides = _sides(exposures, shape)
     first = spectral_start(exposures, shape.scales)[1] if start is None else start
@@ -369,8 +347,7 @@ def _solve_side(
 
 
 _SMALLEST, _LARGEST = 1e-9, 1e6
-"""Of alpha over the mean of N's diagonal: below, double precision does not tell N + alpha from N; beyond, codes are as
-good as zero."""
+"""Limits of alpha over the mean of N's diagonal."""
 
 
 def _levels(
@@ -408,32 +385,21 @@ def _spread(side: Side, covariance: FloatArray) -> float:
 # ---- The start: orientation, scale and codes by spectra ----
 
 _FREQUENCIES = 20
-"""Of either sign, lowest first, whose spectra are compared: most light of a picture is there."""
+"""Frequencies of either sign, lowest first, whose spectra are compared."""
 _COMPARED = 2
-"""Frames of those given whose spectra are compared."""
+"""Frames whose spectra are compared."""
 _STEP = 1.1
-"""Of the scales that are looked at: what shifts the finest of these waves by half its length, where a shadow moves by a
-sixth of the sensor over the scene."""
+"""Ratio of neighbouring tried scales."""
 _WIDEST, _NARROWEST = 1.0, 0.03
-"""Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
-for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
+"""Limits of the shadow's way over the whole scene, over the length of the sensor."""
 _FIRST_TURNS, _SCALE_TURNS = 2, 3
-"""Turns of the sides that tell which orientation is right, and which scale."""
+"""Turns that decide the orientation, and the scale."""
 _CERTAIN = 1.2
-"""Times what the right orientation leaves of the frames that another must leave, or pictures do not tell it."""
+"""Least ratio of what another orientation and the right one leave of the frames."""
 
 
 def spectral_start(exposures: Sequence[Exposure], scales: tuple[float, float]) -> tuple[float, FloatArray]:
-    """How nearly a product of two vectors the frames' spectra over the scenes' are, 0 to 1, and the code of columns
-    that follows (length,).
-
-    Parameters
-    ----------
-    exposures
-        scenes turned as they may lie.
-    scales
-        that may be right [sensor pixels / scene pixel].
-    """
+    """Return how nearly the spectra are a product of two vectors, 0 to 1, and the resulting code of columns."""
     some = exposures[:: -(-len(exposures) // _COMPARED)]
     return _Spectra.of(some).compare([each.scene for each in some], scales)
 
@@ -445,7 +411,7 @@ class _Spectra:
 
     @classmethod
     def of(cls, exposures: Sequence[Exposure]) -> _Spectra:
-        """Those of all ``exposures``. Periods leave room for a shadow that moves by half the sensor."""
+        """Return spectra of ``exposures``, with periods that leave room for a shadow that moves by half the sensor."""
         rows, columns = exposures[0].frame.shape
         periods = 1.5 * rows, 1.5 * columns
         waves = [_waves(count, period) for count, period in zip((rows, columns), periods, strict=True)]
@@ -476,18 +442,18 @@ def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class Pose:
-    """How scenes lie before the camera.
+    """Orientation and scale of scenes before the camera.
 
     Attributes
     ----------
     orientation
-        one of :data:`TURNS`.
+        One of :data:`TURNS`.
     scales
-        of rows and of columns [sensor pixels / scene pixel].
+        Scales of rows and of columns [sensor pixels / scene pixel].
     margin
-        by how much more of the frames' energy this explains than the best of another orientation; None: not compared.
+        Explained part of the energy beyond that of the best other orientation; None: not compared.
     certain
-        whether that is clear.
+        Whether that is clear.
     """
 
     orientation: str
@@ -502,15 +468,7 @@ def find_pose(
     orientation: str | None = None,
     scales: tuple[float, float] | None = None,
 ) -> Pose:
-    """How scenes lie, by spectra and then by codes that are fitted, both of centred frames: even light tells nothing.
-
-    Parameters
-    ----------
-    exposures
-        scenes as they are given.
-    orientation, scales
-        where they are known.
-    """
+    """Find the pose of scenes by spectra, and then by codes that are fitted to centred frames."""
     exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
     some = exposures[:: -(-len(exposures) // _COMPARED)]
     spectra = _Spectra.of(some)
@@ -559,8 +517,7 @@ def _unlike(spectra: _Spectra, scenes: Sequence[FloatArray], scales: tuple[float
 
 
 _FINE, _STEPS = 1.03, 10
-"""Part of a scale by which codes that are fitted may change it at once, a third of the spectra's step; how often, at
-most."""
+"""Ratio by which a fit may change a scale at once, and the number of changes."""
 
 
 def _refine(
@@ -579,47 +536,25 @@ def _refine(
 
 
 _TOLERANCE = 0.05
-"""Of a search for a scale, of its reach: 7e-4 of the scale, a tenth of a pixel of a shadow's way of 150."""
+"""Tolerance of a search for a scale, relative to its reach."""
 
 
 # ---- How many codes: by frames that are held out ----
 
 _GAIN = 0.02
-"""Of what was left of frames that were held out, that more codes must explain: less is within what two halves of the
-frames differ by."""
+"""Part of the residual of held-out frames that more codes must explain."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How many codes a side has, and how well they explain frames that were not fitted.
-
-    Attributes
-    ----------
-    terms
-        that were chosen.
-    held_out
-        mean part of the energy of held-out frames that each number of terms explained, from one on; empty where no
-        frame could be held out.
-    """
+    """Number of codes, and the explained part of held-out frames for each tried number, from one on."""
 
     terms: int
     held_out: tuple[float, ...] = ()
 
 
 def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choice:
-    """The number of codes, of at most ``most``.
-
-    Pictures are held out in two halves, of a single one its frames: their noise at least is not that of the others.
-
-    Parameters
-    ----------
-    exposures
-        scenes turned as the code runs.
-    shape
-        what is fixed; of one term.
-    most
-        terms that are tried.
-    """
+    """Choose the number of codes, at most ``most``, by holding out half of the pictures, or of the frames."""
     groups = sorted({each.group for each in exposures})
     if len(groups) > 1:
         halves = [{group: index % 2 for index, group in enumerate(groups)}[each.group] for each in exposures]
@@ -653,29 +588,22 @@ _REFLECTANCE = "reflectance"
 
 
 class KnownFrames:
-    """All frames of a list, and what they are of.
-
-    Parameters
-    ----------
-    captures
-        the list, its runs and pictures; :meth:`of` reads them.
+    """Frames, scenes and noise of a list of captures.
 
     Attributes
     ----------
-    exposures
-        frames and scenes.
     noises
-        (exposures,) noise variance of a number of each frame by the sensor that its run states; NaN where it does not.
+        Noise variance of a number of each frame, NaN where the run does not state its sensor.
     saturated
-        names of runs with readings at the full well or the ADC's end.
+        Names of runs with saturated readings.
     frames
-        shots that were read.
+        Number of shots.
     sums
         SHA-256 of pictures and of the runs' manifests.
     prepared
-        what the import did to files before they were frames.
+        Preparation of the files at import.
     places
-        of the planes of a colour sensor in its cell, down and to the right, in pixels of a plane.
+        Offsets of the planes of a colour sensor [pixels of a plane].
     """
 
     def __init__(self, captures: KnownCaptures) -> None:
@@ -689,8 +617,7 @@ class KnownFrames:
 
     @classmethod
     def of(cls, captures: KnownCaptures, aged: Mapping[str, Factors] | None = None) -> KnownFrames:
-        """Those of all ``captures``; MitsimError for files that cannot be read, pictures of another size, and runs of
-        another camera than ``aged`` factors."""
+        """Read all ``captures``, which must be of the camera of ``aged`` factors where these are given."""
         read = cls(captures)
         for number, capture in enumerate(captures.listed.known):
             picture = _picture(captures, capture)
@@ -738,26 +665,16 @@ class KnownFrames:
             self.saturated.append(str(Path(capture.run) / line))
 
     def noise(self, number: int, misfit: FloatArray) -> float:
-        """Variance of noise in the exposure of a ``number``: what its sensor states; where it does not, what second
-        differences of the ``misfit`` tell along rows and columns at once, in which there is hardly any scene."""
+        """Return the stated noise variance of an exposure, or estimate it from second differences of the ``misfit``."""
         if np.isfinite(self.noises[number]):
             return self.noises[number]
         guess = float(np.mean(np.square(np.diff(np.diff(misfit, 2, 0), 2, 1)))) / _OF_DIFFERENCES**2
         return guess / _differences_of_turned(misfit.shape, self.prepared)
 
     def misfit(self, models: Iterable[tuple[FloatArray, float]]) -> tuple[float, float, float]:
-        """What models of all frames leave of them, centred: even light is explained whatever picture is named.
+        """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise.
 
-        Parameters
-        ----------
-        models
-            frame by frame, with the variance of its numbers by errors that it is known to have.
-
-        Returns
-        -------
-        float, float, float
-            part of the energy that is explained; part, rms, that neither models nor noise explain; mean of misfit over
-            noise.
+        ``models`` are the centred frames, each with the variance of its known errors.
         """
         excess = energy = total = 0.0
         ratios = []
@@ -772,7 +689,7 @@ class KnownFrames:
         return 1 - total / energy, float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
 
     def warnings(self) -> Iterator[str]:
-        """That runs are saturated, if any is."""
+        """Return a warning if runs are saturated."""
         if self.saturated:
             yield (
                 f"saturation: {len(self.saturated)} runs have readings at the full well or the ADC's end, first "
@@ -781,15 +698,14 @@ class KnownFrames:
 
 
 _OF_DIFFERENCES = 6
-"""Squares of 1, -2, 1 added up: variance of second differences of white noise over its own."""
+"""Variance of second differences of white noise over that of the noise."""
 
 
 def _differences_of_turned(shape: tuple[int, ...], how: Preparation) -> float:
-    """Noise that second differences along rows and columns tell, over that which is there, in a frame of a ``shape``
-    that was turned by bilinear interpolation: 4/9 where all places between pixels occur, 1 where none was turned.
+    """Return the noise that second differences show over the true noise, after turning by bilinear interpolation.
 
-    A pixel that is r of one neighbour and 1 - r of the other has r^2 + (1 - r)^2 of the noise, and its second
-    differences, as of (r, 1 - 3 r, 3 r - 2, 1 - r), less.
+    A pixel that is r of one neighbour and 1 - r of the other has r^2 + (1 - r)^2 of the noise. Its second differences,
+    as of (r, 1 - 3 r, 3 r - 2, 1 - r), have less.
     """
     angle, crop = np.radians(how.turn_deg), how.crop or Crop()
     pivot = (np.array(shape) - 1) / 2 if how.turn_about == "centre" else np.array([-crop.row, -crop.column])
@@ -803,14 +719,7 @@ def _differences_of_turned(shape: tuple[int, ...], how: Preparation) -> float:
 
 
 def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
-    """Place of each plane of a mosaic in its cell, down and to the right, in pixels of a plane, as frames that were
-    prepared so show it.
-
-    Parameters
-    ----------
-    how
-        what was done to the frames.
-    """
+    """Return the offset of each plane of a mosaic in frames of a preparation ``how`` [pixels of a plane]."""
     cell = np.empty((2, 2), dtype=object)
     for name, place in planes_of(how.mosaic or BGGR).items():
         cell[place] = name
@@ -819,7 +728,7 @@ def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
 
 
 _COPIES = 4
-"""Of all frames that are held at a time: as read, as they are compared, and what a model and its misfit take."""
+"""Copies of all frames that are in memory at a time."""
 
 
 def _picture(captures: KnownCaptures, capture: KnownCapture) -> FloatArray:
