@@ -569,7 +569,7 @@ SIZES = {
     "mitsim": (1, 104),
     "optics": (12, 2145),
     "planner": (9, 2188),
-    "reconstruct": (35, 7726),
+    "reconstruct": (26, 7497),
     "report": (14, 2696),
     "scene": (10, 1873),
     "sensor": (7, 1363),

@@ -43,7 +43,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
-from mitsim.reconstruct.solvers import Prior
+from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
 
 Array = npt.NDArray[Any]
 
@@ -267,15 +267,14 @@ class _State:
     smooth: float
 
     @cached_property
-    def _slopes(self) -> tuple[Array, Array, Array]:
-        down, across = _slopes(self.image)
-        return down, across, np.sqrt(down * down + across * across)
+    def _slopes(self) -> Array:
+        return lengths(slopes_of(self.image))
 
     @cached_property
     def _flattened(self) -> float:
         if not self.prior.weight:
             return 0.0
-        low = np.minimum(self._slopes[2], self.smooth)
+        low = np.minimum(self._slopes, self.smooth)
         return self.prior.weight * (float(low.sum(dtype=np.float64)) - _dot(low, low) / (2 * self.smooth))
 
     @cached_property
@@ -283,7 +282,7 @@ class _State:
         squares = _dot(self.residual, self.residual) + self.prior.ridge * _dot(self.image, self.image)
         if not self.prior.weight:
             return squares / 2
-        return squares / 2 + self.prior.weight * float(self._slopes[2].sum(dtype=np.float64))
+        return squares / 2 + self.prior.weight * float(self._slopes.sum(dtype=np.float64))
 
     @property
     def smoothed(self) -> float:
@@ -291,7 +290,7 @@ class _State:
 
     @cached_property
     def _stiffness(self) -> Array:
-        return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
+        return np.asarray(self.prior.weight / np.maximum(self._slopes, self.smooth))
 
     @cached_property
     def gradient(self) -> Array:
@@ -301,11 +300,7 @@ class _State:
         """Return the second derivative of ridge and the quadratic TV at X, times a ``direction``."""
         bent = self.prior.ridge * direction
         if self.prior.weight:
-            down, across = (each * self._stiffness for each in _slopes(direction))
-            bent[1:] += down[:-1]
-            bent[:-1] -= down[:-1]
-            bent[:, 1:] += across[:, :-1]
-            bent[:, :-1] -= across[:, :-1]
+            bent += slopes_adjoint(slopes_of(direction) * self._stiffness)
         return bent
 
     @property
@@ -350,7 +345,7 @@ class _State:
     def gap(self) -> float:
         variation = 0.0
         if self.prior.weight:
-            length = self._slopes[2]
+            length = self._slopes
             held = length * length / np.maximum(length, self.smooth)
             variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
         free, slope, direction, power = self.free, self.gradient, None, 1.0
@@ -399,13 +394,6 @@ class _State:
         if slope <= ridge * reach:
             return slope * slope / (2 * ridge) if ridge else 0.0
         return slope * reach - ridge * reach**2 / 2
-
-
-def _slopes(image: Array) -> tuple[Array, Array]:
-    down, across = np.zeros_like(image), np.zeros_like(image)
-    np.subtract(image[1:], image[:-1], out=down[:-1])
-    np.subtract(image[:, 1:], image[:, :-1], out=across[:, :-1])
-    return down, across
 
 
 def _dot(first: Array, second: Array) -> float:

@@ -736,15 +736,12 @@ def prepare(
             raise MitsimError(f"{name} factor{what} or its patterns are all zero; there is nothing to solve for")
     # Products this small gain little from threads of BLAS, and lose a hundredfold when the cores are busy.
     with single_threaded_blas():
-        sides = [
-            factorise(factor, own, group_pixels(own), centre)
-            for factor, own in zip(factors[: 2 - same], patterns, strict=False)
-        ]
-    sides = sides * 2 if same else sides
-    for name, factorised in zip(("left", "right"), sides, strict=True):
+        left_side = factorise(factors[0], patterns[0], group_pixels(patterns[0]), centre)
+        right_side = left_side if same else factorise(factors[1], patterns[1], group_pixels(patterns[1]), centre)
+    for name, factorised in (("left", left_side), ("right", right_side)):
         if factorised.singular.max() < _UNSEEN:
             raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
-    return Prepared(*sides, centre)
+    return Prepared(left_side, right_side, centre)
 
 
 def _centre_factor(factor: FloatArray) -> FloatArray:

@@ -171,8 +171,8 @@ def _minimise(
     squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
     rho = _penalty(problem)
     smooth = prepared.image(data / (squared + rho))
-    slopes = _gradient(smooth)
-    rho_slopes = weight / max(float(_length(slopes).mean()), _NOTHING)
+    slopes = slopes_of(smooth)
+    rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
     # Without bounds nothing is held to them.
     inside, rho_inside = np.clip(smooth, *prior.bounds), rho if prior.bounded else 0.0
     dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
@@ -191,11 +191,11 @@ def _minimise(
         bounded, pressed = dual_slopes, dual_inside
         if weight:
             target = slopes - dual_slopes
-            length = _length(target)
+            length = lengths(target)
             shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
             bounded = rho_slopes * (target - shrunk)
             relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
-            source += rho_slopes * _gradient_adjoint(relaxed_slopes + dual_slopes)
+            source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
             total = total + rho_slopes * laplacian
         if prior.bounded:
             target = smooth - dual_inside
@@ -205,7 +205,7 @@ def _minimise(
             source += rho_inside * (relaxed_inside + dual_inside)
             total = total + rho_inside
         smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
-        slopes = _gradient(smooth)
+        slopes = slopes_of(smooth)
         dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
         if weight:
             dual_slopes += relaxed_slopes - slopes
@@ -241,7 +241,7 @@ def _towards(first: float, second: float, power: float) -> float:
 
 def _objective(prepared: Prepared, problem: DiagonalProblem, image: FloatArray, prior: Prior) -> float:
     misfit = problem.projected - problem.sigma * prepared.coefficients(image)
-    variation = prior.weight * float(_length(_gradient(image)).sum()) if prior.weight else 0.0
+    variation = prior.weight * float(lengths(slopes_of(image)).sum()) if prior.weight else 0.0
     return 0.5 * float(np.square(misfit).sum() + prior.ridge * np.square(image).sum()) + variation
 
 
@@ -255,9 +255,9 @@ def _gap(
 ) -> tuple[float, float]:
     pull, variation = pressed, prior.slack(image, pressed)
     if prior.weight:
-        slopes = _gradient(image)
-        variation += prior.weight * float(_length(slopes).sum()) - float(np.sum(bounded * slopes))
-        pull = pull + _gradient_adjoint(bounded)
+        slopes = slopes_of(image)
+        variation += prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
+        pull = pull + slopes_adjoint(bounded)
     pull = pull + prior.ridge * image
     along, seen = prepared.coefficients(pull), prepared.coefficients(image)
     unmeasured = float(np.square(pull - prepared.image(along)).sum())
@@ -271,13 +271,13 @@ def _gap(
     return max(variation, 0.0), quadratic
 
 
-def _gradient(image: FloatArray) -> FloatArray:
+def slopes_of(image: FloatArray) -> FloatArray:
     return np.stack([np.diff(image, axis=axis, append=image.take([-1], axis)) for axis in (0, 1)])
 
 
-def _gradient_adjoint(slopes: FloatArray) -> FloatArray:
+def slopes_adjoint(slopes: FloatArray) -> FloatArray:
     down, across = slopes[0, :-1], slopes[1, :, :-1]
-    total = np.zeros(slopes.shape[1:])
+    total = np.zeros(slopes.shape[1:], slopes.dtype)
     total[1:] += down
     total[:-1] -= down
     total[:, 1:] += across
@@ -285,7 +285,7 @@ def _gradient_adjoint(slopes: FloatArray) -> FloatArray:
     return total
 
 
-def _length(slopes: FloatArray) -> FloatArray:
+def lengths(slopes: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.square(slopes).sum(axis=0)))
 
 
