@@ -29,7 +29,8 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
 from mitsim.reconstruct.point_spread import ShiftedLight, minimise
 from mitsim.reconstruct.point_spread_image import solve_point_spread
-from mitsim.reconstruct.solver import Solution, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.solvers import Prior, solve_nonnegative, solve_tv
 
 SCENES = "coins", "page", "rocket", "moon"

@@ -20,7 +20,8 @@ import numpy as np
 
 from mitsim.learn.verbs import load_network
 from mitsim.metrics import psnr
-from mitsim.reconstruct.solver import Accumulator, Prepared, Solution
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
 from mitsim.report.lit_scene import LAMBDAS, accumulate

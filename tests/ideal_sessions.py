@@ -19,7 +19,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 
 N, PIXELS, PITCH = 16, 96, 0.02
 PEAK, READ, GAIN, BLACK, CODES, DARK = 2e4, 4.0, 0.2, 100.0, 2**13, 50.0

@@ -481,7 +481,7 @@ class CalibrationManifest(_Head):
     estimate: str | None = None
     """The estimator's own words."""
     verdict: str | None = None
-    """The estimator's verdict, one of `mitsim.reconstruct.solver.Verdict`."""
+    """The estimator's verdict, one of `mitsim.reconstruct.solution.Verdict`."""
 
 
 # ---- Reading and writing ----

@@ -28,7 +28,8 @@ from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV
-from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, Solution, Status, Verdict, noise_variance
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, noise_variance
 from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28

@@ -52,7 +52,7 @@ from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.lit_scene import IdealCamera
 
 SHARD = 100

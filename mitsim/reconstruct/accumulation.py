@@ -34,7 +34,8 @@ from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.factorisation import IndexArray, Side, group_pixels
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import BYTES_A_NUMBER, TIKHONOV, keeps_frames, slab_numbers
-from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, Solution, half_spread
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Halves, Prepared, half_spread
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 
 EDGES = 2.9

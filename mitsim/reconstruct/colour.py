@@ -39,7 +39,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.solver import Solution
+from mitsim.reconstruct.solution import Solution
 
 # ---- Images of all lines behind a mosaic of filters ------------------------------------------------------------------
 

@@ -34,7 +34,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import check_lambda
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""

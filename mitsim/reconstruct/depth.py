@@ -45,7 +45,8 @@ from mitsim.reconstruct.focus import (
 )
 from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
-from mitsim.reconstruct.solver import Solution, Status, Verdict, centre_columns, centre_frame, prepare, project_frames
+from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
 
 _STEP = 1.0
 """Projector pixels of parallax between depths that are tried first."""

@@ -53,7 +53,8 @@ from mitsim.reconstruct.shifted_codes import (
     find_pose,
     fit_codes,
 )
-from mitsim.reconstruct.solver import Status, Verdict, centre_columns, centre_frame
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 _KNOTS = 4
 """Knots of the spline for each sensor pixel."""

@@ -28,7 +28,7 @@ from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, noise_chance
-from mitsim.reconstruct.solver import Solution, Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.uncertainty import Propagation
 
 UNEXPLAINED = 3.5e-3

@@ -33,7 +33,7 @@ from mitsim.reconstruct.request import (
     holds_image,
     predict_cost,
 )
-from mitsim.reconstruct.solver import Solution, Verdict
+from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
-    from mitsim.reconstruct.point_spread_image import PointSpreadFit
+    from mitsim.reconstruct.point_spread import PointSpreadFit
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 

@@ -674,7 +674,8 @@ class KnownFrames:
     def misfit(self, models: Iterable[tuple[FloatArray, float]]) -> tuple[float, float, float]:
         """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise.
 
-        ``models`` are the centred frames, each with the variance of its known errors.
+        ``models`` are the frames of a model, each with the variance of its known errors. Both are centred before
+        comparison.
         """
         excess = energy = total = 0.0
         ratios = []

@@ -25,7 +25,7 @@ from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.reconstruct import MADE_OF
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
-from mitsim.reconstruct.solver import Status
+from mitsim.reconstruct.solution import Status
 from mitsim.report.folder_page import truth_of, write_folder, write_page
 from mitsim.report.folder_pictures import LARGEST, REFLECTANCE, SMALLEST, Picture, Scale, shown_error
 

@@ -37,7 +37,8 @@ from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import check_same_inputs
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, check_joint
-from mitsim.reconstruct.solver import Solution, automatic_lambda, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import automatic_lambda, prepare
 from mitsim.report.colour_image import ColourImage, JudgedColours, begin_image, board_of
 
 # ---- From a run to its images ----

@@ -31,7 +31,7 @@ from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.request import MARKOV, TIKHONOV
-from mitsim.reconstruct.solver import Solution
+from mitsim.reconstruct.solution import Solution
 from mitsim.report import label
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.report.plots import (

@@ -34,7 +34,8 @@ from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
 from mitsim.reconstruct.convolution import Classes, FactorisedClasses, solve_iteratively
 from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.solver import Solution, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
 from mitsim.report.lit_scene import IdealCamera
 from mitsim.report.pages import Mean, Table, Value

@@ -39,7 +39,8 @@ from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.shadow import SeparableTerms, ShadowGeometry
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Prepared, Solution
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import NONUNIFORMITY, IdealCamera, LitScene, Unexposed, accumulate
 from mitsim.report.pages import Mean, Table, Value

@@ -32,7 +32,7 @@ from mitsim.learn.training_request import (
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.request import TIKHONOV
-from mitsim.reconstruct.solver import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report import IDEALISED, RENDERED
 from mitsim.studies.framework.experiment import Setup
 from mitsim.studies.framework.studio import Studio

@@ -18,7 +18,8 @@ from mitsim.metrics import psnr, ssim
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV
-from mitsim.reconstruct.solver import Accumulator, Prepared, Solution
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.reconstruct.solvers import solve_nonnegative, solve_tv
 from mitsim.report.lit_scene import LAMBDAS
 from mitsim.report.pages import Value

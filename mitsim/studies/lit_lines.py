@@ -52,7 +52,8 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import behind, daylight
 from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Prepared, Solution, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import RENDERED
 from mitsim.report.lit_scene import LAMBDAS, LitScene
 from mitsim.report.mosaic_images import LineImages, MosaicCamera, Solver, solver_of

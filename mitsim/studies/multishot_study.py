@@ -41,7 +41,8 @@ from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.solver import Solution, centre_columns, centre_frame, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
 from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
 from mitsim.report.pages import Table

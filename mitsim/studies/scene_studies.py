@@ -41,7 +41,8 @@ from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames, Frame
 from mitsim.reconstruct.focus import FactorOfDepths, parallax_of, separate
-from mitsim.reconstruct.solver import Accumulator, Prepared, Solution
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED, label
 from mitsim.report.lit_scene import LitScene, Unexposed, peak_time
 from mitsim.report.pages import Mean, Table, Value

@@ -44,7 +44,7 @@ from mitsim.devices.session import load_recipe
 from mitsim.metrics import psnr
 from mitsim.reconstruct.factors import Estimate, Factors, factors_of_sums, stripe_sums
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solver import Solution, Status, Verdict
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
 from mitsim.report.pages import Mean, Table
 from mitsim.report.plots import BLUE, FONT, GREEN, GREY, PALE, ROW, VERMILION, image_grid, label_axes, panels_of

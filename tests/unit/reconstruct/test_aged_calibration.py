@@ -21,7 +21,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.metrics import psnr
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, picture
 from tests.known_camera import PLANES, KnownCamera, write_known
 

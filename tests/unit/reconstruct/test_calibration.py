@@ -18,7 +18,8 @@ from mitsim.reconstruct.factors import (
     squared_condition,
     stripe_sums,
 )
-from mitsim.reconstruct.solver import Verdict, prepare
+from mitsim.reconstruct.solution import Verdict
+from mitsim.reconstruct.solver import prepare
 
 N, M = 16, 40
 H = hadamard(N).astype(float)

@@ -18,7 +18,7 @@ from mitsim.reconstruct.convolution import (
     solve_iteratively,
 )
 from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.solution import Verdict
 
 SENSORS = [None, (15, 12), (8, 15)]
 """All light; cropped on all sides, unevenly; higher than wide, narrower than all light."""

@@ -19,7 +19,7 @@ from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8"

@@ -22,7 +22,7 @@ from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, read_colours
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.shifted_codes import TURNS, _differences_of_turned, plane_offsets
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.solution import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
 
 

@@ -15,7 +15,8 @@ from mitsim.core.runs import Capture
 from mitsim.reconstruct.misfit import UNEXPLAINED, Cause, Misfit, chi_square_text
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.residuals import CHANCE
-from mitsim.reconstruct.solver import Prepared, Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solver import Prepared
 from tests.ideal_sessions import BLACK, PIXELS, Bench, N, bench, picture, shadow
 from tests.unit.reconstruct.test_faults import with_frames
 

@@ -15,17 +15,15 @@ from scipy.optimize import lsq_linear, nnls
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.point_spread import (
     ShiftedLight,
-    minimise,
-    reduce_frame,
-)
-from mitsim.reconstruct.point_spread_image import (
     automatic_prior,
     find_fit,
     frame_error,
     frame_noise,
-    solve_point_spread,
+    minimise,
+    reduce_frame,
 )
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.point_spread_image import solve_point_spread
+from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
 

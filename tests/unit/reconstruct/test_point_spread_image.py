@@ -20,7 +20,7 @@ from mitsim.core.recorders import Recorder, frame_name
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.solver import Verdict
+from mitsim.reconstruct.solution import Verdict
 
 N = 12
 

@@ -9,7 +9,8 @@ import pytest
 
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, Solution, covariance_root, prepare
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import NEIGHBOURS, Prepared, covariance_root, prepare
 from tests.ideal_sessions import Bench
 
 ROWS, COLUMNS = 8, 7

@@ -17,7 +17,7 @@ from mitsim.devices.patterns import parse_patterns
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import PLANES, JointMosaic, chart
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.solver import Status, Verdict
+from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.report.mosaic_images import demosaic
 from mitsim.studies.lit_lines import ARRAY, HALF, JOINT, MosaicShots, filter_weights, replace_spectra, serving
 from tests.ideal_sessions import picture, shadow
