@@ -37,8 +37,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
-from mitsim.metrics import psnr
-from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
+from mitsim.reconstruct.convolution import Classes
+from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS
 from mitsim.studies.convolutional_study import best_image, race, take
@@ -53,8 +53,8 @@ Case = tuple[bool, int]
 """Whether the sensor crops, and the dots' period."""
 
 
-def camera_of(psf: np.ndarray, cropped: bool) -> ConvolutionalCamera:
-    return ConvolutionalCamera(psf, N, psf.shape if cropped else None)
+def camera_of(psf: np.ndarray, cropped: bool) -> ShiftedLight:
+    return ShiftedLight.of(psf, N, psf.shape if cropped else None)
 
 
 def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
@@ -70,7 +70,6 @@ def quality(psf: np.ndarray, case: Case, seed: int) -> Iterator[Row]:
                 "convention": convention,
                 "image": name,
                 "psnr_db": round(db, 2),
-                "divided_db": round(psnr(classes.divide(shots.frames, solution.lam), truth), 2),
                 "lambda_relative": solution.lam / classes.largest,
                 "saturated": shots.saturated,
             }

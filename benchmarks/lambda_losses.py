@@ -30,7 +30,7 @@ import mitsim
 from mitsim.metrics import psnr
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.regularisation import automatic_lambda
+from mitsim.reconstruct.solver import automatic_lambda
 
 SCENES = (
     "photograph", "colour_chart", "resolution_target", "keystone", "lamp_bench", "cards", "corner", "gift_card",

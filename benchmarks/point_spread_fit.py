@@ -21,8 +21,7 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from skimage import data
 from skimage.transform import resize
 
-from mitsim.reconstruct.point_spread import ShiftedLight
-from mitsim.reconstruct.point_spread_fit import find_fit
+from mitsim.reconstruct.point_spread import ShiftedLight, find_fit
 
 PICTURES = "camera", "coins", "astronaut", "text", "cell", "page"
 

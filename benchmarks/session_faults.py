@@ -37,8 +37,7 @@ from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, UNIFORM, Half, halves_in_order
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.captured_session import calibrate_frames
-from mitsim.reconstruct.estimate_factors import estimate_factors, predicted_error
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Factors, estimate_factors, predicted_error
 
 NOISE = 2.3e-3
 """Relative error of both factors, in quadrature, that the shipped session leaves with the anchor camera."""

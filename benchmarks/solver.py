@@ -5,13 +5,13 @@
 
 Speed: streaming sums against dense Phi_L^T Y Phi_R products of the same frames, and block against full
 factorisation, each the median of warm repetitions within this run. Accuracy: noise-free recovery at
-lambda = 0, block against full, and the error of three forms of the solution against a 50-digit answer over
+lambda = 0, and the error of three forms of the solution against a 50-digit answer over
 lambda (gram: the paper's; svd+Q: singular vectors of the stacked matrix but the paper's Q; svd: projected
 frames). Trust: seconds of the stages of whole reconstructions from noisy frames in memory, the best of the repetitions,
 and what the uncertainty takes of adding up and solving; slopes of the factors, which the misfit needs too, count there.
 
 ``--forms`` measures what the solver's precision costs in time: error against exact arithmetic (tests/exact_solver.py)
-and seconds of both methods and layouts in double and single precision, at three lambdas.
+and seconds in double and single precision, at three lambdas.
 """
 
 from __future__ import annotations
@@ -79,25 +79,20 @@ def speed(factor: np.ndarray, repeat: int, rng: np.random.Generator) -> dict[str
         for frame in frames.values():
             transposed @ (frame @ factor)
 
-    def prepare_and_solve(structure: str) -> None:
+    def prepare_and_solve() -> None:
         # The arithmetic of a solve on given sums: those belong to the factors that made them, so a fresh
         # factorisation cannot be handed the same ones through the public door.
-        fresh = prepare(factor, factor, patterns, patterns, structure=structure)
+        fresh = prepare(factor, factor, patterns, patterns)
         sigma = np.outer(fresh.left.singular, fresh.right.singular)
         fresh.image(sigma * total / (np.square(sigma) + 1e-3))
 
     other = factor[:, ::-1].copy()
 
-    def two_sides(structure: str) -> None:
-        prepare(factor, other, patterns, patterns, structure=structure)
-
     result = {
         "dense_products_s": median_seconds(dense, repeat),
         "streaming_s": median_seconds(lambda: summed(prepared, frames), repeat),
-        "block_prepare_and_solve_s": median_seconds(lambda: prepare_and_solve("block"), repeat),
-        "full_prepare_and_solve_s": median_seconds(lambda: prepare_and_solve("full"), repeat),
-        "block_prepare_unequal_sides_s": median_seconds(lambda: two_sides("block"), repeat),
-        "full_prepare_unequal_sides_s": median_seconds(lambda: two_sides("full"), repeat),
+        "prepare_and_solve_s": median_seconds(prepare_and_solve, repeat),
+        "prepare_unequal_sides_s": median_seconds(lambda: prepare(factor, other, patterns, patterns), repeat),
         "solve_auto_s": median_seconds(lambda: prepared.solve(sums, "auto"), repeat),
         "solve_given_lambda_s": median_seconds(lambda: prepared.solve(sums, 1e-3), repeat),
     }
@@ -106,22 +101,14 @@ def speed(factor: np.ndarray, repeat: int, rng: np.random.Generator) -> dict[str
 
 
 def recovery(factor: np.ndarray, rng: np.random.Generator) -> dict[str, float]:
-    """Largest error of an image in 0..1 from noise-free frames at lambda = 0, by family and form."""
+    """Largest error of an image in 0..1 from noise-free frames at lambda = 0, by family."""
     image = rng.random((N, N))
     result = {}
     for name, patterns in (("uniform", np.ones((N, 1))), ("dots:7", dots(N, K))):
         frames = frames_of(factor, patterns, image)
-        images = {}
-        for form, options in (
-            ("svd", {}),
-            ("svd, full", {"structure": "full"}),
-            ("gram", {"method": "gram"}),
-        ):
-            prepared = prepare(factor, factor, patterns, patterns, **options)
-            images[form] = prepared.solve(summed(prepared, frames), 0.0).image
-            result[f"{name}, {form}"] = float(np.abs(images[form] - image).max())
-        difference = images["svd"] - images["svd, full"]
-        result[f"{name}, block - full, relative"] = float(np.linalg.norm(difference) / np.linalg.norm(image))
+        prepared = prepare(factor, factor, patterns, patterns)
+        found = prepared.solve(summed(prepared, frames), 0.0).image
+        result[name] = float(np.abs(found - image).max())
     return result
 
 
@@ -149,10 +136,11 @@ def rounding(rng: np.random.Generator) -> list[dict[str, float]]:
     for exponent in range(-2, -17, -2):
         lam = 10.0**exponent
         truth = exact_solution(factor, frame, lam)
-        images = {}
-        for method in ("gram", "svd"):
-            prepared = prepare(factor, factor, one, one, method=method)
-            images[method] = prepared.solve(summed(prepared, {(0, 0): frame}), lam).image
+        prepared = prepare(factor, factor, one, one)
+        images = {"svd": prepared.solve(summed(prepared, {(0, 0): frame}), lam).image}
+        values, vectors = np.linalg.eigh(factor.T @ factor)
+        rotated = vectors.T @ (factor.T @ frame @ factor) @ vectors
+        images["gram"] = vectors @ (rotated / (np.outer(values, values) + lam)) @ vectors.T
         side = prepared.left
         q = side.basis.T @ (factor.T @ frame @ factor) @ side.basis
         images["svd+Q"] = side.basis @ (q / (np.outer(side.singular, side.singular) ** 2 + lam)) @ side.basis.T
@@ -183,7 +171,7 @@ def print_forms(rows: tuple[SolverRow, ...]) -> None:
         others = [each for each in rows if each.lambda_rel == row.lambda_rel and each is not row]
         beaten = any(each.seconds <= row.seconds and each.error <= row.error for each in others)
         print(
-            f"lambda {row.lambda_rel:.0e} {row.method:>4} {row.layout:<5} {row.precision:<16} {row.seconds:7.3f} s "
+            f"lambda {row.lambda_rel:.0e} {row.precision:<16} {row.seconds:7.3f} s "
             f"(to {row.most_s:.3f}, {row.repeats} runs)  error {row.error:.1e}{'' if beaten else '  *'}"
         )
 

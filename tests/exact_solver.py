@@ -1,12 +1,10 @@
 """The exact image of the solver's problem, and error and seconds of every form of the solver against it.
 
 At the paper's geometry (49 dots, 49 frames of 512 x 512, an image of 128 x 128) the noise-free frames of a random image
-are solved in every combination of
+are solved in these precisions:
 
-* method: ``svd`` of the stacked matrix, or the paper's ``gram`` matrices;
-* layout: ``block`` (each group of scene pixels that shares no pattern alone) or ``full``;
-* precision: ``float64``; ``float32 frames``, stored in single precision and summed in double; ``float32 products``,
-  where frames and slabs are multiplied in single precision as well (computed here: the solver does not offer it).
+``float64``; ``float32 frames``, stored in single precision and summed in double; ``float32 products``, where frames and
+slabs are multiplied in single precision as well (computed here, because the solver does not offer it).
 
 Seconds count what one reconstruction takes: prepare, add all frames, solve; best of REPEATS, BLAS kept to one thread.
 
@@ -38,16 +36,12 @@ from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.metrics import relative_error
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.factorisation import Method, Structure
 from mitsim.reconstruct.solver import Prepared, prepare
 
 Precision = Literal["float64", "float32 frames", "float32 products"]
-Form = tuple[Method, Structure, Precision]
 Timed = list[tuple[float, FloatArray]]
 """Seconds and image, for every lambda."""
 PRECISIONS: tuple[Precision, ...] = ("float64", "float32 frames", "float32 products")
-METHODS: tuple[Method, ...] = ("svd", "gram")
-LAYOUTS: tuple[Structure, ...] = ("block", "full")
 LAMBDAS = (1e-4, 1e-8, 1e-12)
 """From what noise calls for to where double precision ends."""
 REPEATS = 3
@@ -73,9 +67,7 @@ class SolverRow:
     ``judge_error`` what that image is uncertain by, relative.
     """
 
-    method: str
     precision: str
-    layout: str
     lambda_rel: float
     seconds: float
     error: float
@@ -157,7 +149,7 @@ def time_solver(
         for index, relative in enumerate(LAMBDAS):
             answers.append(judge.image(relative * problem.largest_power))
             progress("solver", 0.4 * (index + 1) / len(LAMBDAS))
-        measured: dict[Form, list[Timed]] = {form: [] for form in product(METHODS, LAYOUTS, PRECISIONS)}
+        measured: dict[Precision, list[Timed]] = {form: [] for form in PRECISIONS}
         forms = list(measured)
         # Round by round rather than form by form, so that a busy moment does not fall on one form alone.
         for index, (_, form) in enumerate(product(range(repeats), forms)):
@@ -165,9 +157,7 @@ def time_solver(
             progress("solver", 0.4 + 0.6 * (index + 1) / (repeats * len(forms)))
     return tuple(
         SolverRow(
-            method=method,
             precision=precision,
-            layout=layout,
             lambda_rel=relative,
             seconds=min(timed[index][0] for timed in rounds),
             error=relative_error(rounds[-1][index][1], answers[index][0]),
@@ -176,18 +166,17 @@ def time_solver(
             most_s=max(timed[index][0] for timed in rounds),
             repeats=repeats,
         )
-        for (method, layout, precision), rounds in measured.items()
+        for precision, rounds in measured.items()
         for index, relative in enumerate(LAMBDAS)
     )
 
 
-def _reconstruct(problem: Problem, form: Form) -> Timed:
+def _reconstruct(problem: Problem, precision: Precision) -> Timed:
     """Lambdas share the factorisation and the sums, and each is charged with both."""
-    method, layout, precision = form
     frames = problem.frames if precision == "float64" else problem.frames.astype(np.float32)
     patterns, add = problem.patterns, _add_single if precision == "float32 products" else _add
     started = time.perf_counter()
-    prepared = prepare(problem.factor, problem.factor, patterns, patterns, method=method, structure=layout)
+    prepared = prepare(problem.factor, problem.factor, patterns, patterns)
     solve = add(prepared, frames, problem.k)
     shared = time.perf_counter() - started
     timed = []
@@ -209,7 +198,7 @@ def _add(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callable[[floa
 def _add_single(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callable[[float], FloatArray]:
     """The same with slabs and products in single precision; sums and what follows in double."""
     slabs = [(slab.columns, slab.matrix.astype(np.float32)) for slab in prepared.left.slabs]
-    total = np.zeros((prepared.left.accumulated_size,) * 2)
+    total = np.zeros((len(prepared.left.singular),) * 2)
     for index, frame in enumerate(frames):
         (rows, left), (columns, right) = (slabs[i] for i in divmod(index, k))
         where: Any = (rows, columns)
@@ -217,10 +206,6 @@ def _add_single(prepared: Prepared, frames: npt.NDArray[Any], k: int) -> Callabl
             where = np.ix_(rows, columns)
         total[where] += left.T @ (frame @ right)
     sigma = np.outer(prepared.left.singular, prepared.right.singular)
-    if not prepared.left.projected:
-        # The paper's Q: rotated, it is sigma W.
-        rotated = prepared.left.basis.T @ total @ prepared.right.basis
-        total = np.divide(rotated, sigma, out=np.zeros_like(sigma), where=sigma > 0)
     return lambda lam: prepared.image(np.where(sigma > 0, sigma * total / (np.square(sigma) + lam), 0.0))
 
 

@@ -24,7 +24,7 @@ _SEEN = 0.25
 MOST_LOST = 0.3
 """Part of the mask without factors (rms) from which a calibration is refused: a tenth of the light's energy."""
 _SEPARABLE = 0.01
-"""Residual of a separable mask, as :data:`mitsim.reconstruct.estimate_factors.SEPARABLE_RESIDUAL`."""
+"""Residual of a separable mask, as :data:`mitsim.reconstruct.factors.SEPARABLE_RESIDUAL`."""
 _PLACES = 256
 """Points of the mask per axis that are compared; the singular values take 20 ms."""
 

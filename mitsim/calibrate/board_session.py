@@ -45,7 +45,7 @@ from mitsim.optics.image_formation import number_of_terms
 from mitsim.optics.shadow import Directions, SeparableTerms
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
 from mitsim.planner.planner import make_plan
-from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels
+from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, decibels
 
 _IN_RAYS = 0.5
 """Part (rms) of the geometric residual below which the residual is attributed to diffraction."""

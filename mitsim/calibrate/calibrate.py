@@ -44,8 +44,15 @@ from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
 from mitsim.optics.terms import Lacking, lacking
 from mitsim.reconstruct.colour import behind
-from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, Estimate, ResponseFit, StripeSums, stripe_sums
-from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.factors import (
+    SEPARABLE_RESIDUAL,
+    Estimate,
+    Factors,
+    ResponseFit,
+    StripeSums,
+    load_calibration,
+    stripe_sums,
+)
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 NOISY, NOISE_FREE = "noisy", "noise_free"

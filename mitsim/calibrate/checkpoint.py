@@ -33,7 +33,7 @@ from mitsim.light.grids import GRIDS, LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.light.plan import Plan
 from mitsim.light.simulation import Simulation
-from mitsim.reconstruct.estimate_factors import StripeSums
+from mitsim.reconstruct.factors import StripeSums
 from mitsim.sensor.chain import Digital as DigitalNumbers
 
 KIND = "calibration"

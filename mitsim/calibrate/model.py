@@ -35,8 +35,7 @@ from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import SeparableTerms
 from mitsim.optics.terms import best_term
 from mitsim.reconstruct.captured_session import chosen_responses
-from mitsim.reconstruct.estimate_factors import SEPARABLE_RESIDUAL, decibels, squared_condition
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, Factors, decibels, squared_condition
 from mitsim.reconstruct.solution import Status, Verdict
 from mitsim.reconstruct.solver import centre_frame
 

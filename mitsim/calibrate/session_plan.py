@@ -40,8 +40,7 @@ from mitsim.devices.sensor import EXPOSURE_FRACTION, digital_of
 from mitsim.devices.session import MOST_REPEATS, SIDES, SessionRecipe, load_recipe
 from mitsim.metrics import psnr as psnr_of
 from mitsim.metrics import truth_for
-from mitsim.reconstruct.estimate_factors import Estimate, StripeSums, factors_of_sums
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, StripeSums, factors_of_sums
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.sensor.moments import frame_moments
 

@@ -261,8 +261,7 @@ def _calibrate_known(listed: Path, asked: Calibrating) -> int:
 
     captures, output, aged = load_known(listed), asked.folder, asked.aged  # refused before the fit is imported
     check_output(output)
-    from mitsim.reconstruct.aged_calibration import moved_in_words
-    from mitsim.reconstruct.known_pictures import calibrate_known
+    from mitsim.reconstruct.known_pictures import calibrate_known, moved_in_words
 
     held = memory_from_here()
     with asked.job() as job:

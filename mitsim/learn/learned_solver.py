@@ -26,10 +26,9 @@ from mitsim.learn.pair_store import ModelManifest
 from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
-from mitsim.reconstruct.regularisation import DiagonalProblem, noise_variance
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared
+from mitsim.reconstruct.solver import Accumulator, DiagonalProblem, Prepared, noise_variance
 from mitsim.reconstruct.solvers import SOLVERS, Patterns, Solver
 
 _MOST_BYTES = 1 << 28

@@ -290,7 +290,7 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
 
 
 def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
-    """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.estimate_factors`).
+    """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.factors`).
 
     The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with
     u = sum_k L_k h <R_k 1, v> / |v|^2. So the left factor is the sum of L_k with these weights; the right one likewise.

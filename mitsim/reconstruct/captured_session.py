@@ -1,13 +1,12 @@
-"""A folder with the frames of a real calibration session in; the camera's factors, and what nobody knows of them, out.
+"""Factors of a camera from a folder with the frames of a real calibration session.
 
 Numbers are those of a simulated session: frames of one, written to such a folder, give its factors bit for bit.
 
-*Exposures of one frame.* No frame of a session is brighter than the uniform one. A pixel that this one, read at the
-shortest exposure, would not bring near saturation at a longer one is saturated by no frame at that exposure. So the
-weights of all exposures are found once, and belong to pixels: found by a uniform frame of the other side's stripes,
-they hang on no noise of the frames that they merge, which keeps merged rates without bias, of the variance sum_k w_k^2
-v_k. With w_k in proportion to 1/v_k that is least (Granados et al. 2010, "Optimal HDR reconstruction with linear
-digital cameras", CVPR).
+*Exposures of one frame.* No frame of a session is brighter than the uniform one, so that a pixel that the uniform frame
+would not bring near saturation at an exposure is saturated by no frame. Weights of all exposures are therefore found
+once, by a uniform frame of the other side's stripes, and do not depend on noise of the merged frames. Merged rates have
+no bias and the variance sum_k w_k^2 v_k, which is least with w_k in proportion to 1/v_k (Granados et al. 2010, "Optimal
+HDR reconstruction with linear digital cameras", CVPR).
 """
 
 from __future__ import annotations
@@ -38,21 +37,19 @@ from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_f
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.sensor import digital_of, load_sensor
 from mitsim.devices.session import SIDES, UNIFORM, Half, Merge, Side
-from mitsim.reconstruct.estimate_factors import Estimate, ResponseFit, StripeSums, stripe_sums
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, ResponseFit, StripeSums, stripe_sums
 from mitsim.reconstruct.session_check import CheckedSession, SessionConditions, check_session
 
 _FILLED = ("read_noise_e", "step_dn", "saturation_dn")
-"""Of a list's `digital`, what a camera's file states where the list does not."""
+"""Fields of a list's `digital` that a camera's file may supply."""
 _COMPARED = {"gain_dn_per_e": (0.05, 0.0), "black_level_dn": (0.02, 1.0), "saturation_dn": (0.02, 1.0)}
-"""What both state, and from which relative and absolute difference they contradict: published gains are good to a few
-percent, level and end are settings, true to a digital number."""
+"""Fields that list and camera must agree on, with relative and absolute tolerance."""
 _UNLIKE, _MATTERS = 4.0, 0.02
-"""Squared difference of two frames that should be alike, in the session's median one, and its root as a part of their
-light, from which one is wrong: light that is twice the usual doubles the first, less than the second costs less than
-most sessions' noise."""
+"""Squared difference of repeated frames over the session's median, and difference over their light, above which one is
+wrong.
+"""
 _LIT = 0.01
-"""Light of a dark frame beyond the others', as a part of the uniform frame's, from which it is wrong."""
+"""Light of a dark frame beyond the others', over the uniform frame's, above which it is wrong."""
 
 
 # ---- From the frames of a real session to factors ----
@@ -65,31 +62,30 @@ def calibrate_frames(
     job: Job | None = None,
     camera: Path | str | None = None,
 ) -> Factors:
-    """The camera's two factors, from the frames of a real session.
+    """Calibrate a camera by the frames of a real session.
 
     Parameters
     ----------
     folder
-        with the frames and their list, as docs/formats.md describes it; or what :func:`load_frames` says of it.
+        Folder with the frames and their list (docs/formats.md), or what :func:`load_frames` returns.
     output
         CAL folder that is written; None keeps the factors in memory.
     job
-        clock and progress.
+        Clock and progress.
     camera
-        name of a shipped camera, or its TOML file: what the list does not state of noise and saturation is the
-        camera's, and what it states is compared.
+        Name of a shipped camera, or its TOML file: it supplies noise and saturation that the list does not state, and
+        is compared with the list.
 
     Returns
     -------
     Factors
-        flagged where they cannot be trusted: for saturated frames, responses that are not separable, and a list that
-        contradicts the camera.
+        Flagged for saturated frames, responses that are not separable, and a list that contradicts the camera.
 
     Raises
     ------
     MitsimError
-        for frames that are missing, there twice, of different sizes or cannot be read, for a list that breaks a rule,
-        and an output that cannot be written.
+        For frames that are missing, given twice, of different sizes or unreadable, a list that breaks a rule, and an
+        output that cannot be written.
     """
     job = job or Job()
     session = folder if isinstance(folder, SessionFrames) else load_frames(folder)
@@ -110,17 +106,7 @@ def calibrate_frames(
 def calibrate_planes(
     session: SessionFrames, output: Path, job: Job | None = None, camera: Path | str | None = None
 ) -> dict[str, Factors]:
-    """The camera's factors of every plane of a mosaic, from frames of all planes, by the plane's name.
-
-    Parameters
-    ----------
-    session
-        whose list has prepare.channel = "all".
-    output
-        coloured CAL folder that is written.
-    job, camera
-        as for :func:`calibrate_frames`, whose errors it raises.
-    """
+    """Calibrate every plane of a mosaic by a session with prepare.channel = "all", and write a coloured CAL folder."""
     job, colours = job or Job(), lines_of_planes(CALIBRATION, session.listed.prepare.wavelengths_nm)
     with output_folder(output) as place:
         found = {
@@ -132,7 +118,6 @@ def calibrate_planes(
 
 
 def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFrames, tuple[str, ...]]:
-    """The ``session`` with what its list does not state taken from the ``camera``, and where both contradict."""
     sensor = load_sensor(locate(camera, "calibration", ".toml", CAMERA))
     stated, own = session.listed.digital, digital_of(sensor, session.listed.digital.exposure_s)
     absent = {name: getattr(own, name) for name in _FILLED if getattr(stated, name) is None}
@@ -149,10 +134,9 @@ def _with_camera(session: SessionFrames, camera: Path | str) -> tuple[SessionFra
 
 
 def chosen_responses(session: SessionFrames, chosen: Iterable[tuple[Side, int]]) -> Iterator[tuple[FloatArray, float]]:
-    """Response (rows, columns) to each of the ``chosen`` +-1 patterns, side and number, of a real ``session``, and the
-    standard deviation of its noise [electrons/s]; where the list does not state the sensor's, that of its light alone.
+    """Yield the response to each ``chosen`` +-1 pattern (side, number) of a ``session``, and the noise [electrons/s].
 
-    MitsimError for a frame with pixels at the full well or the ADC's end, where a model's fit would be misled.
+    Raises MitsimError for a saturated frame.
     """
     _check_sizes(session)
     session, _ = _without_factor(session)
@@ -224,7 +208,6 @@ def _calibrate(session: SessionFrames, job: Job, doubts: tuple[str, ...] = ()) -
 
 
 def _not_known(session: SessionFrames) -> Iterator[str]:
-    """What neither frames nor list tell, and what follows."""
     listed = session.listed
     yield "phi_error, noise_free_residual: nobody has exact factors of a real camera; predicted_phi_error is by noise"
     if not listed.digital.noise_is_stated:
@@ -242,11 +225,6 @@ def _not_known(session: SessionFrames) -> Iterator[str]:
 
 
 def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, ...]]:
-    """The ``session`` with what makes frames of its numbers, divided by their common factor where they are beyond the
-    camera's range; and what is doubtful of it.
-
-    The first and last frames tell: others that are no multiples are refused as they are read.
-    """
     prepare, end = session.listed.prepare, session.listed.digital.saturation_dn
     if prepare.divide_by is None:
         common = CommonFactor()
@@ -264,7 +242,6 @@ def _without_factor(session: SessionFrames) -> tuple[SessionFrames, tuple[str, .
 
 
 def _check_sizes(session: SessionFrames) -> None:
-    """MitsimError for a frame that cannot be read, or is of another size than the first."""
     first, *others = session.files
     size = image_size(session.folder / first, session.wanted)
     for name in session.files:
@@ -279,8 +256,6 @@ def _check_sizes(session: SessionFrames) -> None:
 
 
 def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
-    """MitsimError where frames have no light by the levels that the list of a ``session`` states, ``uniform`` (rows,
-    columns) being the brighter of both uniform responses [electrons/s]."""
     first = session.repeats_of((SIDES[0], 0, 1 if session.pairs else UNIFORM))[0]
     values, digital = session.read(first.file), session.listed.digital
     if digital.rate(values).max() <= 0 or not uniform.any():
@@ -296,28 +271,21 @@ def _check_levels(session: SessionFrames, uniform: FloatArray) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
-    """Mean of ``shots`` frames of each exposure: electrons a second, and how they were read."""
-
     rate: FloatArray
     ladder: Ladder
     shots: int
 
     @property
     def exposure_s(self) -> float:
-        """The shortest exposure [s]."""
         return self.ladder.digitals[0].exposure_s
 
     @property
     def variance(self) -> float:
-        """Mean noise variance, of all shots [(electrons/s)^2]."""
         return max(self.ladder.variance(self.rate), 0.0) / self.shots
 
 
 @dataclass(frozen=True)
 class _Compared:
-    """Two frames that should be alike: names, mean ``squared`` difference over mean squared light, that light, and how
-    much of the light of the second the first has. ``kind`` are those that noise makes differ alike."""
-
     names: tuple[str, str]
     kind: int
     squared: float
@@ -326,7 +294,6 @@ class _Compared:
 
     @classmethod
     def of(cls, names: tuple[str, str], kind: int, one: FloatArray, other: FloatArray) -> _Compared:
-        """Of rates (pixels,)."""
         light = max(float(np.square(other).mean()), float(np.square(one).mean()))
         product = float(np.dot(one.ravel(), other.ravel())) / other.size
         size = float(np.square(other).mean())
@@ -335,19 +302,12 @@ class _Compared:
 
 @dataclass(frozen=True, eq=False)
 class _Readings:
-    """Frames of a ``session`` as electrons a second; names of those that are ``saturated`` are noted as they are read,
-    how frames ``compared`` that should be alike, and which dark ones are ``odd``, in words.
-
-    Measurements of all patterns are as in a simulated session: :meth:`mitsim.calibrate.lit_session.LitSession.noisy`.
-    """
-
     session: SessionFrames
     saturated: set[str] = field(default_factory=set)
     compared: dict[Half, list[_Compared]] = field(default_factory=dict)
     odd: dict[str, str] = field(default_factory=dict)
 
     def wrong(self) -> dict[Half, str]:
-        """Which halves of patterns have repeats or exposures that differ, in words."""
         kinds: dict[int, list[float]] = {}
         for each in self.compared.values():
             for one in each:
@@ -376,8 +336,6 @@ class _Readings:
         return found
 
     def response(self, side: Side, index: int) -> tuple[FloatArray, float, FloatArray | None]:
-        """Response (rows, columns) to a +-1 pattern [electrons/s], its mean noise variance, and the sum of its two
-        frames (rows, columns); None where it is not their difference."""
         positive = self._merge((side, index, 1))
         if self.session.pairs:
             negative = self._merge((side, index, -1))
@@ -404,7 +362,6 @@ class _Readings:
 
     @cached_property
     def _ladders(self) -> dict[Side, Ladder] | None:
-        """How several exposures of a side's frames are merged, by a uniform frame of the other; None for one."""
         listed = self.session.listed
         if len(listed.exposure_ladder) == 1:
             return None
@@ -421,7 +378,6 @@ class _Readings:
 
     @cached_property
     def _dark_of(self) -> dict[Side, dict[float, _Reading]]:
-        """Mean dark frame of a side by exposure; of several, by the shortest, merged."""
         found = {}
         for exposure in {self.session.exposure_s(frame) for frame in self.session.dark}:
             frames = [frame for frame in self.session.dark if self.session.exposure_s(frame) == exposure]
@@ -435,8 +391,7 @@ class _Readings:
         }
 
     def _alike(self, frames: list[DarkFile]) -> list[DarkFile]:
-        """Dark ``frames`` of one exposure without one that has light which the others have not; it is noted in
-        ``odd``."""
+        """Return the dark ``frames`` of one exposure without those that contain light, which are noted in ``odd``."""
         levels = np.array([float(self._read([frame], True).rate.mean()) for frame in frames])
         uniform = self._read(self.session.repeats_of((SIDES[0], 0, UNIFORM)), True).rate.mean()
         parts = (levels - np.median(levels)) / uniform
@@ -453,7 +408,6 @@ class _Readings:
         return frames if few else [frame for frame, one in zip(frames, lit, strict=True) if not one]
 
     def _merge(self, half: Half) -> _Reading:
-        """What shows a ``half`` of a pattern, of all exposures and repeats."""
         if self._ladders is None:
             return self._read(self.session.repeats_of(half), True)
         ladder = self._ladders[half[0]]
@@ -468,13 +422,11 @@ class _Readings:
         return _Reading(ladder.merge(rates), ladder, self.session.listed.repeats)
 
     def _compare(self, half: Half, compared: _Compared) -> None:
-        """Note it, once."""
         known = self.compared.setdefault(half, [])
         if compared not in known:
             known.append(compared)
 
     def _read(self, frames: Sequence[StripeFile | DarkFile], used: Chosen) -> _Reading:
-        """The mean of ``frames`` of one exposure; ``used`` are the pixels that may not be saturated."""
         digital = self.session.listed.digital.model_copy(update={"exposure_s": self.session.exposure_s(frames[0])})
         total: FloatArray | None = None
         before: FloatArray | None = None
@@ -500,8 +452,6 @@ class _Readings:
 
 @single_threaded_blas()
 def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, CheckedSession]:
-    """Factors, the rms noise of the responses [electrons/s] where the list states the sensor's, and which frames are
-    wrong."""
     session = readings.session
     signs = stripe_signs(session.listed.n).astype(np.float64)
     sums, variances = _sums(readings, signs.shape[1], job)
@@ -513,7 +463,6 @@ def _estimate(readings: _Readings, job: Job) -> tuple[Estimate, float | None, Ch
 
 
 def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, StripeSums], list[float]]:
-    """Return sums over all responses, and the noise variance of each."""
     with job.clock.stage("frames"):
         first = [readings.response(side, 0) for side in SIDES]
     (left, *_), (right, *_) = first
@@ -541,42 +490,34 @@ def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, 
 # ---- One frame at several exposure times ----
 
 Chosen = npt.NDArray[np.bool_] | bool
-"""Pixels (rows, columns) that are chosen, or all or none."""
+"""Chosen pixels (rows, columns), or all or none."""
 _ROOM = 5.0
-"""Deviations of its noise that a uniform frame's pixel must stay below saturation: one of 3 million goes beyond."""
+"""Standard deviations that a uniform frame's pixel must stay below saturation."""
 _STRIPES_LIGHT = 0.5
-"""Light of stripes over that of the uniform frame, whose noise decides on the weights."""
+"""Light of stripes over that of the uniform frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ladder:
-    """Exposures of every frame, and how their rates are merged.
-
-    Attributes
-    ----------
-    digitals
-        how numbers of each exposure become rates, the shortest first.
-    weights
-        (exposures, rows, columns), 1 in sum; None where there is one exposure.
-    """
+    """Exposures of every frame, the shortest first, and their weights (exposures, rows, columns), or None for one."""
 
     digitals: tuple[Digital, ...]
     weights: FloatArray | None = None
 
     @classmethod
     def of(cls, digitals: Sequence[Digital], uniform: FloatArray, shots: int, merge: Merge) -> Ladder:
-        """Weights of several exposures.
+        """Return the weights of several exposures.
 
         Parameters
         ----------
         digitals
-            of each, the shortest first.
-        uniform
-            (rows, columns) rate of the uniform frame at the shortest [electrons/s].
+            Reading of each exposure, the shortest first.
+        uniform : (rows, columns) array, electrons/s
+            Rate of the uniform frame at the shortest exposure.
         shots
-            that it is the mean of.
+            Number of shots of that frame.
         merge
-            ``weighted``: by variance; ``longest``: the longest exposure that does not saturate a pixel, alone.
+            ``weighted`` by variance, or ``longest`` exposure that does not saturate a pixel.
         """
         first = digitals[0]
         light = np.maximum(uniform, 0.0)
@@ -598,7 +539,7 @@ class Ladder:
         return cls(tuple(digitals), weights)
 
     def merge(self, rates: Iterable[FloatArray], rows: slice = slice(None)) -> FloatArray:
-        """``rates`` (rows, columns) of one frame at each exposure as one; ``rows`` are those that they are of."""
+        """Return the merged ``rates`` of one frame; ``rows`` are those of the sensor that they show."""
         each = iter(rates)
         if self.weights is None:
             return next(each)
@@ -608,18 +549,13 @@ class Ladder:
         return total
 
     def used_pixels(self, exposure: int) -> Chosen:
-        """(rows, columns) whether pixels are read at an ``exposure``."""
+        """Return the pixels (rows, columns) that are read at an ``exposure``."""
         return True if self.weights is None else np.asarray(self.weights[exposure] > 0)
 
     def variance(self, light: FloatArray | float, shots: int = 1) -> float:
-        """Mean noise variance [(electrons/s)^2] of a merged sum or difference of frames.
+        """Return the mean noise variance [(electrons/s)^2] of a merged sum or difference of ``shots`` frames.
 
-        Parameters
-        ----------
-        light
-            (rows, columns) sum of their rates [electrons/s]; one number will do where there is one exposure.
-        shots
-            their number.
+        ``light`` is the sum of their rates; a single number is enough for one exposure.
         """
         if self.weights is None:
             return float(self.digitals[0].variance(float(np.mean(light)), shots))

@@ -1,38 +1,26 @@
-"""A point spread function, patterns and frames in; the image that fits them out, by conjugate gradients, or directly.
+"""Solvers of cameras whose light is one shifted pattern: conjugate gradients, or direct under dots.
 
-A camera whose scene points all cast one pattern of light, each shifted by its place, as a diffuser before a bare sensor
-does (Antipa et al., Optica 5, 1, 2018), sees under the pattern P_i (arXiv 2111.12862, section "Coded Illumination with
-Nonseparable Systems")
+A diffuser before a bare sensor casts one pattern of light h from every scene point, shifted by its place (Antipa et
+al., Optica 5, 1, 2018). Under the pattern P_i (arXiv 2111.12862, section "Coded Illumination with Nonseparable
+Systems") the frame is Y_i = crop( h * (P_i o X) ). One scene pixel shifts h by one sensor pixel. The image minimises
+sum_i ||Y_i - crop(h * (P_i o X))||^2 + lambda ||X||^2.
 
-    Y_i = crop( h * (P_i o X) )
-
-h sums to 1, one scene pixel shifts it by one sensor pixel, and the crop is the sensor, centred in all that the light
-reaches.
-The image minimises sum_i ||Y_i - crop(h * (P_i o X))||^2 + lambda ||X||^2. :func:`solve_iteratively` does what is left
-where no closed form is known: conjugate gradients on the normal equations, each step a convolution and a correlation of
-every frame. :class:`Classes` solves the same equations directly where patterns are dots.
-
-Under dots of period k no two pixels of one frame are nearer than k, and no pixel is in two frames: the normal equations
-fall into k^2 independent systems, one for the n^2/k^2 pixels of each *class* (those that shine together), as the
-paper's equation 8 does for separable cameras. Within a class
+Under dots of period k no pixel is in two frames, so that the normal equations fall into k^2 independent systems, one
+for the n^2/k^2 pixels of each *class* that shines together, as in the paper's equation 8. Within a class
 
     G[p, p'] = sum over sensor pixels s of h[s - p] h[s - p'],       p - p' a multiple of k
 
-**Whole light.** Where the sensor gets all light, G depends on p - p' alone: it is one convolution with h's
-autocorrelation r taken at every k-th place, the same for all classes. On the whole plane the equations are solved by a
-division, in the Fourier domain, by S + lambda, where S is the spectrum |H|^2 folded k times (:meth:`Classes.divide`).
-That answer takes the plane beyond the projector's window for unknown; the one that knows it to be dark solves a section
-of that convolution, by conjugate gradients on grids of 2n/k pixels a side, all frames' transforms being done with once.
+**Whole light.** Where the sensor gets all light, G depends on p - p' alone: it is a section of one convolution with h's
+autocorrelation at every k-th place, the same for all classes, and is solved on grids of 2n/k pixels a side.
 
-**Cropped.** At the sensor's edges light is lost, and G hangs on p too. Its entries are sums of h[u] h[u + p - p'] over
-a window of u, which sums along rows and columns give for all pixels at once, exactly; then each class is factorised by
-Cholesky. Classes of too many pixels are solved by conjugate gradients with the crop in each step, for which the
-division is near the inverse and saves a third to a half of the steps.
+**Cropped.** Elsewhere the entries of G are sums of h[u] h[u + p - p'] over a window of u, which cumulative sums give
+exactly, and each class is factorised by Cholesky. Classes of too many pixels are solved by conjugate gradients with the
+crop in each step, preconditioned by a division by S + lambda, where S is the spectrum |H|^2 folded k times.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -44,158 +32,41 @@ from scipy import fft, linalg
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.patterns import parse_patterns
+from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import check_lambda
 
 Operator = Callable[[FloatArray], FloatArray]
 """From an image (n, n) to another."""
 Watch = Callable[[FloatArray], bool]
-"""Looks at an image (n, n) under way, and says whether it is good enough."""
-
-
-@dataclass(frozen=True, eq=False)
-class ConvolutionalCamera:
-    """A point spread function over a scene of n x n pixels.
-
-    Attributes
-    ----------
-    psf
-        (rows, columns) light of one scene pixel, in sensor pixels; usually of sum 1.
-    n
-        scene pixels a side.
-    sensor
-        (rows, columns) of the sensor, centred; None: all that any scene pixel's light reaches.
-    """
-
-    psf: FloatArray
-    n: int
-    sensor: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
-            raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
-        if self.n < 1:
-            raise MitsimError(f"scene of {self.n} pixels a side; give at least 1")
-        if any(not 1 <= size <= most for size, most in zip(self.shape, self.whole, strict=True)):
-            raise MitsimError(
-                f"sensor of {self.shape[0]} x {self.shape[1]} pixels; give 1 x 1 to {self.whole[0]} x {self.whole[1]}, "
-                "what the light of the whole scene reaches"
-            )
-
-    @property
-    def whole(self) -> tuple[int, int]:
-        """Rows and columns that any scene pixel's light reaches."""
-        rows, columns = self.psf.shape
-        return rows + self.n - 1, columns + self.n - 1
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the sensor."""
-        return self.sensor or self.whole
-
-    @property
-    def cropped(self) -> bool:
-        """Whether light falls beside the sensor."""
-        return self.shape != self.whole
-
-    @property
-    def origin(self) -> tuple[int, int]:
-        """Row and column of the whole light at which the sensor begins."""
-        rows, columns = ((most - size) // 2 for size, most in zip(self.shape, self.whole, strict=True))
-        return rows, columns
-
-    def image_of(self, scene: npt.ArrayLike) -> FloatArray:
-        """What the sensor sees of a ``scene`` (n, n) of shining pixels."""
-        spectrum = fft.rfft2(np.asarray(scene, dtype=np.float64), self._grid) * self._spectrum
-        (row, column), (rows, columns) = self.origin, self.shape
-        return np.asarray(fft.irfft2(spectrum, self._grid)[row : row + rows, column : column + columns])
-
-    def correlate(self, frame: npt.ArrayLike) -> FloatArray:
-        """Adjoint of :meth:`image_of`: (n, n) sum of a ``frame`` weighted by the light of each scene pixel."""
-        (row, column), (rows, columns) = self.origin, self.shape
-        placed = np.zeros(self._grid)
-        placed[row : row + rows, column : column + columns] = frame
-        return np.asarray(fft.irfft2(fft.rfft2(placed) * self._spectrum.conj(), self._grid)[: self.n, : self.n])
-
-    def frames(self, family: PatternFamily, scene: npt.ArrayLike) -> Iterator[FloatArray]:
-        """The noise-free frame of each pattern of a ``family`` on a ``scene`` (n, n), row-major over (i, j)."""
-        for light in self._lights(family):
-            yield self.image_of(light * np.asarray(scene))
-
-    def project(self, family: PatternFamily, frames: Iterable[FloatArray]) -> FloatArray:
-        """Adjoint of :meth:`frames`: (n, n) sum over the patterns of a ``family`` and their ``frames``."""
-        total = np.zeros((self.n, self.n))
-        count = family.left.shape[1] * family.right.shape[1]
-        for light, frame in zip(self._lights(family), self.check_frames(frames, count), strict=True):
-            total += light * self.correlate(frame)
-        return total
-
-    def check_frames(self, frames: Iterable[FloatArray], count: int) -> Iterator[FloatArray]:
-        """``frames`` one by one. MitsimError where one has not the sensor's shape or a number that is not finite,
-        or where there are not ``count`` of them."""
-        seen = 0
-        for seen, frame in enumerate(frames, start=1):
-            if seen > count or frame.shape != self.shape or not np.isfinite(frame).all():
-                raise MitsimError(
-                    f"frame {seen} of shape {frame.shape}, of {count} of shape {self.shape}: give as many as there are "
-                    "patterns, as large as the sensor, of finite numbers"
-                )
-            yield frame
-        if seen < count:
-            raise MitsimError(f"{seen} frames for {count} patterns; give all of them")
-
-    def _lights(self, family: PatternFamily) -> Iterator[FloatArray]:
-        if family.n != self.n:
-            raise MitsimError(f"patterns of {family.n} pixels a side for a scene of {self.n}; both need the same")
-        for row in family.left.T:
-            for column in family.right.T:
-                yield np.outer(row, column).astype(np.float64)
-
-    @property
-    def _grid(self) -> tuple[int, int]:
-        """The whole light and more, so that nothing wraps round, in sizes that transform fast."""
-        rows, columns = (fft.next_fast_len(size, real=True) for size in self.whole)
-        return rows, columns
-
-    @cached_property
-    def _spectrum(self) -> npt.NDArray[np.complex128]:
-        return np.asarray(fft.rfft2(self.psf, self._grid))
+"""Return True for an image (n, n) during the iterations that is good enough."""
 
 
 def solve_iteratively(
-    camera: ConvolutionalCamera,
-    family: PatternFamily,
-    frames: Iterable[FloatArray],
-    lam: float | str,
+    camera: ShiftedLight,
+    frames: FloatArray,
+    lam: float,
     tolerance: float = 1e-6,
     iterations: int = 500,
     watch: Watch | None = None,
 ) -> Solution:
-    """Tikhonov image of any ``family`` by conjugate gradients.
+    """Solve the normal equations of all frames by conjugate gradients.
 
     Parameters
     ----------
-    camera, family, frames
-        what saw the patterns, these, and a frame of each, row-major over (i, j).
-    lam
-        lambda >= 0, in the unit of the point spread function squared.
-    tolerance
-        residual of the normal equations, relative, at which it ends.
-    iterations
-        it takes at most; that image is not ok.
-    watch
-        called with the image after each step; where it says True, that was the last.
-
-    Raises
-    ------
-    MitsimError
-        for another lambda, or frames that do not fit.
+    camera
+        Camera with the patterns that the frames were taken under.
+    frames : (patterns, rows, columns) array
+        Sensor frames in the order of the patterns.
+    lam, tolerance, iterations, watch
+        See :func:`conjugate_gradients`.
     """
-
-    def normal(image: FloatArray) -> FloatArray:
-        return camera.project(family, camera.frames(family, image))
-
-    return conjugate_gradients(normal, camera.project(family, frames), lam, None, tolerance, iterations, watch)
+    camera.check_frames(frames)
+    target = camera.correlate(frames)
+    return conjugate_gradients(
+        lambda image: camera.correlate(camera.image_of(image)), target, lam, None, tolerance, iterations, watch
+    )
 
 
 def conjugate_gradients(
@@ -212,15 +83,15 @@ def conjugate_gradients(
     Parameters
     ----------
     normal
-        a symmetric operator without negative eigenvalues.
+        Symmetric operator without negative eigenvalues.
     target
-        right-hand side, of the shape of X.
+        Right-hand side, of the shape of X.
     lam
-        lambda >= 0.
+        Lambda >= 0.
     inverse
-        something near the inverse of normal + lambda, symmetric and positive, which saves steps.
+        Preconditioner: symmetric, positive, and near the inverse of normal + lambda.
     tolerance, most, watch
-        relative residual at which it ends, the most steps, and what ends it before: :data:`Watch`.
+        Relative residual and number of steps that end the iterations, and a function that may end them before.
     """
     lam = check_lambda(lam)
     image, left = np.zeros_like(target), target
@@ -248,63 +119,72 @@ def conjugate_gradients(
     return Solution(image, lam, residual, status, iterations=spent)
 
 
-def check_lambda(lam: float | str) -> float:
-    """``lam``; MitsimError where it is no finite number of at least 0."""
-    if isinstance(lam, str) or not (np.isfinite(lam) and lam >= 0):
-        raise MitsimError(f"lambda is {lam}; give a finite number of at least 0")
-    return float(lam)
-
-
 # ---- Frames under dots of period k, solved directly, class by class --------------------------------------------------
 
 
 MOST_FACTORISED = 2048
-"""Pixels of a class up to which it is factorised: at 128 x 128 scene pixels all classes then take 270 MB, and their
-factors as much; one of 4096 pixels takes 23 Gflop, more than its conjugate gradients."""
+"""Largest number of pixels of a factorised class; all classes of 128 x 128 scene pixels then take 270 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Classes:
-    """A ``camera`` under shifting dots of period ``k``; 1 is uniform light. Frames are those of ``dots:k``."""
+    """Camera under shifting dots of period ``k``; 1 is uniform light."""
 
-    camera: ConvolutionalCamera
+    camera: ShiftedLight
     k: int
 
     def __post_init__(self) -> None:
-        if not 1 <= self.k <= self.camera.n:
-            raise MitsimError(f"dots of period {self.k}: give 1 to {self.camera.n}, the scene's pixels a side")
+        if not 1 <= self.k <= self._n:
+            raise MitsimError(f"dots of period {self.k}: give 1 to {self._n}, the scene's pixels a side")
+
+    @property
+    def cropped(self) -> bool:
+        """Whether light misses the sensor."""
+        return self.camera.sensor != self.camera.whole
+
+    @property
+    def _n(self) -> int:
+        return self.camera.scene[0]
+
+    @cached_property
+    def _lit(self) -> ShiftedLight:
+        return self.camera.under(parse_patterns(f"dots:{self.k}", self._n))
 
     @property
     def factorised(self) -> bool:
         """Whether normal matrices are formed and factorised."""
-        return self.camera.cropped and self._side**2 <= MOST_FACTORISED
+        return self.cropped and self._side**2 <= MOST_FACTORISED
 
     @property
     def largest(self) -> float:
-        """Largest of S: what lambda is to be compared with."""
+        """Largest number of S, which lambda is relative to."""
         return float(self._power.max())
 
-    def project(self, frames: Iterable[FloatArray]) -> FloatArray:
-        """(n, n) sum of all ``frames`` weighted by the light of each scene pixel: `ConvolutionalCamera.project`, each
-        frame taken at its own pixels only."""
-        return self._interleave(spectrum for spectrum in self._fold_frames(frames))
-
-    def divide(self, frames: Iterable[FloatArray], lam: float) -> FloatArray:
-        """(n, n) image by one division, of ``frames`` at ``lam``: the Tikhonov image of a plane without a dark
-        surround, exact for the whole light."""
-        weight = 1 / (self._power + check_lambda(lam))
-        return self._interleave(spectrum * weight for spectrum in self._fold_frames(frames))
+    def project(self, frames: FloatArray) -> FloatArray:
+        """Return the (n, n) sum of all ``frames``, each correlated with the light of the pixels of its class."""
+        self._lit.check_frames(frames)
+        weight = self._spectrum.conj()
+        (row, column), (rows, columns) = self.camera.origin, self.camera.sensor
+        classes = np.empty((self.k, self.k, self._side, self._side))
+        for (a, b), frame in zip(product(range(self.k), repeat=2), frames, strict=True):
+            placed = np.zeros(weight.shape)
+            # Moved so that the class's first pixel is the first number.
+            placed[:rows, :columns] = frame
+            placed = np.roll(placed, (row - a, column - b), axis=(0, 1))
+            light = fft.ifft2(self._fold(fft.fft2(placed) * weight))
+            classes[a, b] = light.real[: self._side, : self._side]
+        return self._join(classes)
 
     def factorise(self, lam: float) -> FactorisedClasses:
-        """All classes at ``lam``, ready for any number of scenes.
+        """Return all classes at ``lam``, ready for any number of scenes.
 
-        MitsimError for another lambda, or where a class is too ill-conditioned for it.
+        Raises MitsimError where a class is too ill-conditioned.
         """
         lam = check_lambda(lam)
         if not self.factorised:
             return FactorisedClasses(self, lam, None)
         grams = self._grams.reshape(self.k**2, self._side**2, self._side**2)
-        lit = self._split_classes(np.ones((self.camera.n,) * 2)).reshape(self.k**2, -1) > 0
+        lit = self._split_classes(np.ones((self._n,) * 2)).reshape(self.k**2, -1) > 0
 
         def factor(index: int) -> FloatArray:
             gram = grams[index].copy()
@@ -322,22 +202,15 @@ class Classes:
     # ---- equations
 
     def normal(self, image: FloatArray) -> FloatArray:
-        """(n, n) product of the normal matrix of all classes with an ``image`` (n, n)."""
-        if not self.camera.cropped:
+        """Return the normal matrix of all classes times an ``image`` (n, n)."""
+        if not self.cropped:
             classes = fft.rfft2(self._split_classes(image), self._section[0])
             whole = fft.irfft2(classes * self._section[1], self._section[0])
             return self._join(whole[..., : self._side, : self._side])
-        light = np.zeros_like(image)
-        total = np.zeros_like(image)
-        for a, b in product(range(self.k), repeat=2):
-            pixels = slice(a, None, self.k), slice(b, None, self.k)
-            light[pixels] = image[pixels]
-            total[pixels] = self.camera.correlate(self.camera.image_of(light))[pixels]
-            light[pixels] = 0
-        return total
+        return self._lit.correlate(self._lit.image_of(image))
 
     def inverse(self, lam: float) -> Operator:
-        """Division of an image by S + ``lam``: near the normal matrix's inverse, symmetric and positive."""
+        """Return the division of an image by S + ``lam``, symmetric, positive and near the normal matrix's inverse."""
         least = max(lam, float(np.finfo(np.float64).eps) * self.largest)
         weight = 1 / (self._power[:, : self._grid[1] // 2 + 1] + least)
 
@@ -351,12 +224,10 @@ class Classes:
 
     @property
     def _side(self) -> int:
-        """Pixels a side of the largest class."""
-        return -(-self.camera.n // self.k)
+        return -(-self._n // self.k)
 
     @property
     def _grid(self) -> tuple[int, int]:
-        """Every k-th place of a grid that holds the whole light."""
         rows, columns = (fft.next_fast_len(-(-size // self.k)) for size in self.camera.whole)
         return rows, columns
 
@@ -365,19 +236,16 @@ class Classes:
         return np.asarray(fft.fft2(self.camera.psf, tuple(self.k * size for size in self._grid)))
 
     def _fold(self, spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-        """Spectrum of every k-th number from the first on."""
         rows, columns = self._grid
         return np.asarray(spectrum.reshape(self.k, rows, self.k, columns).mean(axis=(0, 2)))
 
     @cached_property
     def _power(self) -> FloatArray:
-        """S: spectrum of the autocorrelation at every k-th place."""
         power = np.square(np.abs(self._spectrum))
         return np.asarray(self._fold(power).real)
 
     @cached_property
     def _section(self) -> tuple[tuple[int, int], npt.NDArray[np.complex128]]:
-        """Grid, and spectrum on it, of the autocorrelation between pixels of one class."""
         size = fft.next_fast_len(2 * self._side - 1, real=True)
         steps = (np.arange(size) + size // 2) % size - size // 2
         near = np.abs(steps) < self._side
@@ -386,41 +254,17 @@ class Classes:
         kernel = np.where(np.outer(near, near), correlation[np.ix_(rows, columns)], 0.0)
         return (size, size), np.asarray(fft.rfft2(kernel))
 
-    def _fold_frames(self, frames: Iterable[FloatArray]) -> Iterator[npt.NDArray[np.complex128]]:
-        """Spectrum of each frame's correlation with h at the pixels of its class."""
-        weight = self._spectrum.conj()
-        (row, column), (rows, columns) = self.camera.origin, self.camera.shape
-        for (a, b), frame in zip(
-            product(range(self.k), repeat=2), self.camera.check_frames(frames, self.k**2), strict=True
-        ):
-            placed = np.zeros(self._spectrum.shape)
-            # Moved so that the class's first pixel is the first number.
-            placed[:rows, :columns] = frame
-            placed = np.roll(placed, (row - a, column - b), axis=(0, 1))
-            yield self._fold(fft.fft2(placed) * weight)
-
-    def _interleave(self, spectra: Iterable[npt.NDArray[np.complex128]]) -> FloatArray:
-        """Image (n, n) of the spectra of its classes."""
-        classes = np.empty((self.k**2, self._side, self._side))
-        for place, spectrum in zip(classes, spectra, strict=True):
-            place[:] = fft.ifft2(spectrum).real[: self._side, : self._side]
-        return self._join(classes.reshape(self.k, self.k, self._side, self._side))
-
     def _split_classes(self, image: FloatArray) -> FloatArray:
-        """(k, k, side, side) classes of an image, zero beyond its edge."""
-        room = self._side * self.k - self.camera.n
+        room = self._side * self.k - self._n
         padded = np.pad(image, ((0, room), (0, room)))
         return padded.reshape(self._side, self.k, self._side, self.k).transpose(1, 3, 0, 2)
 
     def _join(self, classes: FloatArray) -> FloatArray:
-        """Image (n, n) of its classes."""
         size = self._side * self.k
-        return np.ascontiguousarray(classes.transpose(2, 0, 3, 1).reshape(size, size)[: self.camera.n, : self.camera.n])
+        return np.ascontiguousarray(classes.transpose(2, 0, 3, 1).reshape(size, size)[: self._n, : self._n])
 
     @cached_property
     def _grams(self) -> FloatArray:
-        """(k, k, side, side, side, side) lower triangles of all normal matrices: what pixels (i, j) and (i', j') of a
-        class share on the sensor."""
         k, side = self.k, self._side
         grams = np.zeros((k, k, side, side, side, side))
 
@@ -436,17 +280,17 @@ class Classes:
         return grams
 
     def _shared_light(self, below: int, right: int) -> FloatArray:
-        """(n, n) sum over the sensor of each pixel's light times that of the pixel so far above and to the left."""
+        """Return the sum (n, n) over the sensor of each pixel's light times that of a pixel above and to the left."""
         psf, (rows, columns) = self.camera.psf, self.camera.psf.shape
         first, last = max(-right, 0), columns - max(right, 0)
         if below >= rows or last <= first:
-            return np.zeros((self.camera.n,) * 2)
+            return np.zeros((self._n,) * 2)
         both = psf[: rows - below, first:last] * psf[below:, first + right : last + right]
         for axis, start in ((0, 0), (1, first)):
             sums = np.insert(np.cumsum(both, axis=axis), 0, 0.0, axis=axis)
             # Sensor pixel s is place s - p of the light of pixel p.
-            edge = self.camera.origin[axis] - np.arange(self.camera.n) - start
-            ends = np.clip([edge, edge + self.camera.shape[axis]], 0, both.shape[axis])
+            edge = self.camera.origin[axis] - np.arange(self._n) - start
+            ends = np.clip([edge, edge + self.camera.sensor[axis]], 0, both.shape[axis])
             both = np.take(sums, ends[1], axis=axis) - np.take(sums, ends[0], axis=axis)
         if right < 0:
             both[:, right:] = 0  # their partner is beyond the scene's edge
@@ -455,26 +299,18 @@ class Classes:
 
 @dataclass(frozen=True, eq=False)
 class FactorisedClasses:
-    """``classes`` at one ``lam``; with the Cholesky factors of each, or None where conjugate gradients solve them."""
+    """Classes at one ``lam`` with their Cholesky factors, or None where conjugate gradients solve them."""
 
     classes: Classes
     lam: float
     factors: list[FloatArray] | None
 
     def solve(self, projected: FloatArray, tolerance: float = 1e-6) -> Solution:
-        """The Tikhonov image of frames.
-
-        Parameters
-        ----------
-        projected
-            (n, n) :meth:`Classes.project` of them.
-        tolerance
-            relative residual of the normal equations at which conjugate gradients end.
-        """
+        """Return the Tikhonov image of ``projected`` frames (:meth:`Classes.project`)."""
         classes = self.classes
         if self.factors is None:
             # On a section's small grids the division would take longer than the steps that it saves.
-            inverse = classes.inverse(self.lam) if classes.camera.cropped else None
+            inverse = classes.inverse(self.lam) if classes.cropped else None
             return conjugate_gradients(classes.normal, projected, self.lam, inverse, tolerance)
         targets = classes._split_classes(projected)
         image = np.empty_like(targets)

@@ -1,56 +1,69 @@
-"""Shots and factors in; the one depth out whose factors leave least of the measurements unexplained.
+"""Depth of the scene as a whole or for each projector pixel, by the least unexplained energy.
 
-Only what lies in the model's range counts, whatever lambda: the energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2 of
-:mod:`mitsim.reconstruct.misfit`. It has a narrow valley at the true depth, and others where dots of period k see their
-neighbours' light: parallax by k pixels moves the image by as much, and all that tells the two apart are the image's
-edges and what the sensor's own width adds to parallax. So depths are tried in steps of a pixel of parallax, every
-valley that may be the lowest is followed to its bottom, and those that chance or the model's own misfit may have made
-lower are named beside the lowest.
+*One depth.* The energy ||Y||^2 - sum_ij ||U_Li^T Y_ij U_Rj||^2, which no lambda changes, has a narrow valley at the
+true depth, and others where dots of period k see their neighbours' light. So depths are tried in steps of a pixel of
+parallax, every valley that may be the lowest is followed to its bottom, and valleys that chance or the model's own
+misfit may have raised are named beside the lowest. Columns of neighbouring depths are much alike: a few hundred vectors
+span them, so that frames are read once and kept small.
 
-*The basis that depths share.* Columns of neighbouring depths are much alike: a few hundred vectors span all of them,
-and what of a frame lies outside is not explained at any depth. So frames are read once and kept small.
-"""
+*A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the baseline
+were lit, which shows where each dot's light arrives. Then each pixel has columns of both factors at its own depth. The
+model is linear in (X, X o d), d a change of 1/z, so that each Gauss-Newton step, with the d of neighbours pooled, is
+one closed-form solve for each frame: its normal matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take
+the depth on its other side where that explains more. Depths whose parallax spans more than a period of the dots are
+ambiguous."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
-from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
+from mitsim.reconstruct.accumulation import FrameNoise, LitFrames, factor_energy
 from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, parallax_period
+from mitsim.reconstruct.focus import (
+    LEAST_PART,
+    STEP,
+    FactorOfDepths,
+    are_dots,
+    move_factors,
+    parallax_of,
+    parallax_period,
+    pixels_of_parallax,
+    unambiguous_parallax,
+)
+from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
+from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
-from mitsim.reconstruct.subpixel import LitFrames
 
 _STEP = 1.0
-"""Projector pixels of parallax between depths that are tried first: the valley is some two wide on either side."""
+"""Projector pixels of parallax between depths that are tried first."""
 _RESOLUTION = 0.01
-"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm; chosen, below
-the millimetre that is asked for."""
+"""Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm."""
 _FEWEST = 32
-"""Steps at least, where there is no baseline and only the sensor's own width tells depth."""
+"""Least number of steps, for devices without a baseline."""
 _LEAST_RISE = 2e-5
-"""Part of the measurements' energy that a pixel of parallax must add to what is left over, or depth is not told.
-Uniform light stays below it (5e-8 to 2e-5), and there print within pixels moves depth by up to 12 standard errors."""
+"""Part of the measurements' energy that a pixel of parallax must add, or depth is undetermined. Uniform light stays
+below."""
 _SIMILAR = 2.0
-"""A valley's depth below the step next to it is at most so many times that of the lowest valley; chosen, as valleys of
-one scene are alike in shape."""
+"""Largest ratio of a valley's depth to that of the lowest valley."""
 _OPPOSED = 4.0
-"""Times the unexplained energy S by which two depths must differ: r being what the wrong one does not explain of the
-light of the right one, less is left of it than of the right one only if 2 r.d > |r|^2 for the misfit d of energy S; so
-|r|^2 < 4 S."""
+"""Times the unexplained energy S by which two depths must differ. With r the light of the right depth that the wrong
+one does not explain, the wrong one leaves less only if 2 r.d > |r|^2 for the misfit d of energy S, so |r|^2 < 4 S."""
 _LAMBDA = 1e-3
-"""Of the image by which the noise of factors is weighed, over the largest sigma^2: chosen, like that of pixeldepths."""
+"""Lambda over the largest sigma^2 of the image that weighs the noise of factors."""
 
 
 # ---- A depth, its error and its alternatives ----
@@ -58,8 +71,7 @@ _LAMBDA = 1e-3
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another depth [mm] that explains the measurements as well, and how much less it explains (rms, relative to all
-    measurements)."""
+    """Another depth [mm] that explains the measurements as well, and its residual beyond the best (rms, relative)."""
 
     mm: float
     difference: float
@@ -67,22 +79,20 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Depth:
-    """A depth whose factors are used.
+    """Depth whose factors are used.
 
     Attributes
     ----------
-    mm
-        depth.
     error_mm
-        standard error of one that was found; where another depth explains as much, the distance to it.
+        Standard error, or the distance to an alternative; None for a given depth.
     doubt
-        why it is not to be trusted, or nothing.
+        Reason for not trusting the depth, or nothing.
     range_mm
-        nearest and farthest depth that were tried; None where it was given.
+        Nearest and farthest tried depth.
     alternatives
-        depths that explain the measurements as well.
+        Depths that explain the measurements as well.
     at_end
-        whether it is an end of what was tried, where nothing fits.
+        Whether the depth is an end of the tried range.
     """
 
     mm: float
@@ -105,54 +115,25 @@ class Depth:
 
 
 def chance_difference(difference: float, variance: float, unknowns: int) -> float:
-    """Energy by which noise may make what two models leave over differ.
+    """Return the energy by which noise may make the residuals of two models differ.
 
-    The light that the wrong one does not explain, of energy D, meets noise: 4 v D. The noise that one of them takes up
-    and the other does not has the variance 4 v^2 times the unknowns, or less.
-
-    Parameters
-    ----------
-    difference
-        D that was found.
-    variance
-        v of a datum.
-    unknowns
-        of each model.
+    Light of energy D (``difference``) that the wrong model does not explain meets noise of variance v: 4 v D. Noise
+    that only one of the models takes up has the variance 4 v^2 times the ``unknowns``, or less.
     """
     return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
 
 
 @single_threaded_blas()
 def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
-    """The one depth whose factors explain most of the measurements.
+    """Return the depth whose factors explain most of the measurements.
 
-    Parameters
-    ----------
-    shots
-        of a scene.
-    factors
-        of the same camera, with their parallax.
-    depth_range
-        nearest and farthest depth [mm] that are tried; None: a quarter of 1/z either way of the calibrated one.
-
-    Raises
-    ------
-    MitsimError
-        for a calibration without parallax, or a frame that cannot be read; ArgumentError for a range that too little of
-        the sensor knows.
+    ``depth_range`` are the nearest and farthest tried depth [mm], by default a quarter of 1/z either way. Raises
+    MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
     """
     return _Search(shots, factors, depth_range).find()
 
 
 class _Search:
-    """What one depth for the whole scene leaves of all measurements.
-
-    Attributes
-    ----------
-    pixel
-        change of 1/z [1/mm] that moves light by one projector pixel, along the axis where it moves more.
-    """
-
     def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
         self._ends, self._period = shifts_searched(factors, depth_range), np.inf
         beyond = 0.0
@@ -163,14 +144,13 @@ class _Search:
         self._tried = self._ends[0] - beyond, self._ends[1] + beyond
         self._shots, self._factors = shots, factors
         rows, columns = shots.patterns
-        self._groups = group_pixels(rows, "auto"), group_pixels(columns, "auto")
+        self._groups = group_pixels(rows), group_pixels(columns)
         self._all = CommonBasis(shots, factors, self._tried, self._groups)
         self._inverse, self._factor_noise = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
         self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
         self._unknowns = self._all.shape[0] * self._all.shape[1]
 
     def find(self) -> Depth:
-        """The lowest valley, and all that may be as low."""
         margin = 2 * _RESOLUTION * self.pixel
         valleys = sorted(self._valleys(*self._ends))
         valleys = sorted([*valleys, *self._beyond(valleys[0][1], margin)])
@@ -214,9 +194,8 @@ class _Search:
         )
 
     def left_over(self, shift: float) -> float:
-        """Energy of the measurements that factors moved by ``shift`` of 1/z leave."""
         left, right = (
-            factorise(self._all.side(axis, shift), patterns, groups, "svd", "auto", False)
+            factorise(self._all.side(axis, shift), patterns, groups)
             for axis, (patterns, groups) in enumerate(zip(self._all.patterns, self._groups, strict=True))
         )
         measured = np.outer(left.singular, right.singular) > 0
@@ -225,8 +204,6 @@ class _Search:
     # ---- Valleys of the energy over 1/z ----
 
     def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
-        """Energy left over at the bottom of the lowest valley between two changes of 1/z and of those that may be as
-        low, and changes of 1/z."""
         steps = max(int(np.ceil((last - first) / (_STEP * self.pixel))), _FEWEST)
         shifts = np.linspace(first, last, steps + 1)
         scores = np.array([self.left_over(shift) for shift in shifts])
@@ -244,8 +221,7 @@ class _Search:
             yield left, shift
 
     def _beyond(self, shift: float, margin: float) -> Iterator[tuple[float, float]]:
-        """The same of depths beyond the range that are a period of the dots from the best ``shift`` within it, or
-        several; and of all beyond an end that it is, within the ``margin``."""
+        """Yield valleys beyond the range, whole periods of the dots from the best ``shift`` or beside it at an end."""
         for end, tried, step in zip(self._ends, self._tried, (-self._period, self._period), strict=True):
             if tried == end:
                 continue
@@ -259,7 +235,6 @@ class _Search:
                     yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
 
     def _bottom(self, first: float, last: float) -> tuple[float, float]:
-        """Least energy left over between two changes of 1/z, and where."""
         least = minimize_scalar(
             self.left_over, bounds=(first, last), method="bounded", options={"xatol": _RESOLUTION * self.pixel}
         )
@@ -268,8 +243,6 @@ class _Search:
     # ---- Standard error, and valleys that may be as low ----
 
     def _certainty(self, shift: float, least: float) -> tuple[float, float]:
-        """Standard error of the ``shift`` that leaves ``least``, from a parabola through quarters of a pixel: what is
-        left over rises by its own mean over a datum; and how much more is left a pixel beside."""
         before, after = (self.left_over(shift + part * self.pixel) for part in (-0.25, 0.25))
         rise = min(self.left_over(shift + self.pixel), self.left_over(shift - self.pixel)) - least
         curvature = (before - 2 * least + after) / (self.pixel / 4) ** 2
@@ -277,24 +250,19 @@ class _Search:
         return error, float(rise)
 
     def _variance(self, least: float) -> float:
-        """Of a datum, by what the best depth leaves."""
         return float(least / max(self._all.data - self._unknowns, 1))
 
     def _indifferent(self, difference: float, least: float, misfit: float) -> float:
-        """Energy by which two depths may differ of which either is the right one."""
+        """Return the energy by which two depths may differ of which either is the right one."""
         return max(chance_difference(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
 
     def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
-        """Those of the sorted ``valleys`` that may be the right one, beside the lowest, by what its depth leaves beyond
-        noise."""
         least = valleys[0][0]
         return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
 
     # ---- Print, and what stays unexplained ----
 
     def _print_part(self, shift: float) -> float:
-        """Part of the misfit at the depth of ``shift`` that is print finer than a scene pixel: its light lies on either
-        side of the pixels' centres, so no other depth explains it."""
         there = move_factors(self._factors, self._mm(shift))
         lit = LitFrames(there.factors.sides, self._all.patterns)
         for each in there.of(self._shots).pattern_measurements():
@@ -303,8 +271,6 @@ class _Search:
         return float(np.nan_to_num(lit.print_part()))
 
     def _misfit(self, shift: float, least: float) -> float:
-        """Energy that the depth of ``shift`` leaves beyond what noise of frames and factors and rendering leave; 0
-        where the noise is not stated."""
         noise, stated = self._all.noise, self._factor_noise
         if not (noise.stated and stated):
             return 0.0
@@ -324,43 +290,35 @@ class _Search:
 # ---- A basis that factors of all depths share ----
 
 RANGE = 0.25
-"""Depths that are looked for where no range is given, as a part of 1/z: 320 to 533 mm for 400. A baseline of 60 mm
-moves light by an eighth of a window of 0.3 rad."""
+"""Searched part of 1/z on either side: 320 to 533 mm for 400."""
 _LEFT_OUT = 1e-6
-"""Part of the factors' energy that the common basis of all depths may leave out: below their noise's."""
+"""Part of the factors' energy that the common basis may omit."""
 _STILL, _BETWEEN = 2.0, 4
-"""Projector pixels of parallax up to which dots have a basis of their own along an axis, as depth hardly moves their
-shadows there: a quarter of the vectors (54 of 200, 20 of 126), where more parallax leaves none out; and depths a pixel
-that these are made of, as no neighbour's column makes up for one between."""
+"""Projector pixels of parallax up to which dots have a basis of their own along an axis, and depths a pixel of the
+basis."""
 
 
 class CommonBasis:
-    """Frames of a capture, and factors of any depth within a range.
+    """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
 
     Parameters
     ----------
-    shots, factors
-        of the same camera; MitsimError for factors without parallax.
     shifts
-        least and largest change of 1/z [1/mm]; ArgumentError where too little of the sensor knows all these depths.
+        Least and largest change of 1/z [1/mm].
     groups
-        scene pixels along both axes that patterns light apart
-        (:func:`mitsim.reconstruct.factorisation.group_pixels`): where each pattern lights one group, its frames may be
-        on a basis of that alone, and so are the columns of :meth:`side`. None: all frames of an axis share one.
+        Groups of scene pixels that patterns light apart (:func:`mitsim.reconstruct.factorisation.group_pixels`), each
+        of which may have a basis of its own. None: all frames of an axis share one.
 
     Attributes
     ----------
-    parallax, patterns
-        of the factors and the shots.
     noise
-        of the measurements on the whole sensor.
+        Noise of the measurements on the whole sensor.
     frames, stack
-        measurements on the bases, one by one and all in one (K, r, K', r').
+        Measurements on the bases, one by one and in one array (K, r, K', r').
     energy, outside
-        squared norm of the measurements on the part of the sensor where all depths are known, and what of it no depth
-        explains.
+        Squared norm of the measurements where all depths are known, and the part that no depth explains.
     data, part
-        their number, and what part of the sensor they are of.
+        Number of these measurements, and their part of the sensor.
     """
 
     def __init__(
@@ -416,12 +374,11 @@ class CommonBasis:
         return self._sides[0].factor.shape[1], self._sides[1].factor.shape[1]
 
     def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        """(r, n) factor of an ``axis`` on its basis, 1/z changed by ``shift`` [1/mm] for all pixels or for each."""
+        """Return the factor (r, n) of an ``axis`` on its basis, with 1/z changed by ``shift`` [1/mm]."""
         return self._bases[axis].project(self._own(self._columns_at(axis, shift)))
 
     def widen(self, axis: int, pixels: int) -> FloatArray:
-        """(r, ``pixels`` + n + ``pixels``) columns of an ``axis`` on its basis, with those that light beside the window
-        has: of the outermost pixels, moved there by their depth."""
+        """Return the columns of an ``axis`` with ``pixels`` more a side, of the outermost pixels at other depths."""
         edges = self.edges(axis)
         before, beyond = (self._columns_at(axis, offset / edges) for offset in (-pixels, pixels))
         count = before.shape[1]
@@ -429,15 +386,15 @@ class CommonBasis:
         return self._bases[axis].project(self._own(columns))
 
     def edges(self, axis: int) -> FloatArray:
-        """(n,) projector pixels along an ``axis`` that a change of 1/z by 1/mm moves the light of each."""
+        """Return the projector pixels (n,) along an ``axis`` that a change of 1/z by 1/mm moves each pixel's light."""
         return self._sides[axis].edges
 
     def reach(self, axis: int) -> float:
-        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees, along an ``axis``."""
+        """Return the largest parallax along an ``axis`` by a change of 1/z by 1/mm [projector pixels]."""
         return self._sides[axis].reach
 
     def smoothing(self, shift: float) -> float:
-        """Variance of noise in the factors at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones."""
+        """Return the variance of noise in the factors at 1/z changed by ``shift``, over that of the calibrated ones."""
         return float(np.mean([side.noise(shift) ** 2 for side in self._sides]))
 
     def _columns_at(self, axis: int, shift: float | FloatArray) -> FloatArray:
@@ -451,15 +408,7 @@ class CommonBasis:
 
 
 def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
-    """Least and largest change of 1/z [1/mm] of the depths that are looked for.
-
-    Parameters
-    ----------
-    factors
-        with their parallax.
-    depth_range
-        nearest and farthest depth [mm], ArgumentError where the mask is beyond the nearest; None: :data:`RANGE`.
-    """
+    """Return the least and largest change of 1/z [1/mm] of the searched depths."""
     parallax = parallax_of(factors)
     if depth_range is None:
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
@@ -472,7 +421,6 @@ def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -
 
 
 def _alone(groups: tuple[Group, ...], patterns: FloatArray) -> list[tuple[npt.NDArray[np.intp], list[int]]] | None:
-    """Scene pixels of each group, and which of the ``patterns`` (n, K) light it; None where one lights several."""
     lit = np.array([[group.lights(index) for index in range(patterns.shape[1])] for group in groups])
     if len(groups) == 1 or (lit.sum(axis=0) > 1).any():
         return None
@@ -480,9 +428,6 @@ def _alone(groups: tuple[Group, ...], patterns: FloatArray) -> list[tuple[npt.ND
 
 
 class _Basis:
-    """Orthonormal vectors (m, ``size``) that span the columns of all ``factors`` (m, n) but for a part of their energy;
-    of those pixels that are lit ``alone``, where that is given, each with its patterns."""
-
     def __init__(self, factors: list[FloatArray], alone: list[tuple[npt.NDArray[np.intp], list[int]]] | None) -> None:
         self._alone = alone or [(np.arange(factors[0].shape[1]), [])]
         found = [np.linalg.eigh(sum(own @ own.T for own in (f[:, px] for f in factors))) for px, _ in self._alone]
@@ -496,14 +441,477 @@ class _Basis:
         }
 
     def of(self, index: int) -> FloatArray:
-        """(m, size) vectors for frames of pattern ``index``."""
         return self._by_pattern.get(index, self._vectors[0])
 
     def project(self, columns: FloatArray) -> FloatArray:
-        """(size, n) the ``columns`` (m, n) on the basis of each."""
         if len(self._vectors) == 1:
             return np.asarray(self._vectors[0].T @ columns)
         seen = np.zeros((self.size, columns.shape[1]))
         for (pixels, _), vectors in zip(self._alone, self._vectors, strict=True):
             seen[:, pixels] = vectors.T @ columns[:, pixels]
         return seen
+
+
+_STEPS, _STEP_POOLED = 4, 3.0
+"""Largest number of Gauss-Newton steps, and the standard deviation [pixels] over which changes of depth are pooled."""
+_ROUNDS, _BESIDE = 4, 5
+"""Largest number of rounds in which single pixels take another depth of the 5 x 5 around them."""
+_SURE = 25.0
+"""Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
+_RIVAL, _ASTRAY = 2.0, 0.05
+"""Starts that leave less than twice as much as the best one may place at most this part of the reliable pixels half a
+period beside it.
+"""
+_RELIABLE = 0.5
+"""Least confidence of a reliable depth: twice as much light arrives there as anywhere else."""
+SPARE = 2.0
+"""Projector pixels of the period that reliable depths must leave free, as many as a dot's image is wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """Depths by projector pixel, and their image.
+
+    Attributes
+    ----------
+    image, mm, confidence : (n, n') arrays
+        Reflectance; depth; and 1 less the light at the second place over that at the first.
+    lam
+        Lambda of the image.
+    left_over, energy, data
+        Residual energy, energy and number of the measurements.
+    part
+        Part of the sensor of these measurements.
+    doubt
+        Reason for not trusting the depths, or nothing.
+    range_mm
+        Nearest and farthest searched depth.
+    smoothing
+        Variance of the factors' noise at these depths, over that of the calibrated ones.
+    """
+
+    image: FloatArray
+    mm: FloatArray
+    confidence: FloatArray
+    lam: float
+    left_over: float
+    energy: float
+    data: int
+    part: float
+    doubt: str = ""
+    range_mm: tuple[float, float] | None = None
+    smoothing: float = 1.0
+    alternatives: tuple[Alternative, ...] = ()
+
+    def __str__(self) -> str:
+        if self.doubt:
+            return "focus: no depths are told; the image is that of the calibrated one"
+        message = self.summary()
+        depths = f"{message['least_mm']:.4g} to {message['most_mm']:.4g} mm, median {message['median_mm']:.4g}"
+        return f"focus: depths of {depths}, told for {message['told_part']:.0%} of pixels"
+
+    @property
+    def solution(self) -> Solution:
+        """Image as a solution; dots leave fewer unknowns in a frame than the sensor has data."""
+        residual = float(np.sqrt(self.left_over / self.energy))
+        status = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
+        return Solution(self.image, self.lam, residual, status)
+
+    @property
+    def reliable(self) -> np.ndarray:
+        """Whether each depth (n, n') is reliable."""
+        return np.asarray(self.confidence >= _RELIABLE)
+
+    def misfit(self, noise: FrameNoise, factor_energy: float | None, print_energy: float) -> Misfit:
+        """Return the misfit of the measurements at these depths, over the sensor as a whole.
+
+        ``factor_energy`` and ``print_energy`` are the energies that noise of the calibrated factors and print within a
+        pixel may add to all frames.
+        """
+        spare = 1 - 2 * self.image.size / self.data  # a reflectance and a depth for each pixel
+        variance = float(noise.variance.mean()) * self.data * spare
+        expected = variance + self.part * (noise.rendering + self.smoothing * (factor_energy or 0.0))
+        whole = self.left_over, self.energy, expected, self.data / noise.variance.size
+        energies = tuple(np.array([[value]]) for value in whole)
+        return weigh(energies, factor_energy is not None, noise, self.part * print_energy)[0]
+
+    def channels(self) -> dict[str, npt.NDArray[np.float32]]:
+        """Return the channels of depth.exr: depth [mm] and confidence."""
+        return {"depth_mm": self.mm.astype(np.float32), "confidence": self.confidence.astype(np.float32)}
+
+    def summary(self) -> dict[str, float]:
+        """Return the entries of result.json."""
+        reliable = self.mm[self.reliable] if self.reliable.any() else self.mm
+        low, middle, high = (float(value) for value in np.percentile(reliable, (1, 50, 99)))
+        return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
+
+
+@single_threaded_blas()
+def depth_map(
+    shots: Capture,
+    factors: Factors,
+    lam: float | Literal["auto"] = "auto",
+    depth_range: tuple[float, float] | None = None,
+) -> DepthMap:
+    """Return the depth of each projector pixel under shifting dots, and the image with all of them in focus.
+
+    ``depth_range`` are the nearest and farthest searched depth [mm], by default a quarter of 1/z either way. Raises
+    MitsimError for other patterns, and without parallax.
+    """
+    return _MapSearch(shots, factors, depth_range).find(lam)
+
+
+class _MapSearch:
+    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
+        # Of a flat scene far from the calibrated depth dots of any period tell the rest.
+        self._ends = shifts_searched(factors, depth_range)
+        self._inverse = 1 / parallax_of(factors).depth_mm
+        self._range_mm = 1 / (self._inverse + self._ends[1]), 1 / (self._inverse + self._ends[0])
+        self._plane = best_depth(shots, factors, self._range_mm)
+        self._middle = (self._ends[0] + self._ends[1]) / 2
+        # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
+        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - self._inverse
+        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
+        self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
+        self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
+
+    def find(self, lam: float | Literal["auto"]) -> DepthMap:
+        middle = self._middle / self.pixel
+        tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
+        if self._arrivals.limited:
+            look = min(tried, key=lambda start: tried[start])[0]
+            plane = self._start / self.pixel
+            offsets = {start + offset for start in (middle, plane) for offset in (0.0, *OFFSETS)} - {middle}
+            tried |= {(look, offset): self._left_over(self._arrivals.most(look, offset)[0]) for offset in offsets}
+        start = min(tried, key=lambda start: tried[start])
+        rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
+        shift, confidence = self._arrivals.most(*start)
+        shift = self._sharpen(self._refine(shift, start[1] * self.pixel, tried[start]))
+        doubt = self._doubt(shift, confidence, rivals)
+        if doubt:
+            shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
+        solved = self._pixels.solve(shift, None if lam == "auto" else lam)
+        solved = self._pixels.final(shift, solved) if lam == "auto" else solved
+        return DepthMap(
+            solved.image,
+            1 / (self._inverse + shift),
+            confidence,
+            solved.lam,
+            solved.left_over,
+            *(self._all.energy, self._all.data, self._all.part),
+            doubt,
+            self._range_mm,
+            self._all.smoothing(float(np.median(shift))),
+        )
+
+    def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
+        reliable = confidence >= _RELIABLE
+        found = self._pixels.solve(shift)
+        variance, unknowns = self._pixels.variance(found), 2 * shift.size
+        less = found.left_over - self._left_over(np.zeros(shift.shape))
+        # Of a sheet at the calibrated depth either may leave more.
+        if not reliable.any() or less > chance_difference(less, variance, unknowns):
+            return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
+        span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
+        astray = max(
+            float((np.abs(self._arrivals.most(*rival)[0] - shift)[reliable] > self.width / 2).mean())
+            for rival in rivals
+        )
+        spared = not self._arrivals.limited or self.width - span >= SPARE * self.pixel
+        if not spared or astray > _ASTRAY:
+            period = self.width / self.pixel
+            why = f"Depths a period of the dots away, {period:.0f} projector pixels, explain nearly as much"
+            if not spared:
+                why = f"Parallax seems to span {span / self.pixel:.1f} of the {period:.0f} pixels of a period"
+            return (
+                f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of "
+                f"a period of {2 * period:.0f} along the baseline, and of a short one across it."
+            )
+        ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
+        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
+        if others:
+            return (
+                f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
+                "explain a flat scene as well, so the image is that of the calibrated one. Use dots of a longer period "
+                "along the baseline, or give the range of depths."
+            )
+        return ""
+
+    def _left_over(self, shift: FloatArray) -> float:
+        return self._pixels.solve(shift).left_over
+
+    def _refine(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
+        for _ in range(_STEPS):
+            image, moved = self._pixels.step(shift, self.pixel)
+            weight = gaussian_filter(np.square(image), _STEP_POOLED)
+            change = gaussian_filter(image * moved, _STEP_POOLED) / np.maximum(weight, np.finfo(float).tiny)
+            half = self.width / 2
+            ahead = np.clip(shift + self.pixel * np.clip(change, -1, 1), offset - half, offset + half)
+            ahead = median_filter(ahead, MEDIAN)
+            now = self._left_over(ahead)
+            if now >= left_over:
+                break
+            shift, left_over = ahead, now
+        return shift
+
+    def _sharpen(self, shift: FloatArray) -> FloatArray:
+        solved = self._pixels.solve(shift)
+        for _ in range(_ROUNDS):
+            others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
+            gains = self._pixels.gains(shift, solved.image, others)
+            sure = gains.max(axis=0) > _SURE * self._pixels.variance(solved)
+            ahead = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
+            now = self._pixels.solve(ahead)
+            if now.left_over >= solved.left_over:
+                break
+            shift, solved = ahead, now
+        return shift
+
+
+# -------- Measurements and a depth for each projector pixel in, the image out
+
+_SMALL = 1e-3
+"""Lambda over the mean diagonal of the normal matrix while depths are searched."""
+_LARGEST = 1e-2
+"""Largest such lambda of the final image."""
+_MOST_LIT = 4096
+"""Pixels of one frame whose normal matrix has 128 MiB."""
+_CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6
+"""Lagrange cubic through -1, 0, 1, 2: weight of each by power of the place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Image (n, n') at given depths, its lambda, and the residual energy."""
+
+    image: FloatArray
+    lam: float
+    left_over: float
+
+
+class PixelDepths:
+    """Model with a depth for each projector pixel.
+
+    ``limit`` and ``step`` are the largest change of 1/z [1/mm], and the distance between those that columns are
+    computed at.
+    """
+
+    def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
+        self._all = depths
+        self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
+        self._tables = [np.stack([depths.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
+        self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in depths.patterns]
+        most = max(len(row) for row in self._lit[0]) * max(len(column) for column in self._lit[1])
+        if most > _MOST_LIT:
+            raise MitsimError(
+                f"focus map: {most} pixels are lit at a time, and {_MOST_LIT} can be told; use dots further apart"
+            )
+        middle = len(self._shifts) // 2
+        left, right = (float(np.square(table[:, middle]).sum(axis=1).mean()) for table in self._tables)
+        self._scale = left * right
+
+    def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
+        """Return the image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
+        lam = _SMALL * self._scale if lam is None else lam
+        image, left_over = np.zeros(shift.shape), self._all.outside
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            left, right = (self._columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
+            normal, data = (left @ left.T) * (right @ right.T), ((left @ frame.frame) * right).sum(axis=1)
+            found = np.linalg.solve(normal + lam * np.eye(len(data)), data)
+            image[lit] = found
+            left_over += float(np.square(frame.frame).sum() + found @ (normal @ found - 2 * data))
+        return Solved(image, lam, left_over)
+
+    def variance(self, solved: Solved) -> float:
+        """Return the variance of a datum from the residual of a ``solved`` image."""
+        return float(solved.left_over / max(self._all.data - 2 * solved.image.size, 1))
+
+    def final(self, shift: FloatArray, solved: Solved) -> Solved:
+        """Return the image at the lambda of its own residual: variance of a datum over the mean square of pixels."""
+        ideal = self.variance(solved) / max(float(np.square(solved.image).mean()), np.finfo(float).tiny)
+        return self.solve(shift, min(ideal, _LARGEST * self._scale))
+
+    def step(self, shift: FloatArray, unit: float) -> tuple[FloatArray, FloatArray]:
+        """Return X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
+        lam, image, moved = _SMALL * self._scale, np.zeros(shift.shape), np.zeros(shift.shape)
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            (u, du), (v, dv) = (
+                (self._columns(axis, place, shift[lit]), unit * self._columns(axis, place, shift[lit], slope=True))
+                for axis, place in enumerate(lit)
+            )
+            # Columns of the model are u v^T, and by d du v^T + u dv^T.
+            uu, uv, vv = u @ u.T, (u @ du.T, v @ dv.T), v @ v.T
+            across = uv[0] * vv + uu * uv[1]
+            own = (du @ du.T) * vv + uu * (dv @ dv.T) + uv[0].T * uv[1] + uv[0] * uv[1].T
+            normal = np.block([[uu * vv, across], [across.T, own]])
+            seen, slid = u @ frame.frame, du @ frame.frame
+            data = np.concatenate([(seen * v).sum(axis=1), (slid * v + seen * dv).sum(axis=1)])
+            both = np.linalg.solve(normal + lam * np.eye(len(data)), data)
+            image[lit], moved[lit] = np.split(both, 2)
+        return image, moved
+
+    def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
+        """Return the energy (others, n, n') that each pixel alone explains more at other changes of 1/z.
+
+        Pixels of a frame are a period apart and hardly share measurements, so that each is judged with all else fixed.
+        """
+        gains = np.zeros((len(others), *shift.shape))
+        for frame in self._all.frames:
+            lit = self._pixels(frame)
+            left, right = self._columns(0, lit[0], shift[lit]), self._columns(1, lit[1], shift[lit])
+            rest = frame.frame - (left * image[lit][:, None]).T @ right
+            for index, other in enumerate((shift, *others)):
+                u, v = self._columns(0, lit[0], other[lit]), self._columns(1, lit[1], other[lit])
+                own = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
+                size = np.square(u).sum(axis=1) * np.square(v).sum(axis=1)
+                explained = np.square(((u @ rest) * v).sum(axis=1) + own) / size
+                if index == 0:
+                    gains[:, lit[0], lit[1]] -= explained
+                else:
+                    gains[index - 1][lit] += explained
+        return gains
+
+    def _pixels(self, frame: Measurement) -> tuple[np.ndarray, np.ndarray]:
+        rows, columns = np.meshgrid(self._lit[0][frame.row], self._lit[1][frame.column], indexing="ij")
+        return rows.ravel(), columns.ravel()
+
+    def _columns(self, axis: int, pixels: np.ndarray, shift: FloatArray, slope: bool = False) -> FloatArray:
+        """Return columns (k, r) of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivatives."""
+        step = self._shifts[1] - self._shifts[0]
+        place = (shift - self._shifts[0]) / step
+        start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
+        part = place - start
+        one, zero = np.ones_like(part), np.zeros_like(part)
+        powers = [zero, one / step, 2 * part / step, 3 * part**2 / step] if slope else [one, part, part**2, part**3]
+        weights = _CUBIC @ np.stack(powers)
+        table = self._tables[axis]
+        return np.asarray(sum(weight[:, None] * table[pixels, start + k - 1] for k, weight in enumerate(weights)))
+
+
+# ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
+
+
+LAMBDAS = 1e-5, 1e-6, 1e-7
+"""Tried lambdas over the largest sigma^2: smaller ones add noise, larger ones blur dots."""
+OFFSETS = -1.0, -0.5, 0.5, 1.0
+"""Projector pixels by which the range of displacements may be moved, because a surface at its end is ambiguous."""
+MEDIAN = 5
+"""Width of the median of places [projector pixels]."""
+_POOLED = 1.0
+"""Standard deviation over which light is pooled [projector pixels]."""
+_BESIDE_LARGEST = 2
+"""Projector pixels beyond the largest displacement, so that a dot's image is not cut."""
+_LEAST_PARALLAX = 0.5
+"""Least parallax of an axis over the range of depths [projector pixels]."""
+_NEIGHBOURHOOD = 2.0
+"""Projector pixels beside the largest light that belong to it."""
+
+
+class Arrivals:
+    """Places where light arrives, by pixel and change of 1/z.
+
+    Parameters
+    ----------
+    ends
+        Least and largest change of 1/z [1/mm] of the searched depths.
+    beside
+        Largest change of 1/z [1/mm] of the middle of the distinguishable depths.
+
+    Attributes
+    ----------
+    pixel
+        Change of 1/z [1/mm] that moves light by one projector pixel.
+    width, reach
+        Distinguishable changes of 1/z, and the largest tried one, either way.
+    """
+
+    def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
+        self._classes = [_classes(patterns) for patterns in shots.patterns]
+        parallax, counts = parallax_of(factors), (factors.left.shape[1], factors.right.shape[1])
+        self._span = ends[1] - ends[0]
+        moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
+        self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
+        if not any(self._open):
+            raise MitsimError(
+                f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
+                "light; give a depth, or auto"
+            )
+        self.pixel = 1 / max(moves)
+        periods = [own.shape[1] for own in shots.patterns]
+        self.width = min(
+            self._span, unambiguous_parallax(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel
+        )
+        self.reach = beside + self.width / 2 + (max(OFFSETS) + _BESIDE_LARGEST) * self.pixel
+        self.depths = CommonBasis(shots, factors, (-self.reach, self.reach))
+        self._margin = int(np.ceil(self.reach / self.pixel)) + 1
+
+    @property
+    def limited(self) -> bool:
+        """Whether the dots' period limits the range of depths."""
+        return self.width < self._span
+
+    def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
+        """Return changes of 1/z by pixel where most light arrives, and the confidence.
+
+        ``lam`` is relative to the largest sigma^2, ``offset`` the middle of the displacements [projector pixels].
+        """
+        count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
+        shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
+        light = np.stack([self._arriving(self._class_images[lam], shift) for shift in shifts])
+        light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
+        place, step = light.argmax(axis=0), shifts[1] - shifts[0]
+        near = round(_NEIGHBOURHOOD * self.pixel / step)
+        beside = np.arange(count)[:, None, None] - place
+        own = np.where(np.abs(beside) <= near, light, 0.0)
+        other = np.where(np.abs(beside) <= near, 0.0, light).max(axis=0)
+        peak = light.max(axis=0)
+        dark = peak <= np.finfo(float).tiny
+        centroid = (own * beside).sum(axis=0) / np.where(dark, 1.0, own.sum(axis=0))
+        found = median_filter(shifts[place] + step * centroid, MEDIAN)
+        elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
+        return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
+
+    def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
+        keys, places, parts = [], [], []
+        for axis, (classes, opened) in enumerate(zip(self._classes, self._open, strict=True)):
+            place = np.arange(classes.size) + (self.depths.edges(axis) * shift + self._margin if opened else 0.0)
+            whole = np.floor(place).astype(np.intp)
+            whole = np.clip(whole, 0, max(seen.shape[2 + axis] - 2, 0)) if opened else whole
+            keys.append(classes if opened else np.zeros_like(classes))
+            places.append(whole)
+            parts.append(place - whole)
+        total = np.zeros(self.depths.shape)
+        for row in (0, 1) if self._open[0] else (0,):
+            for column in (0, 1) if self._open[1] else (0,):
+                weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
+                value = seen[keys[0][:, None], keys[1], (places[0] + row)[:, None], places[1] + column]
+                total += np.outer(*weights) * value
+        return total
+
+    @cached_property
+    def _class_images(self) -> dict[float, FloatArray]:
+        sides, patterns = [], []
+        for axis, opened in enumerate(self._open):
+            side = self.depths.widen(axis, self._margin) if opened else self.depths.side(axis, 0.0)
+            sides.append(side)
+            patterns.append(np.ones((side.shape[1], 1)) if opened else self.depths.patterns[axis])
+        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
+        counts = [own.shape[1] if opened else 1 for own, opened in zip(self.depths.patterns, self._open, strict=True)]
+        sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
+        for each in self.depths.frames:
+            key = (each.row if self._open[0] else 0, each.column if self._open[1] else 0)
+            sums[key].add(each.frame, 0 if self._open[0] else each.row, 0 if self._open[1] else each.column)
+        problems = {key: prepared.problem(own) for key, own in sums.items()}
+        found = {}
+        for lam in LAMBDAS:
+            images = [prepared.solve(own, lam * problems[key].scale).image for key, own in sums.items()]
+            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
+        return found
+
+
+def _classes(patterns: FloatArray) -> np.ndarray:
+    if not are_dots(patterns):
+        raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
+    return np.asarray(patterns.argmax(axis=1))

@@ -1,17 +1,23 @@
-"""The two factors of a calibrated camera: arrays or a CAL folder in, the linear operator of any pattern family out."""
+"""Factors of a calibrated camera, and their estimate from responses to +-1 stripes on a white board.
+
+Under X = h_i 1^T a separable camera records Y_i = Phi_L h_i (Phi_R 1)^T = u_i v^T, and under 1 h_i^T it records a w_i^T
+with a = Phi_L 1. The uniform response a v^T gives a and v. Projections on them give u_i and w_i, and H H^T = N I gives
+Phi_L = U H^T / N (arXiv 2111.12862, section IV-A, after the FlatCam procedure; the paper omits 1/N). Factors are known
+up to (c Phi_L, Phi_R / c) only. They are returned balanced, |Phi_L 1| = |Phi_R 1|."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, SeparableTerm
+from mitsim.core.arrays import FloatArray, SeparableTerm, sum_of_squares
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, checked_fields, cut
 from mitsim.core.exr import Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
 from mitsim.core.files import output_folder
@@ -19,42 +25,527 @@ from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import SIDES, CalibrationManifest, FactorNoise, read_manifest, write_manifest
 from mitsim.core.runs import Capture
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.estimate_factors import Estimate, squared_condition
 from mitsim.reconstruct.solution import Status, Verdict
-from mitsim.reconstruct.solver import centre_columns
+from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from scipy.sparse.linalg import LinearOperator
     from xarray import Dataset
 
+SEPARABLE_RESIDUAL = 0.01
+"""Unexplained residual above which the status warns: a keystone that leaves 1.5 % costs the image 16 % under uniform
+light, while falloff and diffraction leave less than 1e-3.
+"""
+
+UNKNOWN_NOISE = 0.05
+"""Limit of the unexplained residual where the sensor's noise is not stated."""
+
+NOISE_MODEL = 0.2
+"""Part of the stated noise that may be left unexplained: an error of 4 % in its variance."""
+
+LARGEST_ERROR = 0.1
+"""Relative error of a factor above which the status warns."""
+_NUMBERS_AT_ONCE = 2**15
+"""Numbers of a response whose misfit is summed at a time, so that they stay in the cache."""
+_NEGATIVE = 0.1
+"""Sum over the sum of absolute values below which a uniform response counts as negative."""
+_TURNS, _TURNED = 30, 1e-13
+"""Steps of the power iteration that splits a uniform response, and the change at which it has converged."""
+
+
+# ---- Estimated factors ----
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Estimated factors and their quality.
+
+    Attributes
+    ----------
+    left, right
+        Phi_L (m, n), Phi_R (m', n), in the square root of the frames' unit.
+    separability_residual
+        sqrt(sum ||Y_i - u_i v^T||^2 / sum ||Y_i||^2) over all responses.
+    unexplained
+        Part of that residual beyond the stated noise of the sensor.
+    condition
+        Larger cond(Phi)^2 of the two; inf when rank deficient.
+    noise
+        Root mean square of Y_i - u_i v^T, corrected for the fitted numbers [frame unit].
+    predicted_error
+        Relative error (Frobenius norm) of both factors by independent noise of that size.
+    rank
+        Number of singular values of both factors above rounding and noise.
+    """
+
+    left: FloatArray
+    right: FloatArray
+    separability_residual: float
+    unexplained: float
+    condition: float
+    noise: float
+    predicted_error: tuple[float, float]
+    rank: tuple[int, int]
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Whether the factors can be used without a correction."""
+        return self.status.ok
+
+
+# ---- Sums over the responses of a side ----
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """Contribution of one response to :class:`StripeSums`.
+
+    Attributes
+    ----------
+    vector : (m,) array
+        Least-squares u_i or w_i in Y_i = u_i common^T.
+    misfit, energy
+        ||Y_i - u_i common^T||^2 and ||Y_i||^2.
+    ambient : (3,) array
+        Light that the mask does not cast: even, tilted along the response's vector, and tilted along the common one.
+        Zeros where responses are centred.
+    light : (m,) array
+        Sum of the response's two frames, projected likewise, or None.
+    """
+
+    vector: FloatArray
+    misfit: float
+    energy: float
+    ambient: FloatArray
+    light: FloatArray | None = None
+
+
+@dataclass
+class StripeSums:
+    """Running sums over the responses of one side, which continue to the same bits after being saved.
+
+    Attributes
+    ----------
+    side
+        ``horizontal`` or ``vertical`` stripes.
+    centre
+        Whether row and column means are removed from every response.
+    common
+        v (k,) of Y_i = u_i v^T; for vertical stripes a of Y_i^T = w_i a^T.
+    vectors : (m, N) array
+        u_i or w_i as columns.
+    misfit, energy
+        Sums of ||Y_i - u_i v^T||^2 and of ||Y_i||^2.
+    done
+        Number of added responses.
+    misfits, energies, ambient
+        (N,), (N,) and (N, 3) of each response.
+    lights
+        (m, N) projected sums of the two frames of each response; (m, 0) where they are unknown.
+    """
+
+    side: str
+    centre: bool
+    common: FloatArray
+    vectors: FloatArray
+    misfit: float = 0.0
+    energy: float = 0.0
+    done: int = 0
+    misfits: FloatArray = field(init=False)
+    energies: FloatArray = field(init=False)
+    ambient: FloatArray = field(init=False)
+    lights: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.misfits, self.energies = np.zeros((2, self.vectors.shape[1]))
+        self.ambient = np.zeros((self.vectors.shape[1], 3))
+        self.lights = np.zeros((len(self.vectors), 0))
+
+    def add(self, response: npt.ArrayLike) -> None:
+        """Add the next ``response`` (rows, columns)."""
+        self.put(self.fit_response(response, self.done))
+
+    def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
+        """Return the contribution of response ``number`` without adding it, so that several threads may call this.
+
+        ``light`` (rows, columns) is the sum of the two frames whose difference the response is.
+        """
+        shape = len(self.vectors), len(self.common)
+        shape = shape if self.side == "horizontal" else shape[::-1]
+        checked = _response(response, f"{self.side} response {number}", shape, self.centre)
+        return self._fit_checked(checked, np.asarray(response), light)
+
+    def _fit_checked(self, response: FloatArray, given: FloatArray, light: FloatArray | None) -> ResponseFit:
+        across = self.side == "horizontal"
+        common = self.common / np.dot(self.common, self.common)
+        vector = (response if across else response.T) @ common
+        rows, columns = (vector, self.common) if across else (self.common, vector)
+        misfit = energy = 0.0
+        step = max(1, _NUMBERS_AT_ONCE // response.shape[1])
+        for start in range(0, len(response), step):
+            block = response[start : start + step]
+            explained = np.multiply.outer(rows[start : start + step], columns)
+            misfit += sum_of_squares(np.subtract(block, explained, out=explained))
+            energy += sum_of_squares(block)
+        # Both factors' means are zero if centred, so that light of no mask is not in their vectors.
+        shown = AmbientLight(self.common, len(vector)).measure(given if across else given.T)
+        if light is not None:
+            light = (light if across else light.T) @ common
+            light -= light.mean() * self.centre
+        return ResponseFit(vector, misfit, energy, shown * (not self.centre), light)
+
+    def put(self, seen: ResponseFit) -> None:
+        """Add a fitted response."""
+        self.vectors[:, self.done] = seen.vector
+        self.misfit += seen.misfit
+        self.energy += seen.energy
+        self.misfits[self.done], self.energies[self.done] = seen.misfit, seen.energy
+        self.ambient[self.done] = seen.ambient
+        if seen.light is not None:
+            self.lights = self.lights if self.lights.size else np.zeros_like(self.vectors)
+            self.lights[:, self.done] = seen.light
+        self.done += 1
+
+
+def stripe_sums(
+    horizontal: npt.ArrayLike,
+    vertical: npt.ArrayLike,
+    count: int,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+    lights: Sequence[FloatArray | None] = (None, None),
+) -> tuple[StripeSums, StripeSums]:
+    """Return sums of horizontal and of vertical stripes of ``count`` responses each, with the first of each."""
+    first = _response(horizontal, "horizontal response 0", None, centre)
+    second = _response(vertical, "vertical response 0", first.shape, centre)
+    mean = (upright(first, horizontal) + upright(second, vertical)) / 2
+    if uniform is not None:
+        mean = _response(uniform, "uniform response", first.shape, centre)
+    a, v = _rank_one_split(mean)
+    left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
+    right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
+    for sums, checked, response, light in zip(
+        (left, right), (first, second), (horizontal, vertical), lights, strict=True
+    ):
+        sums.put(sums._fit_checked(checked, np.asarray(response), light))
+    return left, right
+
+
+def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
+    """Return a uniform ``response``, with its sign turned if its uncentred ``light`` is negative."""
+    negative = np.sum(light) < -_NEGATIVE * np.abs(light).sum()
+    return -response if negative else response
+
+
+# ---- From responses, or their sums, to factors ----
+
+
+def estimate_factors(
+    horizontal: Iterable[npt.ArrayLike],
+    vertical: Iterable[npt.ArrayLike],
+    H: npt.ArrayLike,
+    centre: bool = False,
+    uniform: npt.ArrayLike | None = None,
+    noise: float | None = None,
+) -> Estimate:
+    """Estimate the factors of a separable camera from its responses to striped light.
+
+    Parameters
+    ----------
+    horizontal, vertical
+        Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T, in order, each the difference of a pattern's positive and
+        negative capture. Generators keep memory small.
+    H : (n, N) array
+        +1 and -1 with orthogonal rows; column 0 is all +1 unless ``uniform`` is given.
+    centre
+        True removes row and column means, for a FlatCam mask.
+    uniform : (m, m') array
+        Response under all light, by default the mean of the first horizontal and vertical responses.
+    noise
+        Root mean square sensor noise of a response [frame unit]; None if unknown.
+
+    Raises
+    ------
+    MitsimError
+        For a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
+    """
+    signs = _checked_signs(H, uniform is not None)
+    count = signs.shape[1]
+    rows, columns = iter(horizontal), iter(vertical)
+    first = _next(rows, "horizontal", 0, count), _next(columns, "vertical", 0, count)
+    left, right = stripe_sums(*first, count, centre, uniform)
+    for sums, rest in ((left, rows), (right, columns)):
+        while sums.done < count:
+            sums.add(_next(rest, sums.side, sums.done, count))
+        if next(rest, None) is not None:
+            raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
+    return factors_of_sums(left, right, signs, noise)
+
+
+def factors_of_sums(
+    left: StripeSums,
+    right: StripeSums,
+    signs: FloatArray,
+    stated_noise: float | None = None,
+    extra: tuple[float, float] = (0.0, 0.0),
+) -> Estimate:
+    """Return the factors of complete sums; ``extra`` is the squared error of each side's vectors beyond their noise."""
+    v, a = left.common, right.common
+    count = signs.shape[1]
+    phi = left.vectors @ signs.T / count, right.vectors @ signs.T / count
+    energy = left.energy + right.energy
+    residual = float(np.sqrt((left.misfit + right.misfit) / energy))
+    # Each response of m m' numbers spends one fitted number a sensor row (or column).
+    spare = count * (len(a) * (len(v) - 1) + len(v) * (len(a) - 1))
+    noise = float(np.sqrt((left.misfit + right.misfit) / spare))
+    expected = spare * (stated_noise or 0.0) ** 2 / energy
+    unexplained = float(np.sqrt(max(residual**2 - expected, 0.0)))
+    allowed = UNKNOWN_NOISE if stated_noise is None else max(SEPARABLE_RESIDUAL, NOISE_MODEL * float(np.sqrt(expected)))
+    singular = _Singular.of(phi[0]), _Singular.of(phi[1])
+    condition = max(values.squared_condition for values in singular)
+    predicted, rank = [], []
+    for factor, common, values, more in zip(phi, (v, a), singular, extra, strict=True):
+        error = predicted_error(factor, noise, float(np.linalg.norm(common)), count)
+        if more:
+            error = float(np.hypot(error, np.sqrt(more / count) / np.linalg.norm(factor)))
+        predicted.append(error)
+        rank.append(values.rank(factor, error))
+    n = len(signs)
+    figures = (
+        f"Factor error {predicted[0]:.1e} and {predicted[1]:.1e}, "
+        f"rank {rank[0]} of {n} and {rank[1]} of {n}, condition {condition:.1e}."
+    )
+    return Estimate(
+        left=phi[0],
+        right=phi[1],
+        separability_residual=residual,
+        unexplained=unexplained,
+        condition=condition,
+        noise=noise,
+        predicted_error=(predicted[0], predicted[1]),
+        rank=(rank[0], rank[1]),
+        status=_status(unexplained > allowed, unexplained, max(predicted), (n - rank[0], n - rank[1]), figures),
+    )
+
+
+# ---- The error that noise makes ----
+
+
+def predicted_error(factor: FloatArray, noise: float, common_norm: float, count: int) -> float:
+    """Return the relative Frobenius error of a factor by independent noise of each datum.
+
+    u_i = Y_i v / |v|^2 has variance noise^2 / |v|^2 a number, with |v| the ``common_norm``, and U H^T / N averages N
+    (``count``) of them. The error of v enters at second order and as a common scale, and is neglected.
+    """
+    deviation = noise / (np.sqrt(count) * common_norm)
+    norm = float(np.linalg.norm(factor))
+    return float(deviation * np.sqrt(factor.size) / norm) if norm else float("inf")
+
+
+# ---- Light that is no mask's ----
+
+
+class AmbientLight:
+    """Even light and light tilted along either side in responses u v^T, measured across the ``common`` vector v.
+
+    Attributes
+    ----------
+    effects : (3, m) array
+        Vectors that light of size 1 adds to u: even, tilted along u, tilted along v.
+    variances : (3,) array
+        Variances of the measured sizes for noise of variance 1.
+    """
+
+    def __init__(self, common: FloatArray, length: int) -> None:
+        self._places, even = np.linspace(-1, 1, length), np.ones(length)
+        shapes = np.stack([np.ones(len(common)), np.linspace(-1, 1, len(common))], axis=1)
+        shares = common @ shapes / np.dot(common, common)
+        self.effects = np.stack([shares[0] * even, shares[0] * self._places, shares[1] * even])
+        self._across = shapes - np.outer(common, shares)
+        self._products = np.zeros((3, 3))
+        self._products[::2, ::2] = length * self._across.T @ self._across
+        self._products[1, 1] = np.dot(self._places, self._places) * np.square(self._across[:, 0]).sum()
+        self._inverse = np.linalg.pinv(self._products)
+        self.variances = np.diag(self._inverse)
+
+    def measure(self, response: FloatArray) -> FloatArray:
+        """Return the sizes (3,) of the light in a ``response`` (m, k)."""
+        seen = response @ self._across
+        return np.asarray(self._inverse @ [seen[:, 0].sum(), self._places @ seen[:, 0], seen[:, 1].sum()])
+
+    def energies(self, sizes: FloatArray) -> FloatArray:
+        """Return the squares (N,) that light of ``sizes`` (N, 3) adds to the misfits of responses."""
+        return np.asarray(np.einsum("ki,ij,kj->k", sizes, self._products, sizes))
+
+
+# ---- Whether the factors can be used ----
+
+
+def decibels(part: float) -> float:
+    """Return an rms ``part`` of a signal in dB, -20 for a tenth."""
+    return float(20 * np.log10(part))
+
+
+def _status(inseparable: bool, residual: float, error: float, lost: tuple[int, int], figures: str) -> Status:
+    if inseparable:
+        return Status(
+            Verdict.NOT_SEPARABLE,
+            f"Responses are not separable: {residual:.1%} of them is left over ({decibels(residual):.1f} dB)",
+            "for a FlatCam mask centre them, otherwise look for ambient light or a rotated part, or raise the exposure",
+            figures,
+        )
+    if error > LARGEST_ERROR:
+        return Status(
+            Verdict.MOSTLY_NOISE,
+            f"Factors are mostly noise: an error of {error:.0%} is expected of them, allowed are {LARGEST_ERROR:.0%}",
+            "raise the exposure or average captures",
+            figures,
+        )
+    if any(lost):
+        return Status(
+            Verdict.RANK_DEFICIENT,
+            f"Factors are rank deficient: {lost[0]} directions of scene rows and {lost[1]} of columns are not above "
+            "noise and rounding",
+            "use fewer scene pixels, a larger distance from sensor to mask or more exposure",
+            figures,
+        )
+    return Status(Verdict.CALIBRATED, "Calibrated: responses are separable", "", figures)
+
+
+# ---- Singular values: condition and rank ----
+
+
+@dataclass(frozen=True, eq=False)
+class _Singular:
+    values: FloatArray
+    rounding: float
+    wide: bool
+
+    @classmethod
+    def of(cls, phi: FloatArray) -> _Singular:
+        values = np.asarray(np.linalg.svd(phi, compute_uv=False))
+        rounding = float(values[0] * max(phi.shape) * np.finfo(np.float64).eps)
+        return cls(values, rounding, phi.shape[0] < phi.shape[1])
+
+    @property
+    def squared_condition(self) -> float:
+        lost = self.wide or self.values[-1] <= self.rounding
+        return float("inf") if lost else float((self.values[0] / self.values[-1]) ** 2)
+
+    def rank(self, phi: FloatArray, error: float) -> int:
+        """Return the number of singular values above rounding and the noise of a relative ``error``.
+
+        Along a direction that the sensor does not see the factor has m independent numbers of noise. Their squared norm
+        is chi-square with m degrees of freedom, of which the limit is three standard deviations above the mean.
+        """
+        if not phi.any():
+            return 0
+        deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
+        noise = deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))
+        return int(np.count_nonzero(self.values > max(float(noise), self.rounding)))
+
+
+def squared_condition(phi: FloatArray) -> float:
+    """Return cond(phi)^2 of a factor ``phi`` (m, n); inf when it is rank deficient."""
+    return _Singular.of(phi).squared_condition
+
+
+def rank_above_noise(phi: FloatArray, error: float) -> int:
+    """Return the number of singular values of ``phi`` (m, n) above rounding and noise of a relative ``error``."""
+    return _Singular.of(phi).rank(phi, error)
+
+
+# ---- The uniform response as a product of two vectors ----
+
+
+def _rank_one_split(mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    right = _largest_right_vector(mean)
+    left = mean @ right
+    size = float(np.linalg.norm(left))
+    if size == 0:
+        raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
+    root = np.sqrt(size) if left.sum() >= 0 else -np.sqrt(size)
+    return left * (root / size), right * root
+
+
+def _largest_right_vector(matrix: FloatArray) -> FloatArray:
+    """Return the right singular vector (n,) of the largest singular value of a ``matrix`` (m, n), of either sign.
+
+    A uniform response is nearly of rank one, and its SVD takes half a minute at 2048 x 2048, so that power iteration is
+    used unless it does not converge.
+    """
+    # No direction of the data: what starts across the first singular vector would not find it.
+    vector = _unit(np.random.default_rng(0).standard_normal(len(matrix)) @ matrix)
+    for _ in range(_TURNS):
+        before, vector = vector, _unit(_unit(matrix @ vector) @ matrix)
+        if np.linalg.norm(vector - before) <= _TURNED:
+            return vector
+    return np.asarray(np.linalg.svd(matrix, full_matrices=False)[2][0])
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    norm = float(np.linalg.norm(vector))
+    return vector / norm if norm else vector
+
+
+# ---- Responses and patterns as they are read ----
+
+
+def _next(responses: Iterator[npt.ArrayLike], side: str, index: int, count: int) -> npt.ArrayLike:
+    response = next(responses, None)
+    if response is None:
+        raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
+    return response
+
+
+def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
+    values = np.asarray(response, dtype=np.float64)
+    if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
+        raise MitsimError(f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first")
+    if not np.isfinite(values).all():
+        bad = np.count_nonzero(~np.isfinite(values))
+        raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
+    return centre_frame(values) if centre else values
+
+
+def _checked_signs(H: npt.ArrayLike, has_uniform: bool) -> FloatArray:
+    signs = np.asarray(H, dtype=np.float64)
+    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
+        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
+    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
+        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
+    if not has_uniform and not (signs[:, 0] == 1).all():
+        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
+    return signs
+
+
 _LACKING = "lacking"
-"""What channels of a factor's file begin with that hold terms which it lacks; their number follows."""
+"""Prefix of channels with terms that a factor lacks."""
 _LIGHT = ("projector.lines_nm", "projector.radiant_shares")
-"""Parts of an identity that manifests of 0.4.0 do not state; where one of two states none, its light may be any."""
+"""Parts of an identity that manifests of 0.4.0 do not state."""
 
 
 @checked_fields
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """A camera's factors, as a CAL folder holds them: a frame under pattern P is Phi_L (P o X) Phi_R^T.
+    """Factors of a calibrated camera: a frame under pattern P is Phi_L (P o X) Phi_R^T.
 
     Attributes
     ----------
     left, right
-        Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)], numbers of single precision, so that factors from memory and
-        from disk are the same.
+        Phi_L (m, n), Phi_R (m', n') [sqrt(electrons / s)], in single precision as in files.
     manifest
-        of which camera they are, and how they are used.
+        Camera, and use of the factors.
     status
-        what the estimator thought of them.
+        Status of the estimate.
     name
-        the folder, or what messages call factors in memory.
+        Folder, or name in messages.
     estimate
-        what they were fitted as, with residual and predicted error; None for factors from a folder.
+        Estimate with residual and predicted error; None for factors from a folder.
     lacking
-        separable terms [(m, n), (m', n')] of the camera that the factors lack, where a model of it tells them: they
-        predict what images leave unexplained. Of other pixels, or scaled, factors have none.
+        Separable terms [(m, n), (m', n')] of the camera's model that the factors lack.
     """
 
     left: FloatArray
@@ -73,17 +564,7 @@ class Factors:
     @classmethod
     @check_arguments
     def of(cls, estimate: Estimate, manifest: CalibrationManifest, lacking: Iterable[SeparableTerm] = ()) -> Factors:
-        """The factors of an estimate.
-
-        Parameters
-        ----------
-        estimate
-            as it was fitted.
-        manifest
-            which names the camera.
-        lacking
-            what the factors lack of the camera, as separable terms.
-        """
+        """Return the factors of an ``estimate`` with the ``manifest`` of its camera, and the terms that they lack."""
         left, right = _single(estimate.left), _single(estimate.right)
         update = {
             "estimate": str(estimate.status),
@@ -95,13 +576,12 @@ class Factors:
 
     @cached_property
     def condition(self) -> float:
-        """The larger cond(Phi)^2 of the two: the conditioning of A under uniform light; inf when rank deficient."""
+        """Larger cond(Phi)^2 of the two; inf when rank deficient."""
         return max(squared_condition(self.left), squared_condition(self.right))
 
     @property
     def stated_rank(self) -> tuple[int, int] | None:
-        """Directions of scene rows and of columns that the calibration states to be above its noise; None: not stated,
-        as of sessions, which are flagged where they lack any."""
+        """Ranks of both factors above the noise, as the calibration states them; None for sessions."""
         match self.manifest.result.get("rank"):
             case [int(rows), int(columns)]:
                 return rows, columns
@@ -109,19 +589,19 @@ class Factors:
 
     @property
     def sides(self) -> tuple[FloatArray, FloatArray]:
-        """Both factors as the solver takes them: without their columns' means where frames are centred."""
+        """Both factors, centred if frames are."""
         if not self.manifest.centre:
             return self.left, self.right
         return centre_columns(self.left), centre_columns(self.right)
 
     @property
     def ok(self) -> bool:
-        """Whether the factors can be used as they are: a good status, and no warnings."""
+        """Whether the status is good and there are no warnings."""
         return self.status.ok and not self.warnings
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the calibration is flagged."""
+        """Warnings of the calibration."""
         return self.manifest.warnings
 
     @cached_property
@@ -132,16 +612,13 @@ class Factors:
 
     @check_arguments
     def save(self, folder: Path | str) -> Path:
-        """Write the CAL folder that `mitsim calibrate` writes, to a new or empty ``folder``; returns it.
-
-        MitsimError when it holds something, or cannot be written.
-        """
+        """Write the CAL folder of `mitsim calibrate` to a new or empty ``folder``, and return it."""
         with output_folder(folder) as place:
             return self.write(place)
 
     @check_arguments
     def write(self, folder: Path | str) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
+        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         folder = Path(folder)
         metadata: dict[str, str | float] = {"unit": "sqrt(e-/s)"}
         if self.manifest.board_reflectance is not None:
@@ -156,8 +633,7 @@ class Factors:
 
     @check_arguments
     def check_fit(self, shots: Capture) -> None:
-        """MitsimError when ``shots`` are of another camera, mask, distance, projector or light: names first, then
-        the first thing that differs."""
+        """Raise MitsimError if ``shots`` are of another camera, mask, distance, projector or light."""
         ours, theirs = (_parts(each.manifest.camera) for each in (shots, self))
         for name in sorted({*ours, *theirs}, key=lambda name: (not name.endswith("name"), name)):
             own, other = ours.get(name), theirs.get(name)
@@ -179,25 +655,20 @@ class Factors:
 
     @check_arguments
     def operator(self, patterns: str | PatternFamily, seed: int = 0) -> LinearOperator:
-        """The whole model as a linear operator, with its adjoint.
+        """Return the whole model as a linear operator, with its adjoint.
 
         Parameters
         ----------
         patterns
-            a family, or its name such as ``dots:7``.
+            Pattern family, or its name such as ``dots:7``.
         seed
-            of the patterns of a ``random`` family given by name.
+            Seed of a ``random`` family given by name.
 
         Returns
         -------
         LinearOperator
-            (K K' m m', n n'): takes an image (n, n'), row by row, to the measurements (K, K', m, m') [electrons/s] of
-            all patterns (i, j), the differences of signed pairs; centred where the calibration is.
-
-        Raises
-        ------
-        MitsimError
-            for patterns that do not fit the factors.
+            (K K' m m', n n'): from an image (n, n'), row by row, to the measurements (K, K', m, m') [electrons/s] of
+            all patterns (i, j), centred where the calibration is.
         """
         from scipy.sparse.linalg import LinearOperator
 
@@ -232,20 +703,11 @@ class Factors:
 
     @check_arguments
     def plot(self, side: Literal["left", "right"] = "left", ax: Axes | None = None) -> Axes:
-        """Draw a factor with a colour bar; returns the axes.
-
-        Parameters
-        ----------
-        side
-            ``left``: of rows; ``right``: of columns.
-        ax
-            matplotlib's axes to draw on; None: those of a new figure.
-        """
+        """Draw a factor (``left`` of rows, ``right`` of columns) with a colour bar, and return the axes."""
         return from_above("report.plots", "draw_factor")(self, side, ax)
 
     def to_xarray(self) -> Dataset:
-        """Both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm; MitsimError
-        where xarray, an extra, is not installed."""
+        """Return both factors as an ``xarray.Dataset`` with units and, where they are known, coordinates in mm."""
         return from_above("exchange.labelled", "label_factors")(self)
 
     def __repr__(self) -> str:
@@ -266,12 +728,10 @@ class Factors:
 
 
 def _single(values: FloatArray) -> FloatArray:
-    """``values`` rounded to single precision."""
     return values.astype(np.float32).astype(np.float64)
 
 
 def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
-    """What the identity of a ``camera`` says, by names such as ``projector.n``."""
     found: dict[str, Any] = {}
     for part, value in camera.items():
         inner = value.items() if isinstance(value, Mapping) else ()
@@ -280,7 +740,6 @@ def _parts(camera: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _factor_noise(estimate: Estimate) -> FactorNoise | None:
-    """How exact the factors of an ``estimate`` are; None where all is noise."""
     left, right = (
         error * float(np.linalg.norm(side)) / np.sqrt(side.size)
         for side, error in zip((estimate.left, estimate.right), estimate.predicted_error, strict=True)
@@ -292,12 +751,11 @@ def _factor_noise(estimate: Estimate) -> FactorNoise | None:
 
 @check_arguments
 def load_calibration(folder: Path | str) -> Factors:
-    """The factors in the CAL folder ``folder``. MitsimError when it is not a complete calibration."""
+    """Return the factors in a CAL ``folder``, or raise MitsimError if it is not a complete calibration."""
     folder = Path(folder)
     manifest = read_manifest(folder, CalibrationManifest)
 
     def read(name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of the file ``name``."""
         verify(folder, name, manifest.checksums, "calibrate again")
         return read_frame(folder / name)
 
@@ -307,22 +765,7 @@ def load_calibration(folder: Path | str) -> Factors:
 def factors_of(
     manifest: CalibrationManifest, read: Callable[[str], tuple[Channels, Metadata]], name: str = "in memory"
 ) -> Factors:
-    """Factors from a calibration's manifest and files.
-
-    Parameters
-    ----------
-    manifest
-        of the calibration.
-    read
-        channels and metadata of a file, by its name.
-    name
-        where they lie, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when a factor is not there, or not finite.
-    """
+    """Return the factors of a calibration's manifest and files, which ``read`` returns by name."""
     files = [(Path(name) / f"{side}.exr", read(f"{side}.exr")[0]) for side in SIDES]
     left, right = (finite_channel(channels, "factor", path) for path, channels in files)
     terms = max(sum(channel.startswith(_LACKING) for channel in channels) for _, channels in files)

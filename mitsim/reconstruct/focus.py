@@ -1,26 +1,36 @@
-"""Factors of a calibrated depth in; out come those of another depth, and the part of the sensor where they are known.
+"""Factors of another depth or of a wider window, and light that no projector pixel sends.
 
-A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d tau, and
-projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the calibrated
-one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the board.
-Columns change slowly (a mask feature is some ten pixels wide), so values between them are interpolated. Beyond the
-window no column was calibrated; but sensor pixels further on saw the same part of the mask in a column within, at u + v
-and tau - v (1/d - 1/z_0), for any v. Only at the sensor's own edge there is nothing left to see, and these few rows are
-left out, of frames and factors alike.
-
-What moves is the shadow, not the light: an image is light relative to the board's, pixel by pixel, so each pixel keeps
-the brightness that it had at z_0, while values are taken from columns that fall off more or less than its own. Sensor
-pixels that see one part of the mask in two columns tell how much.
+*Depth.* A scene point at tan-angle tau and depth z shades the sensor point u at mask coordinate s = u (1 - d/z) + d
+tau, and projector pixel i lights it at tau = A_i + B_i / z, B_i being the baseline. So the factor of depth z is the
+calibrated one with its columns moved: sensor pixel u sees pixel i where it saw tau_i + (B_i - u)(1/z - 1/z_0) at the
+board. Beyond the window no column was calibrated, but sensor pixels further on saw the same part of the mask in a
+column within, at u + v and tau - v (1/d - 1/z_0) for any v. Rows at the sensor's edge without such a column are left
+out of frames and factors. Each pixel keeps the brightness that it had at z_0.
 
 *Between columns.* Sensor row u + k sees in column i what row u sees at i + k s, s being the columns that one sensor
-pixel's step makes up for: the mask's shadow hangs on one coordinate. So each row has the numbers of its neighbours too,
-at places between its own, and a cubic spline with knots finer than columns is fitted to all of them: where a projector
-pixel is wide, a polynomial through columns alone misses the edges of the mask's features.
-"""
+pixel's step makes up for. So each row uses the numbers of its neighbours too, and a cubic spline with knots finer than
+columns is fitted to all of them.
+
+*Margin.* A wall beside the window scatters light of directions that no projector pixel has. Cells beyond the window
+cast the shadow of the window's edge, moved along the sensor, so that no calibration needs to light them. They count as
+lit in every pattern, which keeps the model separable (benchmarks/margin.py).
+
+*Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij the
+patterns,
+
+    Y_ij = Phi_L (P_ij o X) Phi_R^T + F,        F = Phi_L H_L g H_R^T Phi_R^T
+
+X is direct, F global light, whose image H_L g H_R^T is linear between nodes as far apart as the dots. With Phi H = Q R
+on each side and A = (sum_i U_i)^T Q, the least squares of all K frames over X and F = Q_L f Q_R^T have
+
+    K f - A_L^T (A_L f A_R^T) A_R = Q_L^T (sum_ij Y_ij) Q_R - A_L^T W A_R
+
+An eigenvalue of the left side over K is the part of a mode of F that lit pixels do not explain: 0 under uniform light,
+near 1 where the dots' shadows leave gaps. Global light that changes from frame to frame stays in X."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -32,23 +42,24 @@ from scipy.linalg import solveh_banded
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import Parallax
+from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Ambient, Capture, Measurement
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import check_parallax
+from mitsim.reconstruct.solver import Prepared
 
 STEP = 0.5
-"""Projector pixels of parallax between displacements that are looked at; a dot's image is some two wide."""
+"""Projector pixels of parallax between tried displacements; a dot's image is about two wide."""
 _NEIGHBOURS = 4
-"""Columns that a cubic takes: of 2 to 8 it leaves least (a sheet at 360 mm, 128 pixels: 3.1e-3, 2.1e-3, 2.1e-3, 2.1e-3
-of the measurements); more neighbours add noise."""
+"""Columns of a cubic; fewer leave more of a sheet at 360 mm, more add noise."""
 _DEGREE = 4
-"""Of the polynomial that brightness over columns is: cos^4 of 8.5 degrees is a parabola to 1e-4."""
+"""Degree of the polynomial of brightness over columns: cos^4 of 8.5 degrees is a parabola to 1e-4."""
 _PAIRS = 32
 """Distances along the sensor, at most twice as many, at which columns of the same shadow are compared."""
 _HIDDEN = 0.5
-"""Part of a pixel's light from which it counts as hidden: chosen, as more of it is then missing than seen."""
+"""Part of a pixel's light that must be missing for a hidden pixel."""
 LEAST_PART = 0.5
-"""Part of the sensor's rows that must remain: chosen, as fewer would be another camera."""
+"""Least part of the sensor's rows that must remain."""
 
 
 # ---- Factors moved to another depth ----
@@ -56,8 +67,11 @@ LEAST_PART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
-    """``factors`` of a depth, on the sensor's ``rows`` and ``columns`` where these are known; ``sensor`` is the whole's
-    shape, and ``hidden`` the part of the scene's pixels that the field stop takes most of the light of."""
+    """Factors of a depth on the sensor's ``rows`` and ``columns`` where they are known.
+
+    ``sensor`` is the shape of the whole sensor, and ``hidden`` the part of scene pixels whose light the field stop
+    blocks.
+    """
 
     factors: Factors
     rows: slice
@@ -66,15 +80,14 @@ class MovedFactors:
     hidden: float = 0.0
 
     def of(self, shots: Capture) -> Capture:
-        """What that part of the sensor saw of ``shots``."""
+        """Return the part of ``shots`` on these rows and columns."""
         return _Part(shots, self)
 
 
 def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
-    """The factors of a surface at ``depth_mm`` from the sensor, from calibrated ``factors``.
+    """Return the factors of a surface at ``depth_mm`` from the sensor.
 
-    ArgumentError for a depth where too little of them is known, MitsimError for a calibration that does not state its
-    parallax.
+    Raises ArgumentError for a depth where too little of them is known, and MitsimError without a stated parallax.
     """
     parallax = parallax_of(factors)
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
@@ -107,7 +120,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 
 
 def parallax_of(factors: Factors) -> Parallax:
-    """How ``factors`` move with depth; MitsimError where their calibration does not state it."""
+    """Return the parallax of ``factors``, or raise MitsimError if their calibration does not state it."""
     parallax = check_parallax(factors.manifest.parallax, factors.name)
     if min(factors.left.shape[1], factors.right.shape[1]) < _NEIGHBOURS:
         raise MitsimError(
@@ -118,17 +131,10 @@ def parallax_of(factors: Factors) -> Parallax:
 
 
 def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float, float, float]:
-    """Projector pixels that a change of 1/z by 1/mm moves, at the window's first and at its last edge; and what one mm
-    along the sensor takes off.
+    """Return projector pixels of parallax: two for a change of 1/z by 1/mm, one for a step along the sensor by 1 mm.
 
-    Parameters
-    ----------
-    parallax
-        of the calibration.
-    axis
-        0 for rows, 1 for columns.
-    count
-        n, projector pixels along it.
+    The first two are at the window's first and last edge. ``axis`` is 0 for rows and 1 for columns, ``count`` the
+    number of projector pixels along it.
     """
     window, edges = (parallax.row_tan, parallax.row_mm) if axis == 0 else (parallax.column_tan, parallax.column_mm)
     pixel = (window[1] - window[0]) / count
@@ -140,19 +146,16 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class FactorOfDepths:
-    """A calibrated ``factor`` (m, n), the left one (``axis`` 0) or the right one (1), and how it moves with depth."""
+    """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth."""
 
     factor: FloatArray
     parallax: Parallax
     axis: int
 
     def at(self, shift: float | FloatArray) -> tuple[FloatArray, slice]:
-        """The columns of another depth, and the sensor rows where all of them are known.
+        """Return the factor at another depth, and the sensor rows where all of its columns are known.
 
-        Parameters
-        ----------
-        shift
-            1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
+        ``shift`` is 1/z - 1/z_0 [1/mm] of all scene pixels, or (n,) of each.
         """
         column = self._source_columns(shift)
         row, within, known = self._sources(column)
@@ -163,23 +166,19 @@ class FactorOfDepths:
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
-        """(n,) part of each column's light that the field stop keeps from the sensor at another depth: 1/z changed by
-        ``shift`` [1/mm]; 0 where the calibration states no stop, or its own window was cut."""
+        """Return the part (n,) of each column's light that the field stop blocks at 1/z changed by ``shift`` [1/mm]."""
         return np.asarray(1 - self._transmission(self._source_columns(shift)).mean(axis=0))
 
     def noise(self, shift: float) -> float:
-        """Standard deviation of noise in columns at 1/z changed by ``shift`` [1/mm], over that of the calibrated ones:
-        less, as each number is fitted to many."""
+        """Return the noise of columns at 1/z changed by ``shift`` [1/mm], relative to that of the calibrated ones."""
         white = np.random.default_rng(0).standard_normal(self.factor.shape)
         row, within, _ = self._sources(self._source_columns(shift))
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
     def _source_columns(self, shift: float | FloatArray) -> FloatArray:
-        """(m, n) column that each sensor row saw at the calibrated depth where it now sees each scene pixel."""
         return np.arange(self.factor.shape[1]) + (self.edges - self._parallax_pixels[2] * self._place[:, None]) * shift
 
     def _transmission(self, column: FloatArray) -> FloatArray:
-        """(m, k) part of the light from each ``column`` (m, k) that the field stop lets through."""
         stop = self.parallax.stop_tan
         if stop is None:
             return np.ones_like(column)
@@ -195,9 +194,7 @@ class FactorOfDepths:
     # ---- Columns beside the window, and shadows between columns ----
 
     def beyond(self, margin: int) -> tuple[FloatArray, slice]:
-        """(m, ``margin`` + n + ``margin``) columns at the calibrated depth, with those beside the window, which no
-        projector pixel lights; what there is to see beyond the sensor's edge is taken from the last pixel. And the
-        sensor rows where that is nothing."""
+        """Return the factor with ``margin`` more columns a side, and the sensor rows where all of them are known."""
         rows, count = self.factor.shape
         column = np.arange(-margin, count + margin)
         row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
@@ -208,7 +205,6 @@ class FactorOfDepths:
     def _sources(
         self, column: npt.NDArray[np.floating | np.integer]
     ) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
-        """Rows and columns of the factor that saw the shadow of places between columns (m, k), and whether any did."""
         rows, count = self.factor.shape
         # Columns that one sensor pixel's step along the sensor makes up for.
         step = self._step
@@ -230,33 +226,30 @@ class FactorOfDepths:
 
     @cached_property
     def _own_brightness(self) -> FloatArray:
-        """(n,) of the calibrated columns."""
         return self.brightness(np.arange(self.factor.shape[1]))
 
     @property
     def edges(self) -> FloatArray:
-        """(n,) projector pixels that a change of 1/z by 1/mm moves the light of each."""
+        """Projector pixels (n,) that a change of 1/z by 1/mm moves the light of each pixel."""
         first, last, _ = self._parallax_pixels
         return np.asarray(np.linspace(first, last, 2 * self.factor.shape[1] + 1)[1::2])
 
     @property
     def reach(self) -> float:
-        """Projector pixels that a change of 1/z by 1/mm moves what some sensor pixel sees."""
+        """Largest number of projector pixels that a change of 1/z by 1/mm moves what a sensor pixel sees."""
         first, last, by_place = self._parallax_pixels
         return float(max(abs(first), abs(last), by_place * len(self.factor) * self._pitch / 2))
 
     def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """How bright places at each ``column`` and between are, the mask's shadow apart; 1 in the window's middle."""
+        """Return the brightness at each ``column`` without the mask's shadow; 1 in the window's middle."""
         return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
 
     def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """Places from the window's middle, its edges being 1 away."""
         middle = (self.factor.shape[1] - 1) / 2
         return np.asarray((column - middle) / middle)
 
     @cached_property
     def _falloff(self) -> FloatArray:
-        """(degrees + 1,) coefficients of the polynomial that the logarithm of brightness is; that of degree 0 is 0."""
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
@@ -280,14 +273,12 @@ class FactorOfDepths:
 
     @property
     def _step(self) -> float:
-        """Columns that one pixel's step along the sensor sees the mask's shadow move."""
         parallax = self.parallax
         inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
         return self._pitch * inverse * self._parallax_pixels[2]
 
     @cached_property
     def _place(self) -> FloatArray:
-        """(m,) place of each sensor row, from their middle [mm]."""
         rows = len(self.factor)
         return np.asarray((np.arange(rows) - (rows - 1) / 2) * self._pitch)
 
@@ -300,13 +291,11 @@ class FactorOfDepths:
 
 
 def _whole(known: npt.NDArray[np.bool_]) -> slice:
-    """Rows of which all numbers are ``known``."""
     inside = np.flatnonzero(known.all(axis=1))
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
 def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-    """Lagrange's cubic through the four columns around each ``column`` of each ``row``, exact at whole numbers."""
     start = np.clip(np.floor(column).astype(np.intp) - 1, 0, factor.shape[1] - _NEIGHBOURS)
     t = column - start
     weights = (
@@ -322,7 +311,7 @@ def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) ->
 
 
 class DerivedCapture(Capture):
-    """A ``whole`` capture of which something is changed; all else is its own."""
+    """Capture that differs from the ``whole`` capture in one respect."""
 
     def __init__(self, whole: Capture) -> None:
         super().__init__(whole.manifest, whole.folder)
@@ -335,29 +324,25 @@ class DerivedCapture(Capture):
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """What is taken off every frame."""
+        """Ambient frame that is subtracted from every frame."""
         return self.whole.ambient
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """What was measured, of a ``shape`` that is asked for."""
+        """Return the measurements of the whole capture."""
         return self.whole.pattern_measurements(shape)
 
 
 class _Part(DerivedCapture):
-    """What a part of the sensor saw of a capture."""
-
     def __init__(self, whole: Capture, part: MovedFactors) -> None:
         super().__init__(whole)
         self._part = part
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """As of the whole sensor, whose frames must have the shape that the calibration's have."""
         for each in self.whole.pattern_measurements(self._part.sensor):
             yield replace(each, frame=self._cut(each.frame), light=self._cut(each.light))
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """The ambient frame of that part."""
         whole = self.whole.ambient
         return whole and Ambient(self._cut(whole.rate), self._cut(whole.variance), whole.shots)
 
@@ -369,16 +354,7 @@ class _Part(DerivedCapture):
 
 
 def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
-    """Change of 1/z [1/mm] that moves the light of dots onto the place of others; inf for other patterns, and where
-    depth moves no light.
-
-    Parameters
-    ----------
-    patterns
-        P_L (n, K) and P_R (n', K').
-    parallax
-        of the calibration.
-    """
+    """Return the change of 1/z [1/mm] that moves the light of dots onto other dots; inf for other patterns."""
     ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
     moves = np.array([max(map(abs, each)) for each in ends])
     if not (moves.any() and all(are_dots(lit) for lit in patterns)):
@@ -388,20 +364,15 @@ def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax)
 
 
 def are_dots(patterns: FloatArray) -> bool:
-    """Whether each pixel is lit by one of the (n, K) ``patterns``, as dots light it."""
+    """Return True if exactly one of the (n, K) ``patterns`` lights each pixel."""
     values = np.sort(patterns, axis=1)
     return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
 
 
 def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
-    """Projector pixels of parallax by which light moves onto the place of another dot's of the same frame.
+    """Return the parallax in projector pixels that moves light onto another dot of the same frame.
 
-    Parameters
-    ----------
-    moves
-        projector pixels along both axes for one of parallax; 0 of an axis that has none.
-    periods
-        of the dots.
+    ``moves`` are the projector pixels along both axes for a parallax of one, and ``periods`` those of the dots.
     """
     for parallax in np.arange(1.0, np.prod(periods) + 1, STEP / 4):
         turns = moves * parallax / periods
@@ -414,28 +385,18 @@ def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
 
 
 _SPLINE_ROWS = 5
-"""Sensor rows to either side whose numbers a row is given: of 2, 3 and 5 the most leave least, 1.9e-3, 1.7e-3, 1.5e-3
-of columns of 15 um with noise of 2e-3 (a polynomial through their own row: 2.8e-2); more are another shadow behind
-masks with thickness."""
+"""Sensor rows to either side that a row's spline is fitted to: of 2, 3 and 5 the most leave least (1.9e-3, 1.7e-3,
+1.5e-3)."""
 _SPLINE_KNOTS = 4
-"""Knots a column: with 2, columns of 15 um are off by 2.5e-3 with noise of 2e-3 instead of 1.5e-3."""
+"""Knots for each column."""
 _STIFFNESS = 1e-2
-"""Weight of the squared third differences of neighbouring coefficients over that of a number's error: with 1e-3 noise
-of 2e-3 leaves 1.7e-3 instead of 1.5e-3, without noise 1.0e-3 instead of 1.2e-3."""
+"""Weight of squared third differences of coefficients over that of a number's error."""
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 """Third difference of four neighbours."""
 
 
 class ColumnSpline:
-    """A ``factor`` (m, n) at any place between its columns.
-
-    Parameters
-    ----------
-    factor
-        free of what changes from column to column but the shadow.
-    step
-        columns by which the next sensor row sees the shadow moved.
-    """
+    """Spline of a ``factor`` (m, n) between its columns, whose shadow moves by ``step`` columns from row to row."""
 
     def __init__(self, factor: FloatArray, step: float) -> None:
         rows, count = factor.shape
@@ -448,13 +409,12 @@ class ColumnSpline:
         self._coefficients[edges] = self._fit_each(factor[nearest], nearest - edges[:, None])
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-        """Numbers of each ``row`` at each ``column``, from 0 to n - 1, whole or not; the two broadcast."""
+        """Return numbers of each ``row`` at each ``column``, from 0 to n - 1; the two broadcast."""
         start, weights = self._weights(column * _SPLINE_KNOTS)
         first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
 
     def _fit(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        """(len(``rows``), coefficients) of the spline of each row, from its ``neighbours``' numbers."""
         normal, start, weights = self._normal(neighbours[None])
         data = np.zeros((self._last + 3, len(rows)))
         for k, first, parts in zip(neighbours, start[0], np.moveaxis(weights[:, 0], 1, 0), strict=True):
@@ -466,16 +426,12 @@ class ColumnSpline:
         return np.asarray(solveh_banded(normal[0], data, lower=True).T)
 
     def _fit_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        """(rows, coefficients) of the spline of each row, from what is ``seen`` (rows, k, n) in the ``neighbours``
-        (rows, k) of its own."""
         normal, start, weights = self._normal(neighbours)
         data = np.sum([self._collect(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
         found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
         return np.array(found).reshape(len(seen), self._last + 3)
 
     def _normal(self, neighbours: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
-        """Of fits to rows that are ``neighbours`` (fits, k): normal matrices (fits, 4, coefficients) by diagonal, first
-        coefficient (fits, k, n) and weights (4, fits, k, n) of each number, 0 beyond the last knot."""
         place = (np.arange(self._last // _SPLINE_KNOTS + 1) + neighbours[..., None] * self._step) * _SPLINE_KNOTS
         start, parts = self._weights(place)
         weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
@@ -487,14 +443,11 @@ class ColumnSpline:
         return normal, start, weights
 
     def _collect(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
-        """(fits, coefficients) sums of the ``values`` (fits, k, n) at each ``place`` (fits, k, n)."""
         fits, size = len(place), self._last + 3
         own = (np.arange(fits) * size)[:, None, None] + place
         return np.asarray(np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size), dtype=np.float64)
 
     def _weights(self, place: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
-        """First of the four coefficients at each ``place`` [knots], and the weights of all four: uniform cubic
-        B-splines."""
         start = np.clip(np.floor(place).astype(np.intp), 0, self._last - 1)
         t = place - start
         square = t * t
@@ -502,3 +455,167 @@ class ColumnSpline:
         first = (1 + 3 * (square - t)) / 6 - last
         third = (1 + 3 * (t + square)) / 6 - 3 * last
         return start, (first, 1 - first - third - last, third, last)
+
+
+# ---- A margin of cells beside the window -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """Additional ``cells`` on each side of the projector's window."""
+
+    cells: int
+
+    def factors(self, factors: Factors) -> MovedFactors:
+        """Return ``factors`` with columns of these cells, on the part of the sensor where they are known.
+
+        Raises MitsimError without a stated parallax, and for more cells than the window or the sensor covers.
+        """
+        parallax, sides = parallax_of(factors), (factors.left, factors.right)
+        if self.cells > (most := min(factor.shape[1] for factor in sides)):
+            raise ArgumentError("margin", f"{self.cells}: give at most {most}, the projector's pixels a side")
+        widened = [FactorOfDepths(factor, parallax, axis).beyond(self.cells) for axis, factor in enumerate(sides)]
+        part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
+        if part < LEAST_PART:
+            raise ArgumentError(
+                "margin",
+                f"{self.cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer",
+            )
+        (left, rows), (right, columns) = widened
+        sizes = factors.left.shape[1], factors.right.shape[1]
+        manifest = factors.manifest.model_copy(update={"parallax": _wider(parallax, sizes, self.cells)})
+        shape = len(factors.left), len(factors.right)
+        wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
+        return MovedFactors(wider, rows, columns, shape)
+
+    def of(self, shots: Capture) -> Capture:
+        """Return ``shots`` with patterns that always light these cells, or raise MitsimError for patterns of -1."""
+        if any(shot.sign for shot in shots.manifest.patterns.captures):
+            raise MitsimError(
+                f"margin {self.cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what "
+                "is lit always is not there; leave margin out"
+            )
+        return _Padded(shots, self.cells)
+
+    def inside(self, image: FloatArray) -> FloatArray:
+        """Return the window's part of an ``image``."""
+        return image[self.cells : -self.cells, self.cells : -self.cells]
+
+
+class _Padded(DerivedCapture):
+    def __init__(self, whole: Capture, cells: int) -> None:
+        super().__init__(whole)
+        self._cells = cells
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        pad = (self._cells, self._cells), (0, 0)
+        left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in self.whole.patterns)
+        return left, right
+
+
+def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
+    def extend(edges: tuple[float, float], size: int) -> tuple[float, float]:
+        more = (edges[1] - edges[0]) * cells / size
+        return edges[0] - more, edges[1] + more
+
+    names = ("row_tan", "row_mm"), ("column_tan", "column_mm")
+    update = {
+        name: extend(getattr(parallax, name), size) for size, own in zip(sizes, names, strict=True) for name in own
+    }
+    return parallax.model_copy(update=update)
+
+
+# ---- Global light, the same in all frames ----------------------------------------------------------------------------
+
+
+_LEAST_EIGENVALUE = 1e-3
+"""Least part of a mode that must remain; noise in the mode is magnified by the root of its inverse."""
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Light that all frames share.
+
+    Attributes
+    ----------
+    common : (m, m') array
+        Light of each frame, in the frames' unit.
+    image : (n, n') array
+        Reflectance that it looks like under uniform light.
+    eigenvalues
+        Part of each mode that lit pixels do not explain, smallest first.
+    """
+
+    common: FloatArray
+    image: FloatArray
+    eigenvalues: FloatArray
+
+
+@single_threaded_blas()
+def separate(
+    model: Prepared,
+    seen: tuple[FloatArray, FloatArray],
+    patterns: tuple[FloatArray, FloatArray],
+    weights: FloatArray,
+    total: FloatArray,
+) -> Separation:
+    """Return the global light of frames under shifting dots.
+
+    Parameters
+    ----------
+    model
+        Factorised model of these patterns.
+    seen : (m, n + 2 w) and (m', n' + 2 w') arrays
+        Factors with w columns beside the window on either side (:meth:`FactorOfDepths.beyond`), or w = 0.
+    patterns
+        P_L (n, K) and P_R (n', K').
+    weights, total
+        W (r, r'), and the sum (m, m') of all frames.
+
+    Raises
+    ------
+    MitsimError
+        For uniform light, +-1 patterns or centred factors, under which global light looks like an image.
+    """
+    if model.centre or any((side < 0).any() for side in patterns):
+        raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
+    nodes = [_hats(factor.shape[1], side.shape[1]) for factor, side in zip(seen, patterns, strict=True)]
+    bases, triangles = zip(*(np.linalg.qr(side @ hats) for side, hats in zip(seen, nodes, strict=True)), strict=True)
+    lit = [side.common.T @ basis for side, basis in zip((model.left, model.right), bases, strict=True)]
+    shape = bases[0].shape[1], bases[1].shape[1]
+    count = model.left.pattern_count * model.right.pattern_count
+    measured = (model.sigma > 0).astype(np.float64)
+    target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
+    unexplained: FloatArray = np.eye(target.size) - _explained_matrix(lit, measured) / count
+    reported, modes = np.linalg.eigh(unexplained)
+    if reported[-1] < _LEAST_EIGENVALUE:
+        raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
+    inverse = np.divide(1.0, count * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
+    found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(shape)
+    left, right = (
+        _inside(hats, len(side)) @ np.linalg.inv(triangle)
+        for hats, side, triangle in zip(nodes, patterns, triangles, strict=True)
+    )
+    part = float(np.prod([side.mean() for side in patterns]))
+    return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, reported)
+
+
+def _inside(hats: FloatArray, pixels: int) -> FloatArray:
+    margin = (len(hats) - pixels) // 2
+    return hats[margin : margin + pixels]
+
+
+def _hats(pixels: int, period: int) -> FloatArray:
+    """Return (pixels, J) functions linear between J nodes ``period`` apart, the outer ones at the window's ends."""
+    count = max(2, 1 + -(-(pixels - 1) // period))
+    place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
+    return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))
+
+
+def _explained_matrix(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
+    pairs = [(side[:, :, None] * side[:, None, :]).reshape(len(side), -1) for side in lit]
+    sizes = [side.shape[1] for side in lit]
+    product = (pairs[0].T @ measured @ pairs[1]).reshape(sizes[0], sizes[0], sizes[1], sizes[1])
+    size = sizes[0] * sizes[1]
+    return np.asarray(product.transpose(0, 2, 1, 3).reshape(size, size))

@@ -54,8 +54,10 @@ _OUTLIER, _DIMMED = 6.5, 0.02
 
 @dataclass(frozen=True)
 class FrameFault:
-    """Shots that do not fit the others: ``kind`` of the test, ``numbers`` from 0 in the manifest's order, ``files``,
-    ``words`` for people, and the part of their light, rms, by which they differ."""
+    """Shots that do not fit the others, and the part of their light, rms, by which they differ.
+
+    ``kind`` is the test, ``numbers`` count from 0 in the manifest's order, and ``words`` are for people.
+    """
 
     kind: str
     numbers: tuple[int, ...]
@@ -265,8 +267,7 @@ class FrameCheck:
     # ---- What no test decides
 
     def limits(self) -> tuple[dict[str, Any], ...]:
-        """Return what the frames of a real camera leave undecided, unless a uniform closing frame decides it: entries
-        of result.json, with words and the sizes up to which nothing is seen."""
+        """Return entries of result.json on what the frames of a real camera leave undecided without a closing frame."""
         shots = self._data.shots
         if shots.manifest.plan is not None or (shots.closing and shots.closing.kind == "uniform"):
             return ()

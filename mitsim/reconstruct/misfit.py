@@ -21,15 +21,14 @@ from typing import Any
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
-from mitsim.reconstruct.accumulation import Accumulation, FrameNoise
+from mitsim.reconstruct.accumulation import Accumulation, FrameNoise, LitFrames, print_energy
 from mitsim.reconstruct.defects import Defects, find_defects
-from mitsim.reconstruct.estimate_factors import decibels
+from mitsim.reconstruct.factors import decibels
 from mitsim.reconstruct.frame_check import FrameCheck, FrameFault
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.readings import Reading, find_readings, multiple, negative, pixel_groups
 from mitsim.reconstruct.residuals import CHANCE, TINY, NoiseTest, Place, Residuals, noise_chance
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.subpixel import LitFrames, print_energy
 from mitsim.reconstruct.uncertainty import Propagation
 
 UNEXPLAINED = 3.5e-3

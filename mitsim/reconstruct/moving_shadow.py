@@ -113,8 +113,7 @@ class MovingShadow:
         return np.real(shapes.conj() * self._left).sum(axis=0) / size, self._unit / len(self._own) / 2 / size
 
     def powers(self) -> tuple[FloatArray, FloatArray]:
-        """Return (N,) 1 - 1 / p and its variance, p being the power of each frame that is shown against the uniform
-        one: its vector is p (u_i + u_0) - u_0."""
+        """Return (N,) 1 - 1 / p and its variance, where p (u_i + u_0) - u_0 is the vector of a frame of power p."""
         return self.along(self._spectra + self._spectra[:, :1])
 
     def moves(self) -> tuple[FloatArray, FloatArray]:
@@ -149,8 +148,7 @@ def _modes(angles: FloatArray, step: float, n: int) -> ComplexArray:
 
 
 def _step(columns: ComplexArray, angles: FloatArray, pixels: int) -> float:
-    """Return the pixels that the spectra of ``columns`` move by from one to the next: the step whose reversal makes
-    their sum largest."""
+    """Return the pixels by which ``columns`` move from one to the next, whose reversal makes their sum largest."""
     n = columns.shape[1]
     length = 8 * n
     power = np.square(np.abs(np.fft.fft(columns, length, axis=1)))

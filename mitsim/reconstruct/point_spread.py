@@ -1,34 +1,43 @@
-"""Frames, patterns and a measured point spread function in; the image within bounds, and how far it is above its
-minimum, out.
+"""Image within bounds from frames, patterns and a measured point spread function.
 
 A camera whose scene points all cast one light h, each shifted by its place (:mod:`mitsim.reconstruct.convolution`),
-sees Y_i = crop(h * (P_i o X)). Minimised is, over all X within bounds,
+sees Y_i = crop(h * (P_i o X)). Over all X within bounds
 
     P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
 
-**What is solved for.** Under uniform light everything that can put light on the sensor: frames of m pixels and h of k
-have m + k - 1 scene pixels a side. Convolutions on a grid of that size wrap round only where the sensor is not. The
-image is the middle of it, as large as the sensor; what is beside takes up light from outside, as a margin does. Under
-patterns the scene is theirs, and dark beyond.
+is minimised.
 
-**How.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each pass followed by a
-projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, of which the first three
-lie in some hundred low frequencies. A division by |H|^2 + mu takes these out; and a start from the image of frames and
-light at half the size, made the same way, has them right. TV is taken for quadratic where slopes are below a thousandth
-of the peak over a pixel, and in each pass for the quadratic that touches it.
+**Scene.** Under uniform light it is everything that can put light on the sensor: frames of m pixels and h of k have m +
+k - 1 scene pixels a side. The image is the middle of it, as large as the sensor; the rest takes up light from outside.
+Under patterns the scene is theirs, and dark beyond.
 
-**When it ends.** Where the last half of all steps has lowered the objective by no more than ``tolerance`` of itself,
-and the quadratic promised no more of the last pass. What steps have gained is the least that the objective was above
-its minimum before them (Strakos and Tichy, ETNA 13, 2002), so this is no proof; the next bound is.
+**Method.** Passes of a few steps of conjugate gradients in the pixels that bounds leave free, each followed by a
+projection on the bounds (Moré and Toraldo, SIAM J. Optim. 1, 1991). |H|^2 spans seven decades, so that steps are
+preconditioned by a division by |H|^2 + mu and start from the image at half the size. TV is quadratic where slopes are
+below a thousandth of the peak over a pixel, and in each pass replaced by the quadratic that touches it. The iterations
+end where the last half of all steps has lowered the objective by at most ``tolerance`` of itself (Strakos and Tichy,
+ETNA 13, 2002).
 
-**How far above the minimum.** With r = sum of frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that
-pushes against bounds alone, and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the
-bounds, no farther than R = ||X|| from X,
+**Gap.** With r the frames' residuals, Q = weight grad X / max(|grad X|, epsilon), N that pushes against bounds alone,
+and any d, e = A d: f(X + D) >= f(X) + <r + e, A D> - ||e||^2 / 2, so that within the bounds, no farther than R = ||X||
+from X,
 
     P(X) - min P <= weight TV(X) - Q . grad X + N . (X - bound) + ||e||^2 / 2 + R |g| - ridge R^2 / 2
 
-with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; and |g|^2 / (2 ridge) in place of the last two terms
-where not. d is a few steps of conjugate gradients on A^T A d = -g.
+with g = A^T (r + e) + ridge X + div Q - N, where |g| > ridge R; otherwise |g|^2 / (2 ridge) replaces the last two
+terms. d is a few steps of conjugate gradients on A^T A d = -g.
+
+**Weight.** Blocks of sensor pixels are left out, the image of the rest is made, and the light that it sends to these
+blocks is compared with theirs. Where the lambda that predicts them best asks for clearly more noise than the frames
+have, the model is wrong by as much, and the weight follows from that error in place of the noise.
+
+**Fit.** A frame has fewer pixels than the scene, so that any point spread function fits it with some image. A wrong one
+needs a negative or rough image. So the least of
+
+    1/2 ||A X - Y||^2 + w TV(X),    X >= 0
+
+is compared with that of the same light mirrored and turned, which has the same spectrum and thus the same power to
+explain frames.
 """
 
 from __future__ import annotations
@@ -36,8 +45,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cache, cached_property
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -45,30 +54,31 @@ from scipy import fft
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.solvers import Prior
+from mitsim.devices.patterns import PatternFamily
+from mitsim.reconstruct.solution import Status, Verdict
+from mitsim.reconstruct.solvers import Prior, lengths, slopes_adjoint, slopes_of
 
 Array = npt.NDArray[Any]
 
 _MU = 10.0
-"""mu over the mean of |H|^2: of 0.3 to 100 none ends sooner in all cases, on a measured diffuser."""
+"""mu over the mean of |H|^2."""
 _COARSE_STEPS, _LEAST_SIDE = 60, 32
-"""Steps at each of the smaller sizes, and sides that are not halved: of 30, 60 and 100 steps those that end soonest."""
+"""Steps at each of the smaller sizes, and least side of these."""
 _SMOOTH = 1e-3
 """Slope below which TV is quadratic, over the image's largest number."""
 _FIRST_SMOOTH, _SHARPENED = 10.0, 0.3
-"""That of the first pass over this, and of each pass over that of the one before. Of none, 10 or 30, and 0.3 or 0.5,
-those that end soonest: with none, large weights take five times as many steps to within 5 %."""
+"""Smoothing slope of the first pass over the final one, and ratio between passes: without it large weights take five
+times as many steps."""
 _PASS, _PASS_UNBOUND = 6, 12
-"""Steps of a pass, with bounds and without: of 1 to 12 those that end soonest. Fewer forget what was found, and more go
-where bounds do not let them."""
+"""Steps of a pass, with bounds and without."""
 _TIGHTENED = 2
-"""Steps of conjugate gradients for the d of a bound: they lower it to a third."""
+"""Steps of conjugate gradients for the d of the gap."""
 _NOTHING = 1e-300
-"""In place of a zero that is divided by."""
+"""Divisor in place of a zero."""
 _FEWEST = 1e-12
-"""Shortest part of a pass that is taken: below it nothing is gained in double precision."""
+"""Shortest part of a pass."""
 _HUGE = 1e30
-"""In place of an infinite bound, where a distance to it is multiplied."""
+"""Inverse of the least distance to a bound."""
 
 
 # ---- The camera ------------------------------------------------------------------------------------------------------
@@ -76,20 +86,20 @@ _HUGE = 1e30
 
 @dataclass(frozen=True, eq=False)
 class ShiftedLight:
-    """A point spread function under patterns.
+    """Camera whose scene points all cast one pattern of light.
 
     Attributes
     ----------
-    psf
-        (k, k') light of one scene pixel, in sensor pixels.
+    psf : (k, k') array
+        Light of one scene pixel, in sensor pixels.
     sensor
-        (m, m') rows and columns of the sensor.
+        Rows and columns (m, m') of the sensor.
     patterns
         P_L (n, K) and P_R (n', K'); None: uniform light of all that reaches the sensor.
     precision
-        of all numbers.
-    seen
-        (m, m') 1 for pixels that count, 0 for those that are held out; None: all count.
+        Type of all numbers.
+    seen : (m, m') array
+        1 for pixels that count, 0 for those that are held out; None: all count.
     """
 
     psf: FloatArray
@@ -101,12 +111,36 @@ class ShiftedLight:
     def __post_init__(self) -> None:
         if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
             raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
-        for size, most in zip(self.sensor, self._whole, strict=True):
+        for size, most in zip(self.sensor, self.whole, strict=True):
             if size > most:
                 raise MitsimError(
-                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self._whole[0]} x "
-                    f"{self._whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
+                    f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self.whole[0]} x "
+                    f"{self.whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
                 )
+
+    @classmethod
+    def of(cls, psf: FloatArray, n: int, sensor: tuple[int, int] | None = None) -> ShiftedLight:
+        """Return a camera before an evenly lit scene of ``n`` x ``n`` pixels, whose sensor gets all light."""
+        if n < 1:
+            raise MitsimError(f"scene of {n} pixels a side; give at least 1")
+        rows, columns = (size + n - 1 for size in psf.shape)
+        return cls(psf, sensor or (rows, columns), (np.ones((n, 1)), np.ones((n, 1))))
+
+    def under(self, family: PatternFamily) -> ShiftedLight:
+        """Return the same camera under the patterns of a ``family``."""
+        if (family.n, family.n) != self.scene:
+            raise MitsimError(
+                f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}; both need the same"
+            )
+        return replace(self, patterns=(family.left.astype(np.float64), family.right.astype(np.float64)))
+
+    def check_frames(self, frames: Array) -> None:
+        """Raise MitsimError unless ``frames`` fit the patterns and the sensor and are finite."""
+        if frames.shape != (self.count, *self.sensor) or not np.isfinite(frames).all():
+            raise MitsimError(
+                f"frames of shape {frames.shape}: give {self.count} of {self.sensor[0]} x {self.sensor[1]} finite "
+                "numbers"
+            )
 
     @property
     def scene(self) -> tuple[int, int]:
@@ -132,7 +166,7 @@ class ShiftedLight:
         return rows, columns
 
     def image_of(self, scene: Array) -> Array:
-        """(K K', m, m') frames of a ``scene`` (n, n')."""
+        """Return the frames (K K', m, m') of a ``scene`` (n, n')."""
         frames = np.empty((self.count, *self.sensor), self.precision)
         rows, columns = self._crop
         for frame, light in zip(frames, self._lights, strict=True):
@@ -143,7 +177,7 @@ class ShiftedLight:
         return frames if self.seen is None else frames * self.seen
 
     def correlate(self, frames: Array) -> Array:
-        """Adjoint of :meth:`image_of`: (n, n') of ``frames`` (K K', m, m')."""
+        """Return the adjoint (n, n') of :meth:`image_of` for ``frames`` (K K', m, m')."""
         (rows, columns), total = self.scene, np.zeros(self.scene, self.precision)
         placed = np.zeros((self.sensor[0], self.grid[1]), self.precision)
         for frame, light in zip(frames, self._lights, strict=True):
@@ -156,19 +190,20 @@ class ShiftedLight:
         return total
 
     def half_size(self) -> ShiftedLight | None:
-        """Return the same camera at half the size; None under patterns, with pixels held out, and where that is too
-        small."""
+        """Return the camera at half the size, or None under patterns, with held-out pixels, and if too small."""
         small = min(*self.psf.shape, *self.sensor) // 2 < _LEAST_SIDE
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
     def reduce(self, factor: int) -> ShiftedLight:
-        """Return the same camera with pixels ``factor`` times as large; with 1 itself."""
+        """Return the camera with pixels ``factor`` times as large."""
         rows, columns = (size // factor for size in self.sensor)
         return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
 
     def double(self, smaller: Array) -> Array:
-        """(n, n') image of a ``smaller`` one of :meth:`half_size`, taken linearly between its pixels; pixel p of it
-        is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one."""
+        """Return the image (n, n') of a ``smaller`` one of :meth:`half_size`, linear between its pixels.
+
+        Pixel p of the smaller image is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one.
+        """
         image = np.zeros(self.scene, self.precision)
         place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
         for axis in (0, 1):
@@ -181,7 +216,7 @@ class ShiftedLight:
 
     @property
     def column_power(self) -> float:
-        """Mean square of what one unit of a scene pixel puts into all frames, but for the crop."""
+        """Mean square of the light of one scene pixel in all frames, without the crop."""
         power = float(np.square(self.psf).sum())
         if self.patterns is None:
             return power
@@ -190,8 +225,8 @@ class ShiftedLight:
 
     @cached_property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns of transforms: light that wraps round lands beside the sensor."""
-        sides = zip(self.scene, self._whole, self._origin, self.sensor, strict=True)
+        """Rows and columns of transforms; light that wraps round lands beside the sensor."""
+        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
         rows, columns = (
             fft.next_fast_len(max(scene, whole - origin, origin + size), real=True)
             for scene, whole, origin, size in sides
@@ -200,22 +235,22 @@ class ShiftedLight:
 
     @cached_property
     def spectrum(self) -> Array:
-        """Of h, on the grid."""
+        """Spectrum of h on the grid."""
         return np.asarray(fft.rfft2(self.psf.astype(self.precision), self.grid))
 
     @property
-    def _whole(self) -> tuple[int, int]:
+    def whole(self) -> tuple[int, int]:
         rows, columns = (n + k - 1 for n, k in zip(self.scene, self.psf.shape, strict=True))
         return rows, columns
 
     @property
-    def _origin(self) -> tuple[int, int]:
-        rows, columns = ((whole - size) // 2 for whole, size in zip(self._whole, self.sensor, strict=True))
+    def origin(self) -> tuple[int, int]:
+        rows, columns = ((whole - size) // 2 for whole, size in zip(self.whole, self.sensor, strict=True))
         return rows, columns
 
     @property
     def _crop(self) -> tuple[slice, slice]:
-        (row, column), (rows, columns) = self._origin, self.sensor
+        (row, column), (rows, columns) = self.origin, self.sensor
         return slice(row, row + rows), slice(column, column + columns)
 
     @property
@@ -227,7 +262,7 @@ class ShiftedLight:
 
 
 def reduce_frame(frame: Array, reduce: int) -> Array:
-    """Means of ``reduce`` x ``reduce`` numbers of a ``frame``; rows and columns that remain are left out."""
+    """Return means of ``reduce`` x ``reduce`` numbers of a ``frame``, without the remaining rows and columns."""
     rows, columns = (size // reduce for size in frame.shape)
     blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
     return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
@@ -238,16 +273,6 @@ def reduce_frame(frame: Array, reduce: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """An image X (n, n') of ``light``, and what follows of it.
-
-    Attributes
-    ----------
-    residual
-        A X - Y.
-    smooth
-        the slope below which TV is quadratic.
-    """
-
     light: ShiftedLight
     prior: Prior
     image: Array
@@ -255,56 +280,44 @@ class _State:
     smooth: float
 
     @cached_property
-    def _slopes(self) -> tuple[Array, Array, Array]:
-        down, across = _slopes(self.image)
-        return down, across, np.sqrt(down * down + across * across)
+    def _slopes(self) -> Array:
+        return lengths(slopes_of(self.image))
 
     @cached_property
     def _flattened(self) -> float:
-        """How far the quadratic TV is below TV, times the weight."""
         if not self.prior.weight:
             return 0.0
-        low = np.minimum(self._slopes[2], self.smooth)
+        low = np.minimum(self._slopes, self.smooth)
         return self.prior.weight * (float(low.sum(dtype=np.float64)) - _dot(low, low) / (2 * self.smooth))
 
     @cached_property
     def objective(self) -> float:
-        """P(X)."""
         squares = _dot(self.residual, self.residual) + self.prior.ridge * _dot(self.image, self.image)
         if not self.prior.weight:
             return squares / 2
-        return squares / 2 + self.prior.weight * float(self._slopes[2].sum(dtype=np.float64))
+        return squares / 2 + self.prior.weight * float(self._slopes.sum(dtype=np.float64))
 
     @property
     def smoothed(self) -> float:
-        """P(X) with the quadratic TV, which is what a step lowers."""
         return self.objective - self._flattened
 
     @cached_property
     def _stiffness(self) -> Array:
-        """Weight over slopes: Q of slopes of 1."""
-        return np.asarray(self.prior.weight / np.maximum(self._slopes[2], self.smooth))
+        return np.asarray(self.prior.weight / np.maximum(self._slopes, self.smooth))
 
     @cached_property
     def gradient(self) -> Array:
-        """Of the smoothed objective."""
         return self.light.correlate(self.residual) + self.bend(self.image)
 
     def bend(self, direction: Array) -> Array:
-        """What the second derivative of ridge and TV makes of a ``direction``, with TV for the quadratic that touches
-        it at X; of X itself their gradient."""
+        """Return the second derivative of ridge and the quadratic TV at X, times a ``direction``."""
         bent = self.prior.ridge * direction
         if self.prior.weight:
-            down, across = (each * self._stiffness for each in _slopes(direction))
-            bent[1:] += down[:-1]
-            bent[:-1] -= down[:-1]
-            bent[:, 1:] += across[:, :-1]
-            bent[:, :-1] -= across[:, :-1]
+            bent += slopes_adjoint(slopes_of(direction) * self._stiffness)
         return bent
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Pixels that no bound holds."""
         low, high = self.prior.bounds
         free = np.ones(self.image.shape, dtype=bool)
         if math.isfinite(low):
@@ -314,7 +327,6 @@ class _State:
         return free
 
     def move(self, direction: Array, seen: Array, length: float) -> _State:
-        """The state a ``length`` along a ``direction``, which the sensor sees as ``seen``, within the bounds."""
         image = self.image + self.precise(length) * direction
         if not self.prior.bounded:
             return replace(self, image=image, residual=self.residual + self.precise(length) * seen)
@@ -331,8 +343,7 @@ class _State:
         return np.asarray(1 / total, light.precision)
 
     def divide(self, image: Array) -> Array:
-        """Near what the inverse of the second derivative makes of an ``image`` under uniform light: a division in the
-        Fourier domain."""
+        """Return the approximate inverse of the second derivative times an ``image``, by a Fourier transform."""
         if self.light.patterns is not None:
             return image
         rows, columns = image.shape
@@ -340,16 +351,14 @@ class _State:
         return np.asarray(fft.irfft2(turned, self.light.grid)[:rows, :columns])
 
     def precise(self, number: float) -> Any:
-        """A ``number`` that leaves arrays in their precision."""
         return self.image.dtype.type(number)
 
     # ---- how far above the minimum
 
     def gap(self) -> float:
-        """Upper bound of P(X) - min P; the module's text says of which images."""
         variation = 0.0
         if self.prior.weight:
-            length = self._slopes[2]
+            length = self._slopes
             held = length * length / np.maximum(length, self.smooth)
             variation = self.prior.weight * float((length - held).sum(dtype=np.float64))
         free, slope, direction, power = self.free, self.gradient, None, 1.0
@@ -371,7 +380,7 @@ class _State:
         return max(variation, 0.0) + best
 
     def _parts(self, slope: Array) -> tuple[float, Array]:
-        """N . (X - bound) and ``slope`` - N, for an N that makes little of both."""
+        """Return N . (X - bound) and ``slope`` - N, for an N that makes both small."""
         if not self.prior.bounded:
             return 0.0, slope
         reach = max(math.sqrt(_dot(self.image, self.image)), 1 / _HUGE)
@@ -394,19 +403,10 @@ class _State:
         return total, left
 
     def _most_lowered(self, slope: float) -> float:
-        """Most that a gradient of that norm can lower P within R."""
         ridge, reach = self.prior.ridge, math.sqrt(_dot(self.image, self.image))
         if slope <= ridge * reach:
             return slope * slope / (2 * ridge) if ridge else 0.0
         return slope * reach - ridge * reach**2 / 2
-
-
-def _slopes(image: Array) -> tuple[Array, Array]:
-    """Differences of an ``image`` (n, n') to the next row and column; 0 at the last."""
-    down, across = np.zeros_like(image), np.zeros_like(image)
-    np.subtract(image[1:], image[:-1], out=down[:-1])
-    np.subtract(image[:, 1:], image[:, :-1], out=across[:, :-1])
-    return down, across
 
 
 def _dot(first: Array, second: Array) -> float:
@@ -418,21 +418,20 @@ def _dot(first: Array, second: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """An image near the minimum, and how near.
+    """Image near the minimum.
 
     Attributes
     ----------
-    image
-        the whole scene (n, n').
+    image : (n, n') array
+        The whole scene.
     iterations
-        steps at full size.
+        Steps at full size.
     objective
         P of the image.
     fall
-        what the last half of the steps lowered the objective by, or what the last pass promised, if that is more; over
-        the objective.
+        Relative fall of the objective in the last half of the steps, or promised by the last pass if that is more.
     gap
-        most that the objective is above its minimum, over the objective.
+        Bound of the objective's excess over its minimum, over the objective.
     """
 
     image: Array
@@ -443,23 +442,12 @@ class Minimum:
 
 
 def minimise(light: ShiftedLight, frames: Array, prior: Prior, iterations: int, tolerance: float) -> Minimum:
-    """The image at which the fall is at most ``tolerance``, or that after ``iterations`` steps.
-
-    Parameters
-    ----------
-    light, frames
-        the camera, and what it saw (K K', m, m').
-    prior
-        what is known of scenes.
-    iterations, tolerance
-        most steps at full size, and the fall at which they end.
-    """
+    """Minimise P, until the fall is at most ``tolerance`` or after ``iterations`` steps at full size."""
     state, spent, fall = _descend(_start(light, frames, prior), iterations, tolerance)
     return Minimum(state.image, spent, state.objective, fall, state.gap() / max(state.objective, _NOTHING))
 
 
 def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
-    """Where steps begin: at the image of half the size, or at none."""
     low, high = prior.bounds
     smaller = light.half_size()
     if smaller:
@@ -483,7 +471,6 @@ def _start(light: ShiftedLight, frames: Array, prior: Prior) -> _State:
 
 
 def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, int, float]:
-    """The state after at most so many steps, their number, and its fall."""
     sharp, most = state.smooth, _PASS if state.prior.bounded else _PASS_UNBOUND
     state = replace(state, smooth=_FIRST_SMOOTH * sharp)
     spent, fall, objectives = 0, math.inf, [(0, state.objective)]
@@ -508,8 +495,6 @@ def _descend(state: _State, iterations: int, tolerance: float) -> tuple[_State, 
 
 
 def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
-    """Where conjugate gradients lead in the pixels that no bound holds, what the sensor sees of it, and what it lowers
-    the quadratic by that touches the objective in ``state``."""
     free = state.free
     left = np.where(free, state.gradient, state.precise(0))
     total, seen = np.zeros_like(left), np.zeros_like(state.residual)
@@ -530,3 +515,231 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
             bent *= free
             left += state.precise(length) * bent
     return total, seen, promised
+
+
+# ---- The weight of the prior, and the misfit -------------------------------------------------------------------------
+
+RIDGE, _WEIGHT = 50.0, 1.2
+"""Automatic lambda over the mean square of a scene pixel's light, by a frame's relative error; and automatic weight of
+TV in units of the error of the data term's gradient. Chosen on photographs (benchmarks/iterative_losses.py)."""
+_CLEARLY = 2.0
+"""Ratio of the error by held-out pixels to the measured noise above which the model is wrong."""
+_SIDE, _STEPS = 128, 60
+"""Least side of reduced frames, and steps for held-out pixels."""
+_BLOCKS, _KEPT = 12, 8
+"""Blocks along the shorter side, of which one in eight is held out."""
+_HALVES = range(-16, 7)
+"""Tried weights in half decades."""
+_TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
+_MODEL_ERROR, _ROUGH, _LEFT = 0.01, (3.0, 0.3), 4.0
+"""Least relative error of a model; TV's two weights in a comparison; and the chi-square above which the second one is
+used.
+"""
+_ALIKE = 0.9
+"""Correlation above which light equals its turned copy."""
+_BETTER, _EQUAL = 0.85, 0.98
+"""Cost ratio of the best turned copy to the light as given: below the first the copy is recommended, below the second
+the light is wrong even if noise explains the frames."""
+_LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
+"""Least cost ratio of right light: the first times chi-square to the power of the second. Below the last chi-square
+noise explains the frames."""
+_OFF = 1 / 8
+"""Flagged distance of the light's mean from the middle of the picture, over its side."""
+_GROSS, _GROSS_CHI_SQUARE = 0.1, 4.0
+"""Part of the frames, rms, and chi-square, above which a fit is flagged without a comparison."""
+
+
+def frame_noise(frame: Array) -> float:
+    """Return the noise of a ``frame`` by the median of its mixed second differences; 0 for fewer than 3 x 3 pixels.
+
+    Light of a few sharp lines does not change that median (Immerkaer, Comput. Vis. Image Underst. 64, 1996).
+    """
+    if min(frame.shape) < 3:
+        return 0.0
+    bent = np.diff(np.diff(frame, n=2, axis=0), n=2, axis=1)
+    # The 9 weights have squares of 36 in all; half of normal numbers are below 0.6745 deviations.
+    return float(np.median(np.abs(bent))) / 6 / 0.6745
+
+
+def _noise_variance(frames: Array) -> float:
+    rows, columns = (max(size // 16, 1) for size in frames.shape[1:])
+    strips = [strip for frame in frames for strip in np.array_split(frame, rows)]
+    tiles = [tile for strip in strips for tile in np.array_split(strip, columns, axis=1)]
+    return float(np.mean([frame_noise(tile) ** 2 for tile in tiles]))
+
+
+def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
+    factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape) // _SIDE, 1)
+    return light.reduce(factor), np.stack([reduce_frame(frame, factor) for frame in frames]), factor
+
+
+# ---- The weight ----
+
+
+def frame_error(light: ShiftedLight, frames: Array) -> float:
+    """Return the deviation of ``frames`` (K K', m, m') from the light that a model explains.
+
+    This is their noise or, under uniform light, the noise whose ridge predicts held-out pixels best, if clearly more.
+    """
+    mean = float(frames.mean())
+    if mean <= 0:
+        raise MitsimError(f"frame of mean {mean:g}: lambda cannot be chosen; check exposure and black level")
+    noise = math.sqrt(float(np.mean([frame_noise(frame) ** 2 for frame in frames])))
+    if light.patterns is not None:
+        return noise
+    small, seen, _ = _shrink(light, frames)
+    row, column = np.indices(small.sensor) // max(min(small.sensor) // _BLOCKS, 1)
+    counted = (row + 3 * column) % _KEPT > 0
+    part = replace(small, seen=counted.astype(small.precision))
+
+    @cache
+    def error(half: int) -> float:
+        prior = Prior(ridge=10 ** (half / 2) * small.column_power, bounds=(0.0, math.inf))
+        scene = minimise(part, seen * part.seen, prior, _STEPS, 0.02).image
+        return float(np.square((small.image_of(scene) - seen)[:, ~counted]).sum())
+
+    best = 0
+    while best in _HALVES and error(lower := min((best - 1, best + 1), key=error)) < error(best):
+        best = lower
+    before, here, after = (error(half) for half in (best - 1, best, best + 1))
+    # The vertex of the parabola through these three.
+    place = best + (before - after) / 2 / max(before - 2 * here + after, 1e-300)
+    level = mean * 10 ** (place / 2) / RIDGE
+    return level if level > _CLEARLY * noise else noise
+
+
+def automatic_prior(light: ShiftedLight, frames: Array, prior: Prior, kind: Literal["ridge", "weight"]) -> Prior:
+    """Return ``prior`` with an automatic ridge or weight of TV.
+
+    Raises MitsimError for frames without light, and for a ridge under patterns.
+    """
+    if kind == "weight":
+        return replace(prior, weight=_WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power))
+    if light.patterns is not None:
+        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+    return replace(prior, ridge=RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power)
+
+
+# ---- The misfit ----
+
+
+@dataclass(frozen=True)
+class PointSpreadFit:
+    """Fit of frames to a point spread function.
+
+    Attributes
+    ----------
+    chi_square, unexplained
+        Residual energy over that of noise, and residual beyond noise, rms, over the frames.
+    stated
+        Whether the sensor states its noise; otherwise it is measured from the frames.
+    gain
+        Cost of the best turned or mirrored copy over the cost of the light as given; None where all copies are alike.
+    reading
+        Orientation of that copy.
+    off
+        Rows and columns from the middle of the picture to the light's centre.
+    size
+        Rows and columns of the picture.
+    """
+
+    chi_square: float
+    unexplained: float
+    stated: bool
+    gain: float | None
+    reading: str
+    off: tuple[float, float]
+    size: tuple[int, int]
+
+    @property
+    def fault(self) -> tuple[str, str]:
+        """Sentence and remedy; empty for a good fit."""
+        left = (
+            f"{self.unexplained:.1%} of the frames is left unexplained, {self.chi_square:.3g} times the noise's energy"
+        )
+        same = "use the light of one point as this camera sees it, as it lies in the frames"
+        if self.gain is not None and self.gain < _BETTER:
+            return f"Misfit: the point spread function fits better {self.reading}; {left}", f"turn it so, or {same}"
+        least = _EQUAL if self.chi_square < _NOISY else _LEAST_GAIN * self.chi_square**_RISE
+        if self.gain is not None and self.gain < least:
+            return f"Misfit: the point spread function fits no better as given than {self.reading}; {left}", same
+        if self.unexplained > _GROSS and self.chi_square > _GROSS_CHI_SQUARE:
+            return f"Misfit: {left}", same
+        rows, columns = self.off
+        if max(abs(rows) / self.size[0], abs(columns) / self.size[1]) > _OFF:
+            return (
+                f"Misfit: the point's light is centred {rows:+.0f} rows and {columns:+.0f} columns from the middle of "
+                "its picture, and the image is displaced as much",
+                "take the picture of a point in the middle of the field, or shift it there",
+            )
+        return "", ""
+
+    @property
+    def gist(self) -> str:
+        """Misfit in a few words."""
+        return f"{self.unexplained:.1%} unexplained"
+
+    def __str__(self) -> str:
+        noise = "its stated noise" if self.stated else "noise, measured from the frames"
+        cost = "" if self.gain is None else f"; turned or mirrored, the light costs {self.gain:.3g} times as much"
+        return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the misfit's entries of result.json."""
+        sentence, _ = self.fault
+        return {
+            "chi_square": self.chi_square,
+            "unexplained": self.unexplained,
+            "noise_stated": self.stated,
+            "flagged": bool(sentence),
+            "turned_cost": self.gain,
+            "reading": self.reading if self.gain is not None and self.gain < _BETTER else None,
+            "off_centre": list(self.off),
+        }
+
+    def judge(self, status: Status) -> Status:
+        """Return the ``status`` of a solution with this misfit."""
+        sentence, remedy = self.fault
+        if not sentence:
+            return status
+        if not status.verdict.good:
+            return replace(status, flags=(*status.flags, f"{sentence}; {remedy}."))
+        return replace(status, verdict=Verdict.MISFIT, sentence=sentence, remedy=remedy)
+
+
+def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> PointSpreadFit:
+    """Return the fit of ``frames`` to ``light``; ``variance`` is their mean noise variance, None if not stated."""
+    small, seen, factor = _shrink(light, frames)
+    noise = max(_noise_variance(seen) if variance is None else variance / factor**2, 1e-300)
+    error = math.hypot(math.sqrt(noise), _MODEL_ERROR * float(seen.mean()))
+
+    def cost(psf: FloatArray, rough: float) -> tuple[float, float]:
+        camera = replace(small, psf=np.ascontiguousarray(psf))
+        prior = Prior(weight=rough * error * math.sqrt(camera.column_power), bounds=(0.0, math.inf))
+        found = minimise(camera, seen, prior, 2 * _STEPS, 0.002)
+        return found.objective, float(np.mean(np.square(camera.image_of(found.image) - seen))) / noise
+
+    rough, fine = _ROUGH
+    (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
+    rough, objective = (fine, alternative) if left > _LEFT else (rough, objective)
+    copies = {name: small.psf[::rows, ::columns] for name, (rows, columns) in _TURNED.items()}
+    others = {name: cost(copy, rough)[0] for name, copy in copies.items() if _likeness(small.psf, copy) < _ALIKE}
+    reading = min(others, key=lambda name: others[name], default="")
+    energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
+    off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
+    rows, columns = light.psf.shape
+    return PointSpreadFit(
+        chi_square=chi_square,
+        unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
+        stated=variance is not None,
+        gain=others[reading] / max(objective, 1e-300) if others else None,
+        reading=reading,
+        off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
+        size=(rows, columns),
+    )
+
+
+def _likeness(first: FloatArray, second: FloatArray) -> float:
+    grid = [2 * size for size in first.shape]
+    shifted = fft.irfft2(fft.rfft2(first, grid) * fft.rfft2(second, grid).conj(), grid)
+    return float(shifted.max() / math.sqrt(float(np.square(first).sum() * np.square(second).sum())))

@@ -1,4 +1,4 @@
-"""A run and a measured point spread function in, the scene's image out, and how far it is above its minimum."""
+"""Image of a run by a measured point spread function."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.devices.mask_profile import load_psf
-from mitsim.reconstruct.convolution import check_lambda
-from mitsim.reconstruct.point_spread import Array, ShiftedLight, minimise, reduce_frame
-from mitsim.reconstruct.point_spread_fit import automatic_prior, find_fit
+from mitsim.reconstruct.point_spread import Array, ShiftedLight, automatic_prior, find_fit, minimise, reduce_frame
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
 from mitsim.reconstruct.solution import Solution, Status, Verdict
+from mitsim.reconstruct.solver import check_lambda
 from mitsim.reconstruct.solvers import Prior
 
 _NUMBERS = 24
-"""Numbers of single precision that are held for each of a grid, and for each of all frames: measured, 15 to 20."""
+"""Single-precision numbers in memory for each of a grid and of all frames."""
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -40,34 +39,20 @@ def solve_point_spread(
     iterations: int = 300,
     tolerance: float = 0.02,
 ) -> Solution:
-    """The image of all frames.
+    """Return the image of all frames (K K', m, m').
 
     Parameters
     ----------
-    light
-        the camera under its patterns.
-    frames
-        (K K', m, m') row-major over patterns (i, j).
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     lam
-        lambda, or the weight of ``tv``; ``auto``: :func:`mitsim.reconstruct.point_spread_fit.automatic_prior`.
+        Lambda, or the weight of ``tv``; "auto": :func:`mitsim.reconstruct.point_spread.automatic_prior`.
     bounds
-        least and largest number; None: any of ``tikhonov``, 0 and inf of the others, as light is.
+        Least and largest number; None: any for ``tikhonov``, otherwise 0 and inf.
     iterations, tolerance
-        it ends where the last half of its steps lowered the objective by at most ``tolerance`` of itself, or after so
-        many steps.
-
-    Raises
-    ------
-    MitsimError
-        for frames of another shape or number, or with numbers that are not finite, another lambda, or no iterations.
+        See :func:`mitsim.reconstruct.point_spread.minimise`.
     """
-    if frames.shape != (light.count, *light.sensor) or not np.isfinite(frames).all():
-        raise MitsimError(
-            f"frames of shape {frames.shape}: give {light.count} of {light.sensor[0]} x {light.sensor[1]} finite "
-            "numbers"
-        )
+    light.check_frames(frames)
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
@@ -114,32 +99,31 @@ def reconstruct_psf(
     """Recover the image of a camera whose scene points all cast one pattern of light, each shifted by its place.
 
     One scene pixel shifts it by one pixel of the frames. Under uniform light the image is as large as the sensor, and
-    what lies beside is solved for too; under patterns it is theirs (:mod:`mitsim.reconstruct.point_spread`).
+    under patterns as large as these.
 
     Parameters
     ----------
     shots
-        in memory, or of :func:`mitsim.core.runs.load_run`.
+        Capture in memory, or of :func:`mitsim.core.runs.load_run`.
     psf
-        (k, k') light of a scene pixel, or a picture of it as :func:`mitsim.devices.mask_profile.load_psf` takes it, of
-        the same pixels as the frames.
+        Light (k, k') of a scene pixel, or a picture of it (:func:`mitsim.devices.mask_profile.load_psf`), of the same
+        pixels as the frames.
     reduce
-        pixels a side, of frames and of the picture, that become one.
+        Pixels a side, of frames and of the picture, that become one.
     lam
-        lambda >= 0 in the unit of the point spread function squared, for ``tv`` the weight of the total variation;
-        ``auto`` chooses it from the frames.
+        Lambda >= 0 in the unit of the point spread function squared, for ``tv`` the weight of the total variation;
+        "auto" chooses it from the frames.
     method
         ``tikhonov``, ``nonnegative`` or ``tv``.
     bounds
-        least and largest number of the image [electrons/s], by ``nonnegative`` and ``tv``; None: 0 and inf.
+        Least and largest number of the image [electrons/s], for ``nonnegative`` and ``tv``; None: 0 and inf.
     iterations
-        most steps, by ``nonnegative`` and ``tv``; None: 300.
+        Largest number of steps, for ``nonnegative`` and ``tv``; None: 300.
 
     Raises
     ------
     MitsimError
-        for a picture without light, frames that cannot be read or are larger than what its light reaches, more memory
-        than is free, and another lambda, method or bounds.
+        For a picture without light, frames that do not fit, too little memory, and another lambda, method or bounds.
     """
     return reconstruct_psf_request(
         shots, psf, reduce, ImageRequest(lam=lam, method=method, bounds=bounds, iterations=iterations)
@@ -150,15 +134,7 @@ def reconstruct_psf(
 def reconstruct_psf_request(
     shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
-    """The image that a request asks for, as :func:`reconstruct_psf`.
-
-    Parameters
-    ----------
-    shots, psf, reduce, request
-        as there.
-    job
-        of whose work it is a part.
-    """
+    """Recover the image of a request, see :func:`reconstruct_psf`."""
     request.check_point_spread(reduce)
     clock = (job or Job()).apart("").clock
     with clock.stage("read"):
@@ -192,15 +168,7 @@ def reconstruct_psf_request(
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    """What decides an image.
-
-    Parameters
-    ----------
-    shots, psf
-        whose fingerprints count, (k, k') of the second.
-    reduce, request
-        as for :func:`reconstruct_psf_request`.
-    """
+    """Return what decides an image: fingerprints of the ``shots`` and of the ``psf``, and the request."""
     digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
     asked = {
         "run": shots.fingerprint,
@@ -213,7 +181,6 @@ def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageReque
 
 
 def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
-    """(k, k') of sum 1, or as it was given where that was an array."""
     if isinstance(psf, (str, Path)):
         return load_psf(psf, reduce)
     light = np.asarray(psf)
@@ -226,9 +193,6 @@ def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
 
 
 class _Frames:
-    """Frames of a capture, of which ``reduce`` x ``reduce`` pixels become one; and, once they are read, the mean
-    ``variance`` of their noise, where the sensor's is stated."""
-
     def __init__(self, shots: Capture, reduce: int) -> None:
         self._shots, self._reduce = shots, reduce
         self.saturated = 0
@@ -242,7 +206,6 @@ class _Frames:
         self._shape, self._columns, self._count = (first[0], first[1]), right.shape[1], left.shape[1] * right.shape[1]
 
     def read(self) -> FloatArray:
-        """(K K', m, m') of all patterns, row-major [electrons/s]."""
         frames = np.empty((self._count, *self.sensor), np.float32)
         for each in self._shots.pattern_measurements(self._shape):
             frames[each.row * self._columns + each.column] = reduce_frame(each.frame, self._reduce)

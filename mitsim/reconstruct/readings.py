@@ -60,8 +60,10 @@ _STEPS = {
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading that restores the fit: ``words`` for people, ``order`` for `mitsim import --order` where it is one, and
-    the part of the measurements, rms, that it ``left``."""
+    """A reading of the data that restores the fit, and the part of the measurements, rms, that it ``left``.
+
+    ``order`` is an argument of `mitsim import --order`.
+    """
 
     words: str
     left: float = 0.0
@@ -73,8 +75,7 @@ class Reading:
 
 
 def multiple(factor: int, chi_square: float) -> Reading | None:
-    """Return the reading of numbers that were multiplied by a ``factor``, if their noise shows it by its
-    ``chi_square``."""
+    """Return the reading of numbers that were multiplied by a ``factor``, if the ``chi_square`` shows it."""
     if factor < 2 or not chi_square > max(_MULTIPLIED * factor, _LEAST_MULTIPLIED):
         return None
     bits = "" if factor & (factor - 1) else f", as of fewer bits that were moved up by {factor.bit_length() - 1}"
@@ -83,7 +84,7 @@ def multiple(factor: int, chi_square: float) -> Reading | None:
 
 def pixel_groups(patterns: tuple[FloatArray, FloatArray]) -> list[list[IndexArray]]:
     """Return the scene rows and the scene columns that are lit alike, group by group, of ``patterns`` P_L and P_R."""
-    return [[group.pixels for group in group_pixels(side, "block")] for side in patterns]
+    return [[group.pixels for group in group_pixels(side)] for side in patterns]
 
 
 def negative(prepared: Prepared, groups: list[list[IndexArray]], weights: FloatArray) -> bool:

@@ -1,7 +1,4 @@
-"""Shots and factors in, the scene's image out, and how far to trust it. Never sees the scene's truth.
-
-An image is figures, sentences and pictures, and a folder of files.
-"""
+"""Image of a scene from a capture and factors, and how far to trust it; the scene's truth is never used."""
 
 from __future__ import annotations
 
@@ -21,12 +18,10 @@ from mitsim.core.job import Clock, Cost, Job, Limits
 from mitsim.core.options import takes
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising
-from mitsim.reconstruct.background import Margin
-from mitsim.reconstruct.depth import Depth, best_depth
-from mitsim.reconstruct.depth_map import DepthMap, depth_map
+from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
+from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import move_factors
+from mitsim.reconstruct.focus import Margin, move_factors
 from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
@@ -41,7 +36,6 @@ from mitsim.reconstruct.request import (
 )
 from mitsim.reconstruct.solution import Solution, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
-from mitsim.reconstruct.subpixel import print_energy
 from mitsim.reconstruct.uncertainty import NO_UNCERTAINTY, Uncertainty, uncertainty
 
 if TYPE_CHECKING:
@@ -49,49 +43,49 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
     from xarray import Dataset
 
-    from mitsim.reconstruct.point_spread_fit import PointSpreadFit
+    from mitsim.reconstruct.point_spread import PointSpreadFit
     from mitsim.reconstruct.request import ImageKeys
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
 UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
 _INCOMPLETE = "incomplete"
-"""Status in result.json of an image whose files are being written."""
+"""Status in result.json while files are being written."""
 MADE_OF = "made_of"
-"""Key of the folders that an image was made of: whoever shows it finds its truth there."""
+"""Key of the folders that an image was made of."""
 POINT_SPREAD = "psf"
-"""Among an image's inputs, where a point spread function takes the place of factors: its fingerprint."""
+"""Key of the fingerprint of a point spread function among an image's inputs."""
 
 
 @checked_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reconstruction(Solution):
-    """An image and how far to trust it: reflectance, 1 = the calibration's board; by a point spread function
-    electrons/s. Its status counts misfit, and flags of the capture and of the calibration.
+    """Image and its quality: reflectance relative to the calibration's board, or electrons/s by a point spread.
 
     Attributes
     ----------
     rank
-        of the whole model, the product of ``rank_sides``; None, as all of these, where the model is not factorised.
+        Rank of the whole model, the product of ``rank_sides``; None, as the next three, where the model is not
+        factorised.
     condition
-        the larger of ``condition_sides``; that of the whole model is their product, ``condition_whole``.
+        Larger of ``condition_sides``.
     rank_sides, condition_sides
-        of scene rows and of scene columns.
+        For scene rows and for scene columns.
     misfit
-        what of the measurements fits no image; None where there are no more data than unknowns.
+        Misfit of the measurements; None where there are no more data than unknowns.
     uncertainties
-        standard uncertainty of the image by source; None for ``nonnegative``, ``tv``, a trained network and with a
-        depth for each pixel, which are not linear in the frames, and by a point spread function.
+        Standard uncertainty by source; None for methods that are not linear in the frames, with a depth for each pixel,
+        and by a point spread function.
     seconds
-        by stage.
+        Seconds by stage.
     inputs
-        fingerprints of shots and factors, ``lam`` as it was asked for, and the method; the focus, where one was.
+        Fingerprints of shots and factors, and the request.
     focus
-        the depth whose factors were used, or a depth for each pixel; None: the calibrated one.
+        Depth, or depth for each pixel; None: the calibrated one.
     predicted
-        seconds by stage and memory, before it was begun; None where nobody could tell.
+        Predicted seconds by stage and memory, if known.
     fit
-        how well the frames fit a point spread function; None of an image by factors, whose ``misfit`` says so.
+        Fit to a point spread function; None for an image by factors.
     """
 
     rank: int | None
@@ -108,7 +102,7 @@ class Reconstruction(Solution):
 
     @property
     def depths(self) -> DepthMap | None:
-        """A depth for each pixel, where these were looked for and are told."""
+        """Depth for each pixel, where it was requested and is reliable."""
         return _by_pixel(self.focus)
 
     @property
@@ -118,28 +112,27 @@ class Reconstruction(Solution):
 
     @property
     def uncertainty(self) -> FloatArray | None:
-        """(n, n') standard uncertainty of the image, random and systematic parts together."""
+        """Standard uncertainty (n, n') of the image, random and systematic parts together."""
         return self.uncertainties.total if self.uncertainties else None
 
     @property
     def white(self) -> float:
-        """Number of the image that pictures show as white: 1; by a point spread function, whose image no board is
-        compared with, its largest."""
+        """Number that pictures show as white: 1, or the largest number by a point spread function."""
         largest = float(self.image.max()) if POINT_SPREAD in self.inputs else 0.0
         return largest if largest > 0 else 1.0
 
     @property
     def trust(self) -> tuple[str, ...]:
-        """A line on the misfit, and one on the uncertainty by source, where these are known."""
+        """Lines on misfit, fit and uncertainty, where these are known."""
         return tuple(str(known) for known in (self.misfit, self.fit, self.uncertainties) if known)
 
     @property
     def limits(self) -> tuple[str, ...]:
-        """A sentence or more on each thing that the frames of a real camera leave undecided."""
+        """Sentences on what the frames of a real camera leave undecided."""
         return tuple(f"Not decided: {limit['words']}" for limit in self.misfit.limits) if self.misfit else ()
 
     def summary(self) -> dict[str, Any]:
-        """What result.json and the command line's JSON say of it."""
+        """Return the entries of result.json."""
         return {
             "lambda": self.lam,
             "rank": self.rank,
@@ -174,16 +167,16 @@ class Reconstruction(Solution):
         Parameters
         ----------
         folder
-            new or empty, or with an earlier image of the same inputs, which is replaced.
+            New or empty folder, or one with an earlier image of the same inputs, which is replaced.
         overwrite
-            whether an earlier image of other inputs may be replaced, too.
+            Whether an earlier image of other inputs may be replaced, too.
         more
-            entries of result.json beside :meth:`summary`.
+            Entries of result.json beside :meth:`summary`.
 
         Raises
         ------
         MitsimError
-            when the folder holds another image or something else, or cannot be written.
+            If the folder contains something else, or cannot be written.
         """
         _check_stored(more)
         with output_folder(folder, overwrite=may_replace(Path(folder), self.inputs, overwrite)) as place:
@@ -191,8 +184,7 @@ class Reconstruction(Solution):
 
     @check_arguments
     def write(self, folder: Path | str, more: Mapping[str, Any] | None = None) -> Path:
-        """The same in a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`); ``more``
-        are further entries of result.json."""
+        """Write the files to a ``folder`` that this process holds already (:func:`mitsim.core.files.output_folder`)."""
         _check_stored(more)
         folder = Path(folder)
         remove_page(folder)
@@ -213,27 +205,18 @@ class Reconstruction(Solution):
 
     @check_arguments
     def plot(self, quantity: Literal["image", "uncertainty", "depth"] = "image", ax: Axes | None = None) -> Axes:
-        """Draw the image, its standard uncertainty or the depths with a colour bar; returns the axes.
+        """Draw the image, its standard uncertainty or the depths with a colour bar, and return the axes.
 
-        Parameters
-        ----------
-        quantity
-            what is drawn.
-        ax
-            matplotlib's axes to draw on; None: those of a new figure.
-
-        Raises
-        ------
-        MitsimError
-            for an uncertainty or depths that are not known.
+        Raises MitsimError for an uncertainty or depths that are not known.
         """
         return from_above("report.plots", "draw_image")(self, quantity, ax)
 
     @check_arguments
     def to_xarray(self, factors: Factors | None = None) -> Dataset:
-        """The image, and where known its uncertainty and depths, as an ``xarray.Dataset`` with units; by the
-        ``factors`` that it was solved with, coordinates in mm too. MitsimError where xarray, an extra, is not
-        installed."""
+        """Return the image, and where known its uncertainty and depths, as an ``xarray.Dataset`` with units.
+
+        The ``factors`` that it was solved with give coordinates in mm.
+        """
         return from_above("exchange.labelled", "label_image")(self, factors)
 
     def __repr__(self) -> str:
@@ -257,7 +240,6 @@ class Reconstruction(Solution):
 
 
 def _check_stored(more: object) -> None:
-    """ArgumentError for entries of result.json that JSON cannot hold."""
     try:
         plain(more)
     except TypeError as error:
@@ -265,21 +247,9 @@ def _check_stored(more: object) -> None:
 
 
 def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool) -> bool:
-    """Whether a folder holds an image that may be replaced; False when it holds none.
+    """Return True if ``folder`` contains an image that may be replaced, False if it contains none.
 
-    Parameters
-    ----------
-    folder
-        that is to be written to.
-    asked
-        the :func:`inputs` of the new image.
-    overwrite
-        whether an image of other inputs may be replaced.
-
-    Raises
-    ------
-    MitsimError
-        when there is an image of other inputs, and ``overwrite`` is off.
+    Raises MitsimError for an image of other inputs than ``asked`` unless ``overwrite`` is on.
     """
     if not holds_image(folder):
         return False
@@ -289,9 +259,9 @@ def may_replace(folder: Path, asked: Mapping[str, str | float], overwrite: bool)
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """Return what result.json of the finished image in ``folder`` states.
+    """Return the contents of result.json of a finished image in ``folder``.
 
-    MitsimError where the image is unfinished, or its files are not those that were written.
+    Raises MitsimError where the image is unfinished, or its files have changed.
     """
     result = read_json(folder / RESULT_FILE)
     if not isinstance(result, dict) or result.get("status") == _INCOMPLETE:
@@ -301,17 +271,7 @@ def read_result(folder: Path) -> dict[str, Any]:
 
 
 def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | float]) -> None:
-    """MitsimError where the image in a folder is of other inputs.
-
-    Parameters
-    ----------
-    folder
-        that holds it.
-    head
-        JSON beside it, whose ``inputs`` are its own.
-    asked
-        inputs of the new image.
-    """
+    """Raise MitsimError if the image in a ``folder``, whose JSON is ``head``, is of other inputs than ``asked``."""
     earlier = head.get("inputs") if isinstance(head, dict) else None
     earlier = earlier if isinstance(earlier, dict) else {}
     changed = [name for name in {**asked, **earlier} if earlier.get(name) != asked.get(name)]
@@ -325,11 +285,9 @@ def check_same_inputs(folder: Path, head: object, asked: Mapping[str, str | floa
 # ---- From shots and factors to an image ------------------------------------------------------------------------------
 
 _DEFECT_ROUNDS = 6
-"""Times that defective pixels are looked for: beside bright ones dim ones show when these are left out, of a tenth of
-their energy each time."""
+"""Largest number of searches for defective pixels, because dim ones show when bright ones are left out."""
 _BETTER = 0.5
-"""Part of what was unexplained, rms, that frames may leave without pixels that count as defective though the rest does
-not fit either."""
+"""Part of the unexplained residual that frames without defective pixels may leave."""
 
 
 @takes(ImageRequest)
@@ -340,27 +298,27 @@ def reconstruct(
     method: str | Solver = TIKHONOV,
     **options: Unpack[ImageKeys],
 ) -> Reconstruction:
-    """Recover the image from a capture and a calibration alone.
+    """Recover the image from a capture and a calibration.
 
     Parameters
     ----------
     shots
-        in memory, or of :func:`mitsim.core.runs.load_run`; frames on disk are read one at a time.
+        Capture in memory, or of :func:`mitsim.core.runs.load_run`; frames on disk are read one at a time.
     factors
-        of the same camera.
+        Factors of the same camera.
     lam
-        lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; ``auto`` chooses it
-        from the data.
+        Lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation; "auto" chooses it from
+        the data.
     method
-        ``tikhonov`` (closed form, pixels independent), ``markov`` (closed form, neighbours alike:
-        :mod:`mitsim.reconstruct.solver`), ``nonnegative`` (Tikhonov's of at least 0), ``tv`` (least total variation),
-        or a solver of one's own, such as a trained network (:func:`mitsim.load_network`).
+        ``tikhonov`` (closed form, independent pixels), ``markov`` (closed form, correlated neighbours), ``nonnegative``
+        (Tikhonov's solution of at least 0), ``tv`` (least total variation), or a solver, such as a trained network
+        (:func:`mitsim.load_network`).
 
     Raises
     ------
     MitsimError
-        for a capture and factors that do not fit each other, a frame that cannot be read, more memory than is free,
-        another lambda, method, focus, margin or range, or a calibration that does not state its parallax.
+        For a capture and factors that do not fit each other, a frame that cannot be read, too little memory, another
+        lambda, method, focus, margin or range, or a calibration without parallax where that is needed.
     """
     return reconstruct_request(shots, factors, ImageRequest(lam=lam, method=method, **options))
 
@@ -369,15 +327,7 @@ def reconstruct(
 def reconstruct_request(
     shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
-    """The image that a request asks for, as :func:`reconstruct`.
-
-    Parameters
-    ----------
-    shots, factors, request
-        as there.
-    job
-        of whose work it is a part: its watch is told of the stages, and the image has their seconds.
-    """
+    """Recover the image of a request, see :func:`reconstruct`; the ``job`` gives clock and progress."""
     method, asked, lam = request.method, request.inputs(shots, factors), request.lam
     shots, factors, beside, solver = check_image(shots, factors, request)
     # Depths that are looked for, and total variation, take as long as the data ask for.
@@ -425,14 +375,7 @@ def reconstruct_request(
 def check_image(
     shots: Capture, factors: Factors, request: ImageRequest
 ) -> tuple[Capture, Factors, Margin | None, Solver]:
-    """Return the part of shots, the factors, the margin and the solver that an image is solved with; refuse, before a
-    frame is read, what no image is made of.
-
-    Parameters
-    ----------
-    shots, factors, request
-        as for :func:`reconstruct_request`.
-    """
+    """Return shots, factors, margin and solver of a request, or refuse it before a frame is read."""
     solver = SOLVERS[request.method] if isinstance(request.method, str) else request.method
     factors.check_fit(shots)
     if request.focus is not None:
@@ -450,8 +393,6 @@ def check_image(
 def _focus(
     shots: Capture, factors: Factors, request: ImageRequest, clock: Clock
 ) -> tuple[Depth | DepthMap | None, Capture, Factors, list[str]]:
-    """The depth that is asked for, or found; the part of ``shots`` and the ``factors`` that are known there, and
-    doubts."""
     if request.focus is None:
         return None, shots, factors, []
     depth: Depth | DepthMap
@@ -473,14 +414,12 @@ def _focus(
 
 
 def _by_pixel(depth: Depth | DepthMap | None) -> DepthMap | None:
-    """A depth for each pixel, where these were looked for and are told."""
     return depth if isinstance(depth, DepthMap) and not depth.doubt else None
 
 
 def _fit(
     data: Accumulation, depth: Depth | DepthMap | None, lam: float | Literal["auto"], clock: Clock
 ) -> tuple[Accumulation, Solution, Misfit | None]:
-    """The image at ``lam`` and its misfit, and the sums that they are of: without defective pixels."""
     by_pixel = _by_pixel(depth)
     with clock.stage("solve"):
         solution = by_pixel.solution if by_pixel else data.solution(lam)
@@ -498,7 +437,7 @@ def _fit(
 
 
 def _misfit_at(data: Accumulation, depths: DepthMap) -> Misfit:
-    """What of the measurements fits no image with a depth for each pixel, ``depths``."""
+    """Return the misfit with a depth for each pixel."""
     misfit = depths.misfit(data.noise, data.factor_energy(depths.image), print_energy(data.model, depths.image))
     # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
     most = move_factors(data.factors, float(np.median(depths.mm)))
@@ -509,9 +448,7 @@ def _misfit_at(data: Accumulation, depths: DepthMap) -> Misfit:
 def _without_defects(
     data: Accumulation, lam: float | Literal["auto"], misfit: Misfit
 ) -> tuple[Accumulation, Solution, Misfit | None]:
-    """Sums without the readings of defective pixels, their solution at ``lam`` and misfit; all as it was where the
-    frames fit no better so. ``misfit`` is that of ``data``, with the first defects."""
-
+    """Return data, solution and misfit without defective pixels, or unchanged where the frames fit no better."""
     found, now, without = None, misfit, data
     for _ in range(_DEFECT_ROUNDS):
         if now.defects is None:
@@ -529,7 +466,6 @@ def _without_defects(
 
 
 def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
-    """Sentences on why the capture or the calibration was flagged: an image made of them is flagged too."""
     return tuple(
         f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
         for what, warnings in (("capture", shots.warnings), ("calibration", factors.warnings))

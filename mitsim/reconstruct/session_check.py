@@ -28,7 +28,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.devices.session import SIDES, UNIFORM, Half, Side
-from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
+from mitsim.reconstruct.factors import LARGEST_ERROR, AmbientLight, Estimate, StripeSums, factors_of_sums
 from mitsim.reconstruct.moving_shadow import MovingShadow
 from mitsim.reconstruct.picture_check import robust_scatter
 
@@ -189,7 +189,7 @@ class CheckedSession:
         signs
             (n, N) H.
         noise
-            as ``stated_noise`` of :func:`mitsim.reconstruct.estimate_factors.factors_of_sums`.
+            as ``stated_noise`` of :func:`mitsim.reconstruct.factors.factors_of_sums`.
         """
         return factors_of_sums(*self.sums, signs, noise, self.extra)
 
@@ -225,8 +225,7 @@ def check_session(sums: tuple[StripeSums, StripeSums], signs: FloatArray, taken:
 def _shrunk(
     values: FloatArray, variances: FloatArray, good: npt.NDArray[np.bool_], least: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return ``values`` shrunk to 0 by their own ``variances``, the squared error that is left of each, and the
-    variance that they share, 0 where it cannot be told from 0.
+    """Return ``values`` shrunk to 0 by their ``variances``, the remaining squared errors, and the shared variance.
 
     The variance that all ``good`` values have beyond their noise is the prior of each; where it cannot be told from 0,
     no value is changed. A value that is sure by itself is kept. The prior's variance is at ``least`` so much.
@@ -248,8 +247,10 @@ def _shrunk(
 
 
 class _Side:
-    """One side of a session while it is checked: ``vectors`` (m, N) as they are mended so far, ``extras`` squared
-    errors by their reason, ``axis`` 0 for horizontal stripes."""
+    """One side of a session while it is checked, with corrected ``vectors`` (m, N).
+
+    ``extras`` are squared errors by their reason, and ``axis`` is 0 for horizontal stripes.
+    """
 
     def __init__(self, sums: StripeSums, other: StripeSums, axis: int) -> None:
         self.sums, self.uniform, self.axis = sums, other.common, axis
@@ -279,8 +280,10 @@ class _Side:
         self.extras[reason] = self.extras.get(reason, 0.0) + max(energy, 0.0)
 
     def add_motion(self, places: FloatArray, variances: FloatArray, times: FloatArray) -> None:
-        """Count ``places`` (N,) [pixels] of patterns at ``times``, if they differ by more than their ``variances``,
-        against either end of the session; the other side's uniform frames are as far on the other side of 0."""
+        """Count ``places`` (N,) [pixels] of patterns that differ from either end of the session beyond ``variances``.
+
+        The other side's uniform frames are as far on the other side of 0.
+        """
         few, late = max(2, len(times) // 8), np.argsort(times)
         ends = np.array([np.median(places[late[:few]]), np.median(places[late[-few:]]), -self.place])
         away = np.square(np.append(places, ends[2]) - np.median(places)) / np.append(variances, 2 * variances.max())
@@ -291,8 +294,11 @@ class _Side:
             self.add(f"camera or mask move by {np.ptp(ends):.2g} pixels; fasten them", energy)
 
     def fit_sums(self) -> tuple[FloatArray, ...]:
-        """Fit the sums of all pairs; return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power,
-        place and unequal power of both frames, and the variances of these three."""
+        """Fit the sums of all pairs.
+
+        Return (N,) arrays: whether pairs do not fit, squared errors beyond noise, power, place and unequal power of
+        both frames, and the variances of these three.
+        """
         shapes = self.shapes
         if not self.sums.centre:
             shapes = np.stack([*shapes, np.ones_like(self.uniform), np.linspace(-1, 1, len(self.uniform))])
@@ -370,8 +376,7 @@ class _Check:
     # ---- what the sums of pairs show of lamp, lag, bend, motion and ambient light ------------------------------------
 
     def _correct_pairs(self) -> bool:
-        """Fit the sums of pairs, correct the responses, and count what is left as errors; return False if the sums
-        show only that frames are saturated."""
+        """Fit the sums of pairs, correct the responses, and count the rest as errors; return False if saturated."""
         bad, excess, *measured = np.stack([own.fit_sums() for own in self.sides], axis=1)
         if self.taken.saturated and bad.any():
             return False
@@ -559,8 +564,7 @@ class _Check:
     # ---- the result --------------------------------------------------------------------------------------------------
 
     def _judge(self) -> None:
-        """Report the errors that matter, the largest first; refuse the session for more than a tenth, and for frames
-        that are wrong."""
+        """Report significant errors, the largest first, and refuse the session for a tenth or for wrong frames."""
         found, sides = self.found, self.sides
         energies = {
             why: sum(own.extras.get(why, 0.0) / own.size for own in sides) for own in sides for why in own.extras

@@ -1,4 +1,4 @@
-"""Pictures that a camera saw and its frames of them in; the two factors, each side a code seen through shifts, out.
+"""Factors as codes seen through shifts, fitted to frames of known pictures.
 
 A mask before a sensor casts the same shadow from every direction, shifted. So a side's factor is an unknown code c on a
 grid of sensor pixels, seen from scene pixel i through a shift::
@@ -6,24 +6,23 @@ grid of sensor pixels, seen from scene pixel i through a shift::
     Phi[u, i] = sum_k b_k(i) c_k(u + o + s i)
 
 with s the sensor pixels that one scene pixel shifts the shadow by, o the place of this frame's pixels (planes of a
-Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. One term: all directions are alike.
-More terms: the code changes smoothly over the scene, as by falloff, a lens or a mask of some thickness.
+Bayer sensor lie half a pixel apart), and b_k polynomials over the scene, b_0 = 1. Several terms describe a code that
+changes smoothly over the scene, for example by falloff, a lens or a mask of some thickness.
 
-*Given one side, the other is linear.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes:
-least squares, whose normal matrix N is one block, added up along the diagonal. Left and right take turns until what is
-left stands still. A code's numbers are taken for independent, of a variance 1 / alpha that frames themselves tell
-(MacKay 1992, Neural Computation 4, 415): alpha = gamma / |c|^2, gamma = tr N (N + alpha)^-1 being the numbers that
-frames tell. What they do not tell stays near zero, and (N + alpha)^-1 is the covariance of the rest.
+*Alternating least squares.* With Z = X Phi_R^T a frame is Y = Phi_L Z, and Phi_L is linear in its codes. Left and right
+take turns until the misfit is constant. A code's numbers have an independent prior of variance 1 / alpha, estimated
+from the frames (MacKay 1992, Neural Computation 4, 415): alpha = gamma / |c|^2, where gamma = tr N (N + alpha)^-1 is
+the number of parameters that the frames determine, and (N + alpha)^-1 is their covariance.
 
-*Where to begin.* By the convolution theorem a frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the
-sensor's edges: Y over X is a product of two vectors, and how nearly it is one tells orientation and scale of the scene.
-"""
+*Start.* A frame's spectrum is Y(f, g) = C_L(f) C_R(g) X(-s f, -s' g), up to the sensor's edges. Y over X is a product
+of two vectors only for the right orientation and scale of the scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -33,26 +32,34 @@ from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.exr import checksum, finite_channel, read_frame
+from mitsim.core.imagelist import BGGR, PLANES, Crop, Preparation, Wanted, planes_of
+from mitsim.core.images import orient, own_end, read_image
+from mitsim.core.job import Cost, Limits
+from mitsim.core.manifests import MANIFEST
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import load_run
+from mitsim.devices.knownlist import KnownCapture, KnownCaptures, preparation_of
+from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import centre_columns, centre_frame
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """A frame and the light that it is of.
+    """Frame and the light that it shows.
 
     Attributes
     ----------
-    scene
-        (n, n') picture, times its pattern.
-    frame
-        (m, m') measurement [electrons/s], centred where the camera's factors are.
+    scene : (n, n') array
+        Picture times its pattern.
+    frame : (m, m') array, electrons/s
+        Measurement, centred where the camera's factors are.
     group
-        picture that it is of: frames of one picture are held out together.
+        Picture number; frames of one picture are held out together.
     plane
-        name of the sensor's plane; planes have gains of their own.
+        Name of the sensor's plane; planes have gains of their own.
     offset
-        of the plane's pixels, down and to the right, 0 to below 1 [pixels].
+        Offset of the plane's pixels, down and to the right, 0 to below 1 pixel.
     """
 
     scene: FloatArray
@@ -62,7 +69,7 @@ class Exposure:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def turn_scene(self, orientation: str) -> Exposure:
-        """The same with its scene as it lies in an ``orientation``."""
+        """Return the exposure with its scene in another ``orientation``."""
         return replace(self, scene=TURNS[orientation](self.scene))
 
 
@@ -76,22 +83,12 @@ TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "transposed, upside down": lambda scene: scene.T[::-1],
     "transposed, turned": lambda scene: scene.T[::-1, ::-1],
 }
-"""How a picture lies as the camera's code runs, by the orientations of a list."""
+"""Orientations of a picture relative to the camera's code."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What is fixed while codes are fitted.
-
-    Attributes
-    ----------
-    scales
-        s of rows and of columns [sensor pixels / scene pixel].
-    terms
-        number of codes a side.
-    centre
-        whether factors lose their columns' means, as frames do.
-    """
+    """Fixed quantities of a fit: ``scales`` s of both sides [sensor pixels / scene pixel], codes a side, centring."""
 
     scales: tuple[float, float]
     terms: int = 1
@@ -103,8 +100,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One side: ``sensor`` pixels, ``scene`` pixels, ``scale``, ``terms``, and whether
-    it loses the means of its columns."""
+    """Geometry of one side: ``sensor`` and ``scene`` pixels, ``scale``, ``terms``, and whether it is centred."""
 
     sensor: int
     scene: int
@@ -114,24 +110,24 @@ class Side:
 
     @property
     def width(self) -> int:
-        """Of the window of the code that one sensor pixel sees."""
+        """Length of the window of the code that one sensor pixel sees."""
         return int(np.floor(self.scale * (self.scene - 1))) + 3
 
     @property
     def length(self) -> int:
-        """Of the code."""
+        """Length of the code."""
         return self.sensor + self.width - 1
 
     @cached_property
     def weights(self) -> FloatArray:
-        """(terms, n) b_k, of mean square 1."""
+        """Polynomials b_k (terms, n) of mean square 1."""
         place = np.linspace(-1, 1, self.scene) if self.scene > 1 else np.zeros(1)
         return np.stack(
             [np.polynomial.legendre.Legendre.basis(k)(place) * np.sqrt(2 * k + 1) for k in range(self.terms)]
         )
 
     def hats(self, offset: float) -> FloatArray:
-        """(n, width) what each scene pixel takes of its window, by linear interpolation, at an ``offset``."""
+        """Return the linear interpolation (n, width) of each scene pixel in its window, at an ``offset``."""
         place = offset + self.scale * np.arange(self.scene)
         first = np.floor(place).astype(int)
         found = np.zeros((self.scene, self.width))
@@ -141,21 +137,16 @@ class Side:
         return found
 
     def factor(self, codes: FloatArray, offset: float) -> FloatArray:
-        """Phi (m, n) of ``codes`` (terms, length), for pixels at an ``offset``."""
+        """Return Phi (m, n) of ``codes`` (terms, length) for pixels at an ``offset``."""
         hats, phi = self.hats(offset), np.zeros((self.sensor, self.scene))
         for code, weight in zip(codes, self.weights, strict=True):
             phi += (sliding_window_view(code, self.width) @ hats.T) * weight
         return centre_columns(phi) if self.centre else phi
 
     def normal(self, offset: float, gram: FloatArray, product: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix (terms length, terms length) and right-hand side of the codes.
+        """Return normal matrix and right-hand side of the codes.
 
-        Parameters
-        ----------
-        offset
-            of the frames.
-        gram, product
-            (n, n) sum of Z Z^T, and (m, n) sum of Y Z^T, both over the noise's variance.
+        ``gram`` (n, n) and ``product`` (m, n) are the sums of Z Z^T and Y Z^T over the noise's variance.
         """
         hats, w, k = self.hats(offset), self.width, self.terms
         spread = (self.weights[:, :, None] * hats[None]).transpose(1, 0, 2).reshape(self.scene, k * w)
@@ -180,26 +171,26 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Codes:
-    """Codes that were fitted.
+    """Fitted codes.
 
     Attributes
     ----------
     sides
-        geometry of rows and of columns.
-    codes
-        (terms, length) of either.
+        Geometry of rows and of columns.
+    codes : (terms, length) arrays
+        Codes of either side.
     gains
-        of each plane.
+        Gain of each plane.
     variances
-        (exposures,) mean square of what is left of each frame.
+        Mean square of what is left of each frame.
     explained
-        mean over the frames of the part of their energy that the fit explains.
+        Mean explained part of the frames' energy.
     errors
-        standard deviation of a number of the left and of the right factor, rms, what no frame tells included; gains 1.
+        Standard deviation of a number of each factor, rms, at gains of 1, undetermined numbers included.
     seen_errors
-        that of independent errors that change frames of these scenes as much as the factors' do.
+        Independent errors that change frames of these scenes as much as the factors' errors do.
     told
-        numbers of each side's codes that the frames tell.
+        Numbers of each side's codes that the frames determine.
     """
 
     sides: tuple[Side, Side]
@@ -212,7 +203,7 @@ class Codes:
     told: tuple[float, float]
 
     def factors(self, offset: tuple[float, float] = (0.0, 0.0), plane: str = "") -> tuple[FloatArray, FloatArray]:
-        """Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
+        """Return Phi_L (m, n) and Phi_R (m', n') of a ``plane`` whose pixels are at an ``offset``."""
         gain = self.gains[plane]
         left, right = (
             side.factor(codes, place) * np.sqrt(abs(gain))
@@ -222,14 +213,13 @@ class Codes:
 
     @property
     def evidence(self) -> float:
-        """Log-likelihood of the frames less that of as many numbers as they tell (Schwarz 1978): codes that are long
-        because the scale is large explain more, whatever the frames are of."""
+        """Log-likelihood of the frames, less the penalty of the determined numbers (Schwarz 1978)."""
         size = self.sides[0].sensor * self.sides[1].sensor
         likelihood = -0.5 * size * float(np.log(self.variances).sum())
         return likelihood - 0.5 * sum(self.told) * float(np.log(size * len(self.variances)))
 
     def explains(self, exposures: Sequence[Exposure]) -> float:
-        """Mean part of the energy of ``exposures`` that the codes, fitted to others, explain."""
+        """Return the mean part of the energy of other ``exposures`` that the codes explain."""
         parts = []
         for each in exposures:
             left, right = self.factors(each.offset, each.plane)
@@ -239,33 +229,28 @@ class Codes:
 
 
 _TURNS, _STILL = 20, 1e-5
-"""Times that the sides take turns at most, and gain of the explained part at which they have ended: frames of no more
-than a million numbers tell no smaller one."""
+"""Largest number of turns, and the gain of the explained part that ends them."""
 _VAGUE = 1e-3
-"""First guess of alpha, over the mean of N's diagonal; a few turns find the right one from there."""
+"""First guess of alpha, over the mean of N's diagonal."""
 
 
 @single_threaded_blas()
 def fit_codes(
     exposures: Sequence[Exposure], shape: Shape, start: FloatArray | None = None, turns: int = _TURNS
 ) -> Codes:
-    """Codes of both sides.
+    """Fit the codes of both sides to ``exposures`` whose scenes lie as the code runs.
 
     Parameters
     ----------
-    exposures
-        scenes turned as the code runs.
-    shape
-        what is fixed.
     start
-        (any,) code of columns to begin with; None: that of the spectra.
+        Code of columns to begin with; None: that of the spectra.
     turns
-        that sides take at most.
+        Largest number of turns of both sides.
 
     Raises
     ------
     MitsimError
-        for frames or scenes without light.
+        For frames or scenes without light.
     """
     sides = _sides(exposures, shape)
     first = spectral_start(exposures, shape.scales)[1] if start is None else start
@@ -311,9 +296,6 @@ def _sides(exposures: Sequence[Exposure], shape: Shape) -> tuple[Side, Side]:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What frames tell of a side's codes: ``alphas`` of the terms, 0 where they are not known yet, ``covariance`` of
-    all numbers, how many are ``told``, and error of a factor's number ``seen`` in frames of these scenes."""
-
     alphas: FloatArray
     covariance: FloatArray
     told: float = 0.0
@@ -321,7 +303,6 @@ class _Known:
 
     @classmethod
     def vague(cls, side: Side) -> _Known:
-        """Nothing yet."""
         return cls(np.zeros(side.terms), np.zeros((0, 0)))
 
 
@@ -334,7 +315,6 @@ def _solve_side(
     variances: FloatArray,
     before: _Known,
 ) -> tuple[FloatArray, _Known]:
-    """Codes of the side ``axis`` given the ``other``'s, and what is known of them."""
     own, across = sides[axis], sides[1 - axis]
     phis = {place: across.factor(other, place) for place in {each.offset[1 - axis] for each in exposures}}
     sums: dict[float, list[FloatArray]] = {}
@@ -367,14 +347,12 @@ def _solve_side(
 
 
 _SMALLEST, _LARGEST = 1e-9, 1e6
-"""Of alpha over the mean of N's diagonal: below, double precision does not tell N + alpha from N; beyond, codes are as
-good as zero."""
+"""Limits of alpha over the mean of N's diagonal."""
 
 
 def _levels(
     exposures: Sequence[Exposure], sides: tuple[Side, Side], codes: list[FloatArray], gains: dict[str, float]
 ) -> tuple[dict[str, float], FloatArray]:
-    """Gains of the planes, by least squares, and mean squares of what is left of each frame."""
     phis = [
         {place: side.factor(code, place) for place in {each.offset[axis] for each in exposures}}
         for axis, (side, code) in enumerate(zip(sides, codes, strict=True))
@@ -393,7 +371,6 @@ def _levels(
 
 
 def _spread(side: Side, covariance: FloatArray) -> float:
-    """Standard deviation of a number of the factor, rms, by the ``covariance`` of the codes."""
     hats = side.hats(0.0)
     k, w = side.terms, side.width
     spread = (side.weights[:, :, None] * hats[None]).transpose(1, 0, 2)  # (n, terms, w)
@@ -408,53 +385,39 @@ def _spread(side: Side, covariance: FloatArray) -> float:
 # ---- The start: orientation, scale and codes by spectra ----
 
 _FREQUENCIES = 20
-"""Of either sign, lowest first, whose spectra are compared: most light of a picture is there."""
+"""Frequencies of either sign, lowest first, whose spectra are compared."""
 _COMPARED = 2
-"""Frames of those given whose spectra are compared."""
+"""Frames whose spectra are compared."""
 _STEP = 1.1
-"""Of the scales that are looked at: what shifts the finest of these waves by half its length, where a shadow moves by a
-sixth of the sensor over the scene."""
+"""Ratio of neighbouring tried scales."""
 _WIDEST, _NARROWEST = 1.0, 0.03
-"""Times that the shadow's way over the whole scene is as long as the sensor, from which and to which scales are looked
-for: beyond, hardly two directions see one part of a mask; below, a scene is a few pixels."""
+"""Limits of the shadow's way over the whole scene, over the length of the sensor."""
 _FIRST_TURNS, _SCALE_TURNS = 2, 3
-"""Turns of the sides that tell which orientation is right, and which scale."""
+"""Turns that decide the orientation, and the scale."""
 _CERTAIN = 1.2
-"""Times what the right orientation leaves of the frames that another must leave, or pictures do not tell it."""
+"""Least ratio of what another orientation and the right one leave of the frames."""
 
 
 def spectral_start(exposures: Sequence[Exposure], scales: tuple[float, float]) -> tuple[float, FloatArray]:
-    """How nearly a product of two vectors the frames' spectra over the scenes' are, 0 to 1, and the code of columns
-    that follows (length,).
-
-    Parameters
-    ----------
-    exposures
-        scenes turned as they may lie.
-    scales
-        that may be right [sensor pixels / scene pixel].
-    """
+    """Return how nearly the spectra are a product of two vectors, 0 to 1, and the resulting code of columns."""
     some = exposures[:: -(-len(exposures) // _COMPARED)]
     return _Spectra.of(some).compare([each.scene for each in some], scales)
 
 
 @dataclass(frozen=True, eq=False)
 class _Spectra:
-    """Spectra of some ``frames`` (waves, waves), at multiples of 1 / ``periods``."""
-
     frames: list[npt.NDArray[np.complex128]]
     periods: tuple[float, float]
 
     @classmethod
     def of(cls, exposures: Sequence[Exposure]) -> _Spectra:
-        """Those of all ``exposures``. Periods leave room for a shadow that moves by half the sensor."""
+        """Return spectra of ``exposures``, with periods that leave room for a shadow that moves by half the sensor."""
         rows, columns = exposures[0].frame.shape
         periods = 1.5 * rows, 1.5 * columns
         waves = [_waves(count, period) for count, period in zip((rows, columns), periods, strict=True)]
         return cls([waves[0] @ each.frame @ waves[1].T for each in exposures], periods)
 
     def compare(self, scenes: Sequence[FloatArray], scales: tuple[float, float]) -> tuple[float, FloatArray]:
-        """As :func:`spectral_start`."""
         above, below = np.zeros_like(self.frames[0]), np.zeros(self.frames[0].shape)
         left, right = (
             np.conj(_waves(count, period / scale))
@@ -471,7 +434,6 @@ class _Spectra:
 
 
 def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
-    """(waves, count) exp(-2 pi i f x / ``period``) at whole x; f = 0 is left out."""
     order = np.arange(1, _FREQUENCIES + 1)
     return np.asarray(
         np.exp(-2j * np.pi / period * np.multiply.outer(np.concatenate([order, -order]), np.arange(count)))
@@ -480,18 +442,18 @@ def _waves(count: int, period: float) -> npt.NDArray[np.complex128]:
 
 @dataclass(frozen=True)
 class Pose:
-    """How scenes lie before the camera.
+    """Orientation and scale of scenes before the camera.
 
     Attributes
     ----------
     orientation
-        one of :data:`TURNS`.
+        One of :data:`TURNS`.
     scales
-        of rows and of columns [sensor pixels / scene pixel].
+        Scales of rows and of columns [sensor pixels / scene pixel].
     margin
-        by how much more of the frames' energy this explains than the best of another orientation; None: not compared.
+        Explained part of the energy beyond that of the best other orientation; None: not compared.
     certain
-        whether that is clear.
+        Whether that is clear.
     """
 
     orientation: str
@@ -506,15 +468,7 @@ def find_pose(
     orientation: str | None = None,
     scales: tuple[float, float] | None = None,
 ) -> Pose:
-    """How scenes lie, by spectra and then by codes that are fitted, both of centred frames: even light tells nothing.
-
-    Parameters
-    ----------
-    exposures
-        scenes as they are given.
-    orientation, scales
-        where they are known.
-    """
+    """Find the pose of scenes by spectra, and then by codes that are fitted to centred frames."""
     exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
     some = exposures[:: -(-len(exposures) // _COMPARED)]
     spectra = _Spectra.of(some)
@@ -563,14 +517,12 @@ def _unlike(spectra: _Spectra, scenes: Sequence[FloatArray], scales: tuple[float
 
 
 _FINE, _STEPS = 1.03, 10
-"""Part of a scale by which codes that are fitted may change it at once, a third of the spectra's step; how often, at
-most."""
+"""Ratio by which a fit may change a scale at once, and the number of changes."""
 
 
 def _refine(
     misfit: Callable[[tuple[float, float]], float], start: tuple[float, float], reach: float
 ) -> tuple[float, float]:
-    """Scales of the least ``misfit``, each within a factor ``reach`` of the ``start``: rows, then columns."""
     options = {"xatol": np.log(reach) * _TOLERANCE}
     bounds = -np.log(reach), np.log(reach)
     row = minimize_scalar(
@@ -584,47 +536,25 @@ def _refine(
 
 
 _TOLERANCE = 0.05
-"""Of a search for a scale, of its reach: 7e-4 of the scale, a tenth of a pixel of a shadow's way of 150."""
+"""Tolerance of a search for a scale, relative to its reach."""
 
 
 # ---- How many codes: by frames that are held out ----
 
 _GAIN = 0.02
-"""Of what was left of frames that were held out, that more codes must explain: less is within what two halves of the
-frames differ by."""
+"""Part of the residual of held-out frames that more codes must explain."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How many codes a side has, and how well they explain frames that were not fitted.
-
-    Attributes
-    ----------
-    terms
-        that were chosen.
-    held_out
-        mean part of the energy of held-out frames that each number of terms explained, from one on; empty where no
-        frame could be held out.
-    """
+    """Number of codes, and the explained part of held-out frames for each tried number, from one on."""
 
     terms: int
     held_out: tuple[float, ...] = ()
 
 
 def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choice:
-    """The number of codes, of at most ``most``.
-
-    Pictures are held out in two halves, of a single one its frames: their noise at least is not that of the others.
-
-    Parameters
-    ----------
-    exposures
-        scenes turned as the code runs.
-    shape
-        what is fixed; of one term.
-    most
-        terms that are tried.
-    """
+    """Choose the number of codes, at most ``most``, by holding out half of the pictures, or of the frames."""
     groups = sorted({each.group for each in exposures})
     if len(groups) > 1:
         halves = [{group: index % 2 for index, group in enumerate(groups)}[each.group] for each in exposures]
@@ -644,10 +574,195 @@ def choose_terms(exposures: Sequence[Exposure], shape: Shape, most: int) -> Choi
 
 
 def _held_out(kept: Sequence[Exposure], left_out: Sequence[Exposure], shape: Shape) -> float:
-    """Part of the energy of frames ``left_out`` that codes of those ``kept`` explain. Planes of the former that the
-    latter have none of have the gain that explains most."""
     codes = fit_codes(kept, shape)
     gains = codes.gains
     for plane in {each.plane for each in left_out} - {*gains}:
         gains = gains | {plane: float(np.mean([*codes.gains.values()]))}
     return replace(codes, gains=gains).explains(left_out)
+
+
+_COLOURS = {"red": 0, "green": 1, "blue": 2}
+_PICTURE = Wanted("picture", colour=True)
+_REFLECTANCE = "reflectance"
+"""Channel of an image, or of a truth, in OpenEXR."""
+
+
+class KnownFrames:
+    """Frames, scenes and noise of a list of captures.
+
+    Attributes
+    ----------
+    noises
+        Noise variance of a number of each frame, NaN where the run does not state its sensor.
+    saturated
+        Names of runs with saturated readings.
+    frames
+        Number of shots.
+    sums
+        SHA-256 of pictures and of the runs' manifests.
+    prepared
+        Preparation of the files at import.
+    places
+        Offsets of the planes of a colour sensor [pixels of a plane].
+    """
+
+    def __init__(self, captures: KnownCaptures) -> None:
+        self.exposures: list[Exposure] = []
+        self.noises: list[float] = []
+        self.saturated: list[str] = []
+        self.frames = 0
+        self.sums: dict[str, str] = {}
+        self.prepared = preparation_of(next(iter(captures.manifests.values())), captures.path)
+        self.places = plane_offsets(self.prepared)
+
+    @classmethod
+    def of(cls, captures: KnownCaptures, aged: Mapping[str, Factors] | None = None) -> KnownFrames:
+        """Read all ``captures``, which must be of the camera of ``aged`` factors where these are given."""
+        read = cls(captures)
+        for number, capture in enumerate(captures.listed.known):
+            picture = _picture(captures, capture)
+            read.sums[capture.picture] = checksum(captures.picture(capture))
+            for line in captures.manifests:
+                if captures.lines is not None and line not in PLANES:
+                    raise MitsimError(
+                        f"list {captures.path}: {capture.run} has the line {line}, and lines of a projector see codes "
+                        f"of their own; calibrate each alone, by runs such as {capture.run}/{line}"
+                    )
+                light = _plane(captures, capture, picture, line)
+                read._add(captures, number, line, light, None if aged is None else aged[line])
+        return read
+
+    def _add(self, captures: KnownCaptures, number: int, line: str, light: FloatArray, aged: Factors | None) -> None:
+        capture = captures.listed.known[number]
+        folder = captures.run(capture, line)
+        shots = load_run(folder)
+        self.sums[str(Path(capture.run) / line)] = checksum(folder / MANIFEST)
+        left, right = shots.patterns
+        if light.shape != (len(left), len(right)):
+            raise MitsimError(
+                f"picture {captures.picture(capture)}: is {light.shape[0]} x {light.shape[1]} pixels, but the run "
+                f"{folder} has {len(left)} x {len(right)} scene pixels; give one of its size"
+            )
+        first = self.exposures[0].frame.shape if self.exposures else None
+        if aged is not None:
+            aged.check_fit(shots)
+            first = len(aged.left), len(aged.right)
+        digital, centre = shots.manifest.digital, captures.listed.centre if aged is None else aged.manifest.centre
+        saturated = 0
+        for each in shots.pattern_measurements(first):
+            if not self.exposures:
+                count = len(captures.listed.known) * len(captures.manifests) * left.shape[1] * right.shape[1]
+                held = Cost(memory_bytes=_COPIES * float(each.frame.nbytes) * count)
+                held.check(f"list {captures.path}: its frames", Limits())
+            frame = centre_frame(each.frame) if centre else each.frame
+            scene = light * np.multiply.outer(left[:, each.row], right[:, each.column])
+            self.exposures.append(Exposure(scene, frame, number, line, self.places.get(line, (0.0, 0.0))))
+            variance = float(np.mean(np.maximum(digital.variance(each.light, each.shots), 0.0)))
+            self.noises.append(variance if digital.noise_is_stated else np.nan)
+            self.frames += each.shots
+            saturated += each.saturated
+        if saturated:
+            self.saturated.append(str(Path(capture.run) / line))
+
+    def noise(self, number: int, misfit: FloatArray) -> float:
+        """Return the stated noise variance of an exposure, or estimate it from second differences of the ``misfit``."""
+        if np.isfinite(self.noises[number]):
+            return self.noises[number]
+        guess = float(np.mean(np.square(np.diff(np.diff(misfit, 2, 0), 2, 1)))) / _OF_DIFFERENCES**2
+        return guess / _differences_of_turned(misfit.shape, self.prepared)
+
+    def misfit(self, models: Iterable[tuple[FloatArray, float]]) -> tuple[float, float, float]:
+        """Return explained part, rms part that neither models nor noise explain, and mean of misfit over noise.
+
+        ``models`` are the frames of a model, each with the variance of its known errors. Both are centred before
+        comparison.
+        """
+        excess = energy = total = 0.0
+        ratios = []
+        for number, (each, (model, error)) in enumerate(zip(self.exposures, models, strict=True)):
+            misfit = centre_frame(each.frame - model)
+            noise = self.noise(number, misfit) + error
+            left_over = float(np.mean(np.square(misfit)))
+            excess += left_over - noise
+            total += left_over
+            energy += float(np.mean(np.square(centre_frame(each.frame))))
+            ratios.append(left_over / noise if noise > 0 else 1.0)
+        return 1 - total / energy, float(np.sqrt(max(excess, 0.0) / energy)), float(np.mean(ratios))
+
+    def warnings(self) -> Iterator[str]:
+        """Return a warning if runs are saturated."""
+        if self.saturated:
+            yield (
+                f"saturation: {len(self.saturated)} runs have readings at the full well or the ADC's end, first "
+                f"{self.saturated[0]}, so their frames are not linear; expose for less"
+            )
+
+
+_OF_DIFFERENCES = 6
+"""Variance of second differences of white noise over that of the noise."""
+
+
+def _differences_of_turned(shape: tuple[int, ...], how: Preparation) -> float:
+    """Return the noise that second differences show over the true noise, after turning by bilinear interpolation.
+
+    A pixel that is r of one neighbour and 1 - r of the other has r^2 + (1 - r)^2 of the noise. Its second differences,
+    as of (r, 1 - 3 r, 3 r - 2, 1 - r), have less.
+    """
+    angle, crop = np.radians(how.turn_deg), how.crop or Crop()
+    pivot = (np.array(shape) - 1) / 2 if how.turn_about == "centre" else np.array([-crop.row, -crop.column])
+    y, x = np.arange(shape[0])[:, None] - pivot[0], np.arange(shape[1]) - pivot[1]
+    sources = np.cos(angle) * y + np.sin(angle) * x + pivot[0], np.cos(angle) * x - np.sin(angle) * y + pivot[1]
+    kept, seen = np.ones(shape), np.ones(shape)
+    for r in (source % 1 for source in sources):
+        kept *= r**2 + (1 - r) ** 2
+        seen *= (r**2 + (1 - 3 * r) ** 2 + (3 * r - 2) ** 2 + (1 - r) ** 2) / _OF_DIFFERENCES
+    return float(seen.mean() / kept.mean())
+
+
+def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
+    """Return the offset of each plane of a mosaic in frames of a preparation ``how`` [pixels of a plane]."""
+    cell = np.empty((2, 2), dtype=object)
+    for name, place in planes_of(how.mosaic or BGGR).items():
+        cell[place] = name
+    turned = orient(cell, how.orientation) if isinstance(how.orientation, int) else cell
+    return {str(turned[row, column]): (row / 2, column / 2) for row in (0, 1) for column in (0, 1)}
+
+
+_COPIES = 4
+"""Copies of all frames that are in memory at a time."""
+
+
+def _picture(captures: KnownCaptures, capture: KnownCapture) -> FloatArray:
+    path, gamma = captures.picture(capture), captures.listed.gamma
+    if path.suffix.lower() == ".exr":
+        channels = read_frame(path)[0]
+        values = (
+            finite_channel(channels, _REFLECTANCE, path) if _REFLECTANCE in channels else read_image(path, _PICTURE)
+        )
+    else:
+        values = read_image(path, _PICTURE)
+    if values.ndim == 3 and values.shape[2] != 3:
+        raise MitsimError(f"picture {path}: has {values.shape[2]} channels; save it without transparency")
+    light = np.asarray(values, dtype=np.float64) / (own_end(values) or 1.0)
+    if gamma == 1:
+        return light
+    if light.min() < 0:
+        raise MitsimError(f"picture {path}: has numbers below 0, which have no gamma; leave gamma out of the list")
+    return np.asarray(light**gamma)
+
+
+def _plane(captures: KnownCaptures, capture: KnownCapture, picture: FloatArray, line: str) -> FloatArray:
+    if picture.ndim == 2:
+        if capture.colour is not None:
+            raise MitsimError(
+                f"list {captures.path}: picture {capture.picture} is grey; leave colour {capture.colour!r} out"
+            )
+        return picture
+    if line:
+        return picture[:, :, "rgb".index(line[0])]
+    if capture.colour is None:
+        raise MitsimError(
+            f"list {captures.path}: picture {capture.picture} is in colour; say which plane {capture.run} shows, "
+            f"colour = {', '.join(map(repr, _COLOURS))}, or give a grey one"
+        )
+    return picture[:, :, _COLOURS[capture.colour]]

@@ -1,4 +1,4 @@
-"""What a solver found: an image, its statistics, and a status, which is a verdict with its sentence and remedy."""
+"""Solution of an image: its statistics, and a status with the reason and the remedy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mitsim.core.arrays import FloatArray
 
 
 class Verdict(Enum):
-    """What a solver or a calibration found; the value is its name in files."""
+    """Result of a solver or a calibration; the value is its name in files."""
 
     SOLVED = "solved"
     """Every direction of the image is measured."""
@@ -22,40 +22,38 @@ class Verdict(Enum):
     ILL_CONDITIONED = "ill-conditioned"
     """Rounding may change what is seen."""
     MISFIT = "misfit"
-    """Measurements hold more than any image explains."""
+    """The measurements contain more than any image explains."""
     NOT_CONVERGED = "not converged"
-    """The iterations ended before the image stood still."""
+    """The iterations ended before the image was constant."""
     CALIBRATED = "calibrated"
     """Factors explain the responses."""
     NOT_SEPARABLE = "not separable"
-    """Responses hold more than any factors explain."""
+    """The responses contain more than any factors explain."""
     MOSTLY_NOISE = "mostly noise"
     """Factors have a large error."""
     UNKNOWN = "unknown"
-    """Factors from elsewhere, without a word on how good they are."""
+    """Factors of another program, of unknown quality."""
 
     @property
     def good(self) -> bool:
-        """Whether the result can be used as it is."""
+        """Whether the result can be used without a correction."""
         return self in (Verdict.SOLVED, Verdict.PARTLY_MEASURED, Verdict.CALIBRATED, Verdict.UNKNOWN)
 
 
 @dataclass(frozen=True)
 class Status:
-    """Whether a result can be trusted; as text, all of it in one or more sentences.
+    """Verdict on a result, with the reason and the remedy; ``str`` gives all of it in sentences.
 
     Attributes
     ----------
-    verdict
-        what was found.
     sentence
-        the same in words, with its figures, without a full stop.
+        Verdict in words, with its figures, without a full stop.
     remedy
-        what to do; empty where nothing is to be done.
+        What to do; may be empty.
     figures
-        rank, condition, rounding: a sentence.
+        Sentence with rank, condition and rounding.
     flags
-        sentences on what the result inherits from flagged captures and calibrations.
+        Sentences inherited from flagged captures and calibrations.
     """
 
     verdict: Verdict
@@ -66,7 +64,7 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """Whether the result can be used as it is: a good verdict, and nothing flagged before."""
+        """Whether the verdict is good and nothing was flagged before."""
         return self.verdict.good and not self.flags
 
     def __str__(self) -> str:
@@ -76,27 +74,24 @@ class Status:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An image, and what its solver says of it.
+    """Image with the statistics and the status of its solver.
 
     Attributes
     ----------
-    image
-        (n, n') estimate of X, neither clipped nor normalised.
+    image : (n, n') array
+        Estimate of X, neither clipped nor normalised.
     lam
-        lambda that was used, in the unit of the model squared; for total variation its weight [data^2 / image].
+        Lambda in the unit of the model squared; for total variation its weight [data^2 / image].
     residual
-        ||Y - model|| / ||Y|| over all frames, where rounding hides what is below about 1e-8; of a convolutional camera
-        that of the normal equations, relative to their right-hand side.
-    status
-        not ok when the image lacks something that no lambda explains, rounding may have changed too much of it, or
-        iterations did not converge; with rank and condition, where they are known.
+        ||Y - model|| / ||Y|| over all frames, above a rounding of about 1e-8; of conjugate gradients the residual of
+        the normal equations, relative to their right-hand side.
     rounding
-        what rounding may have changed, ||error|| / ||image||; None where the solver does not bound it.
+        Bound of ||error|| / ||image|| by rounding; None if the solver has no bound.
     iterations
-        that were spent; 0 in closed form.
+        0 in closed form.
     objective, relative_gap
-        what was minimised, and an upper bound of how far it is above its minimum, relative to the part of it that
-        images change; None in closed form.
+        Minimised function, and an upper bound of its excess over the minimum, relative to the part that images change;
+        None in closed form.
     """
 
     image: FloatArray
@@ -110,5 +105,5 @@ class Solution:
 
     @property
     def ok(self) -> bool:
-        """Whether the image can be used as it is."""
+        """Whether the image can be used without a correction."""
         return self.status.ok

@@ -1,92 +1,388 @@
-"""Sensor frames of a separable lensless camera under separable patterns in; the scene's image out.
+"""Factorised solver of a separable lensless camera, and the automatic lambda.
 
-Solves min_X sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + lambda ||X||^2 (arXiv 2111.12862, eq. 6) with the
-factors prepared once and the frames added one by one:
+The solver minimises sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + lambda ||X||^2 (arXiv 2111.12862, eq. 6). The
+factors are prepared once, and frames are added one by one:
 
 >>> prepared = prepare(left, right, P_L, P_R)
 >>> frames = prepared.accumulator()
 >>> frames.add(Y, i, j)                           # for each pattern P_L[:, i] P_R[:, j]^T
 >>> solution = prepared.solve(frames, "auto")
 
-With B_L = U_L S_L V_L^T (see :mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj the
-solution is X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. Its rounding error is about eps /
-sqrt(lambda_rel), with lambda_rel = lambda / (max s_L^2 max s_R^2); with the paper's Q = sum (Phi_L^T Y
-Phi_R) o P in place of W it is eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
-``method="gram"`` keeps that form for comparison.
+With B = U S V^T on each side (:mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj, the solution is
+X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. The rounding error is about eps / sqrt(lambda_rel), where
+lambda_rel = lambda / (max s_L^2 max s_R^2). The paper's Q = sum (Phi_L^T Y Phi_R) o P in place of W would give
+eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
 
-Every solution says how much rounding may have moved it: 110 units of eps, nearly all of them LAPACK's way
-of ending the SVD of a side, magnified by sigma_max max_ij sigma_ij / (sigma_ij^2 + lambda) <= 1 / (2
-sqrt(lambda_rel)); for ``gram``, whose data carry sigma_max^2 eps, by sigma_max^2 / min_ij (sigma_ij^2 +
-lambda). That is relative to the image, for frames that the model explains; what it does not explain is
-magnified as noise, and by more.
+*Correlated neighbours.* The penalty lambda ||X||^2 darkens large even areas of noisy images. With the covariance
+rho^|p - p'| along rows and columns (a separable first-order Markov field; Jain, Fundamentals of Digital Image
+Processing, 1989, chapter 2), X = F_L Z F_R^T with independent Z, so that the penalty is Tikhonov's of the model B F.
+The SVD of S V^T F keeps the closed form.
 
-*Neighbours alike.* Tikhonov's lambda ||X||^2 says that every pixel is near black and knows nothing of the next one.
-Where the frames are noisy lambda then darkens the image, its large even parts too. Pictures are not so: with the
-covariance rho^|p - p'| along rows and along columns (a separable first-order Markov field; Jain, Fundamentals of
-Digital Image Processing, 1989, chapter 2) an even part of many pixels has many times the variance of a single pixel,
-and is kept.
+*Lambda.* Coefficient W_ij is kept by the share sigma_ij^2 / (sigma_ij^2 + lambda), so that trying a lambda costs n^2
+operations. Where the model explains the frames, lambda minimises an unbiased estimate of the image's error. Elsewhere
+the image must also be stable when lambda changes (docs/decisions/0004-lambda-by-halves.md).
 
-With C = F F^T on each side the image is X = F_L Z F_R^T, Z independent numbers, so that the penalty lambda ||Z||^2 is
-Tikhonov's of the model B F in the place of B = U S V^T. From the SVD S V^T F = U' S' V'^T follow U U', S', and the
-columns F V' that make an image of coefficients: all that was a closed form stays one.
-"""
+*Noise by halves of the sensor.* With G = U_0^T U_0 of half of the sensor's rows, W_0 - G W contains no image, but
+noise: white noise of variance v gives its number i the variance v (G (I - G))_ii. An error of the left factor that is
+independent from sensor row to row adds to all numbers of a column of W. Halves of the columns show errors of the right
+factor."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import minimize_scalar
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.reconstruct.factorisation import (
-    Method,
     Side,
     Slab,
     StripHalves,
     Strips,
-    Structure,
-    check_choices,
     factorise,
     group_pixels,
 )
-from mitsim.reconstruct.regularisation import DiagonalProblem, Halves, automatic_lambda, end_of_range
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 
+
+def check_lambda(lam: float | str) -> float:
+    """Return ``lam`` as a float, or raise MitsimError unless it is a finite number of at least 0."""
+    if isinstance(lam, str) or not (np.isfinite(lam) and lam >= 0):
+        raise MitsimError(f"lambda is {lam}; give a finite number of at least 0")
+    return float(lam)
+
+
+RISK_POWER = 0.5
+"""Power of sigma that weights errors: 0 is the image's error, 2 that of the frames
+(docs/decisions/0002-automatic-lambda.md)."""
+MISFIT_RATIO = 1.2
+"""Limit of noise outside the model's range over noise inside it. Flat prints have 0.92 to 1.02, and scenes with depth
+and gloss 1.4 and more (benchmarks/lambda_losses.py)."""
+_TAKEN, _TAKEN_RISE = 30.0, 4
+"""Limit of the energy that lambda removes within the range, over the noise outside, and the power of the noise ratio
+that raises the limit (docs/decisions/0004-lambda-by-halves.md)."""
+_EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
+"""Powers of ten of the tried lambdas, relative to the largest sigma^2."""
+_FELT = 100.0
+"""Ratio of sigma^2 to lambda above which lambda changes a coefficient by less than one per cent."""
+_FAINT, _FEWEST = 2.0, 20
+"""An octave whose energy over its noise is lower is faint if it has at least the second number of coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class DiagonalProblem:
+    """Inverse problem in its diagonal basis.
+
+    Attributes
+    ----------
+    sigma : (r, r') array
+        Singular values of the whole model, exact zeros beyond its rank.
+    projected : (r, r') array
+        Data W projected on the left singular vectors.
+    energy
+        Squared norm of all data.
+    data_count
+        Number of independent data.
+    halves
+        ``projected`` by quarters of the sensor, which show its noise; None assumes white noise.
+    struck : (r, r') array
+        Part of ``projected`` that is known to be neither image nor noise, up to its sign.
+    least
+        Smallest automatic lambda, see :attr:`Prepared.least_lambda`.
+    """
+
+    sigma: FloatArray
+    projected: FloatArray
+    energy: float
+    data_count: int
+    halves: Halves | None = None
+    struck: FloatArray | float = 0.0
+    least: float = 0.0
+
+    def residual_energy(self, lam: float) -> float:
+        """Return ||Y - model||^2 of the Tikhonov solution at ``lam``."""
+        outside = max(self.energy - float(np.sum(np.square(self.projected))), 0.0)
+        return outside + self.taken_energy(lam)
+
+    def taken_energy(self, lam: float) -> float:
+        """Return the energy within the model's range that the Tikhonov solution at ``lam`` omits."""
+        return float(np.sum(np.square((1 - self.kept_share(lam)) * self.projected)))
+
+    def image_energy(self, lam: float) -> float:
+        """Return ||X||^2 of the Tikhonov image X at ``lam``."""
+        kept = self.kept_share(lam)
+        return float(np.sum(np.square((kept * self.projected)[kept > 0] / self.sigma[kept > 0])))
+
+    def kept_share(self, lam: float) -> FloatArray:
+        """Return the share sigma^2 / (sigma^2 + ``lam``) of each coefficient (r, r'), 0 beyond the rank."""
+        squared = np.square(self.sigma)
+        return np.divide(squared, squared + lam, out=np.zeros_like(squared), where=squared > 0)
+
+    @property
+    def scale(self) -> float:
+        """Largest sigma^2, which lambda_rel refers to."""
+        return float(np.square(self.sigma.max()))
+
+
+def risk_score(problem: DiagonalProblem, lam: float, noise: float | FloatArray) -> float:
+    """Return an unbiased estimate of the weighted squared error of the image at ``lam``, up to a constant.
+
+    ``noise`` is the variance of one datum, or (r, r') of each number of ``projected``. With kept shares k, coefficient
+    (k W / sigma) has the expected squared error (1 - k)^2 x^2 + k^2 noise / sigma^2, and (W^2 - noise) / sigma^2
+    estimates x^2 without bias. Terms that lambda does not change are omitted, so that small sigma do no harm.
+    """
+    measured = problem.sigma > 0
+    sigma, data = problem.sigma[measured], np.square(problem.projected[measured])
+    variance = np.broadcast_to(noise, problem.sigma.shape)[measured]
+    kept = problem.kept_share(lam)[measured]
+    errors = ((kept - 2) * (data - variance) + kept * variance) / (np.square(sigma) + lam)
+    return float(np.sum(sigma**RISK_POWER * errors))
+
+
+def movement(problem: DiagonalProblem, lam: float) -> float:
+    """Return ||lambda dX / dlambda||^2 of the Tikhonov image X at ``lam``.
+
+    This quasi-optimality criterion of Tikhonov and Glasko (1965) needs no noise level and holds for errors of any
+    spectrum.
+    """
+    kept = problem.kept_share(lam)
+    measured = kept > 0
+    return float(np.sum(np.square((kept * (1 - kept) * problem.projected)[measured] / problem.sigma[measured])))
+
+
+def noise_variance(problem: DiagonalProblem) -> float:
+    """Return the mean noise variance of one datum from the energy outside the model's range.
+
+    Raises MitsimError when there are no more data than unknowns.
+    """
+    spare = problem.data_count - np.count_nonzero(problem.sigma)
+    if spare <= 0:
+        raise MitsimError("there are no more data than unknowns, so noise cannot be told; give lambda as a number")
+    inside = np.square(problem.projected[problem.sigma > 0]).sum()
+    return max(problem.energy - float(inside), 0.0) / spare
+
+
+def is_misfit(problem: DiagonalProblem) -> bool:
+    """Return True if the energy outside the model's range exceeds what the noise within it explains."""
+    if not problem.halves:
+        return False
+    chance = 3 * MEDIAN_SPREAD / float(np.sqrt(2 * np.count_nonzero(problem.sigma)))
+    return noise_variance(problem) > (MISFIT_RATIO + chance) * problem.halves.typical
+
+
+def coefficient_noise(problem: DiagonalProblem) -> float | FloatArray:
+    """Return the noise variance of each number (r, r') of ``problem.projected``, or of all.
+
+    Most numbers have the noise outside the model's range, or the noise that the halves of the sensor show where that is
+    larger, because noise of the factors is within the range alone. Where the model does not explain the frames, the
+    halves decide. Noise of single rows, columns and numbers is added.
+    """
+    white, halves = noise_variance(problem), problem.halves
+    if not halves:
+        return white + np.square(problem.struck)
+    level = halves.typical if is_misfit(problem) else float(np.fmax(white, halves.typical))
+    return _believable(problem, level + halves.excess + np.square(problem.struck))
+
+
+def _believable(problem: DiagonalProblem, noise: FloatArray) -> FloatArray:
+    """Raise the ``noise`` of octaves of sigma whose signal would need a scene brighter than the octaves before.
+
+    All octaves beyond the first such octave count as noise, unless one of them is clearly above the noise.
+    """
+    measured = problem.sigma > 0
+    sigma, found = problem.sigma[measured], noise[measured]
+    octave = np.log2(sigma.max() / sigma).astype(np.intp)
+    sizes = np.bincount(octave)
+    data, level, square = (
+        np.bincount(octave, values) / np.maximum(sizes, 1)
+        for values in (np.square(problem.projected[measured]), found, np.square(sigma))
+    )
+    power = np.divide(np.maximum(data - level, 0.0), square, out=np.zeros_like(square), where=square > 0)
+    before = np.cumsum(sizes * power) / np.cumsum(sizes)
+    faint = (data < _FAINT * level) & (sizes >= _FEWEST)
+    clear = np.flatnonzero((data >= _FAINT * level) & (sizes >= _FEWEST))
+    doubtful = faint[1:] & (power[1:] > before[:-1])
+    doubtful[: clear.max(initial=0)] = False
+    if not doubtful.any():
+        return noise
+    beyond = octave > int(np.argmax(doubtful))
+    raised = noise.copy()
+    raised[measured] = np.where(beyond, found * np.maximum(data[octave] / level[octave], 1.0), found)
+    return raised
+
+
+def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
+    """Return the lambda in the unit of sigma^2 that minimises :func:`risk_score`, but at least ``problem.least``.
+
+    Where the model does not explain the frames, as the frames show or as is known before (``explained`` is False), that
+    lambda is a lower bound, and the image that :func:`movement` finds steadiest is used. Raises MitsimError without
+    more data than unknowns, or without a signal.
+    """
+    noise = coefficient_noise(problem)
+    if problem.energy == 0:
+        raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
+    lam = _least(lambda lam: risk_score(problem, lam, noise), problem.scale, _EXPONENTS)
+    if is_misfit(problem) or not explained:
+        # Beyond the largest sigma^2 all goes to black, and at lambda 0 nothing moves, however large its noise.
+        candidates = problem.scale * 10.0 ** _EXPONENTS[_EXPONENTS <= 0]
+        lam = _steadiest(problem, [max(lam, candidates[0]), *candidates[candidates > max(lam, candidates[0])].tolist()])
+    return max(lam, problem.least)
+
+
+def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:
+    """Return a sentence if ``lam`` is an end of its search range and the image depends on that end, else nothing."""
+    lowest, highest = problem.scale * 10.0 ** np.array([_EXPONENTS[0], 0.0])
+    if lam >= highest:
+        return ("Automatic lambda is the largest that is tried: the frames show hardly more than noise.",)
+    if lam <= lowest and np.square(problem.sigma[problem.sigma > 0]).min() < _FELT * lowest:
+        return (
+            "Automatic lambda is the smallest that is tried, so that weakly measured directions of the image may be "
+            "noise; compare with a larger lambda.",
+        )
+    return ()
+
+
+def _steadiest(problem: DiagonalProblem, lambdas: list[float]) -> float:
+    """Return the rising lambda at which the image moves least, as far as misfit explains what lambda removes.
+
+    Behind a mask whose constant term is centred away the image turns black, and movement then counts relative to the
+    image. The bound by the misfit prevents that a dark print loses its stars.
+    """
+    moved = np.array([movement(problem, lam) for lam in lambdas])
+    if len(moved) > 1 and moved[-1] < moved[-2]:
+        moved /= [problem.image_energy(lam) for lam in lambdas]
+    count = len(moved)
+    if problem.halves and np.isfinite(problem.halves.typical):
+        noise = noise_variance(problem)
+        excess = max(noise / problem.halves.typical, 1.0)
+        most = _TAKEN * excess**_TAKEN_RISE * noise * np.count_nonzero(problem.sigma)
+        while count > 1 and problem.taken_energy(lambdas[count - 1]) > most:
+            count -= 1
+        while 1 < count < len(moved) and moved[count] < moved[count - 1]:
+            count -= 1
+    return lambdas[int(np.argmin(moved[:count]))]
+
+
+def _least(score: Callable[[float], float], scale: float, exponents: FloatArray) -> float:
+    best = int(np.argmin([score(scale * 10.0**exponent) for exponent in exponents]))
+    if best == 0 and score(0.0) <= score(scale * 10.0 ** exponents[0]):
+        return 0.0
+    lower, upper = exponents[max(best - 1, 0)], exponents[min(best + 1, len(exponents) - 1)]
+    refined = minimize_scalar(
+        lambda exponent: score(scale * 10.0**exponent), bounds=(lower, upper), method="bounded", options={"xatol": 1e-3}
+    )
+    return float(scale * 10.0 ** float(refined.x))
+
+
+# -------- W by quarters of the sensor in
+
+_LEAST_SPREAD = 0.01
+"""Least G (I - G)_ii of a usable number: 1/4 where both halves see as much, 0 where a side has no spare rows."""
+_MEDIAN = 0.4549
+"""Median of the square of a standard normal number."""
+MEDIAN_SPREAD = 2.33
+"""Relative standard deviation of the median of n squared normal numbers, times the square root of n."""
+_SIGNIFICANT = 2.0
+"""Standard deviations above which a row or column is noisier than others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Halves:
+    """Quarters (2, 2, r, r') of W in the diagonal basis by halves of both sides of the sensor."""
+
+    quarters: FloatArray
+    left: Side
+    right: Side
+
+    @cached_property
+    def differences(self) -> tuple[FloatArray, FloatArray]:
+        """W_0 - G W (r, r') of the halves of rows, and of the halves of columns."""
+        total = self.quarters.sum(axis=(0, 1))
+        by_row = self.quarters[0].sum(axis=0) - self.left.first_half @ total
+        by_column = self.quarters[:, 0].sum(axis=0) - total @ self.right.first_half
+        return by_row, by_column
+
+    @cached_property
+    def _squares(self) -> tuple[FloatArray, FloatArray]:
+        spreads = (half_spread(side.first_half) for side in (self.left, self.right))
+        rows, columns = (np.where(spread >= _LEAST_SPREAD, spread, np.nan) for spread in spreads)
+        by_row, by_column = self.differences
+        return np.square(by_row) / rows[:, None], np.square(by_column) / columns
+
+    @cached_property
+    def typical(self) -> float:
+        """Noise variance of most numbers by the median; NaN when unknown."""
+        return float(_medians(np.concatenate([square[self._measured] for square in self._squares])[None])[0])
+
+    @cached_property
+    def excess(self) -> FloatArray:
+        """Noise variance (r, r') beyond :attr:`typical` where a row or column is significantly noisier."""
+        row, column = (np.where(self._measured, square, np.nan) for square in self._squares)
+        return _excess(row.T) + _excess(column)[:, None]
+
+    @property
+    def _measured(self) -> npt.NDArray[np.bool_]:
+        return np.asarray(np.outer(self.left.singular, self.right.singular) > 0)
+
+
+def half_spread(half: FloatArray) -> FloatArray:
+    """Return the variance (r,) of W_0 - G W for white noise of variance 1: diag G (I - G) with G ``half``."""
+    return np.asarray(np.diag(half) - np.einsum("ij,ji->i", half, half))
+
+
+def _medians(squares: FloatArray) -> FloatArray:
+    ordered, count = np.sort(squares, axis=1), np.count_nonzero(~np.isnan(squares), axis=1)  # NaN come last
+    middle = [
+        np.take_along_axis(ordered, place[:, None], axis=1) for place in (np.maximum(count - 1, 0) // 2, count // 2)
+    ]
+    return np.asarray((middle[0] + middle[1])[:, 0] / (2 * _MEDIAN))
+
+
+def _excess(squares: FloatArray) -> FloatArray:
+    """Return the variance of each row of ``squares`` beyond that of the middle row, where it is significant."""
+    level = _medians(squares)
+    count = np.maximum((~np.isnan(squares)).sum(axis=1), 1)
+    middle = np.nanmedian(level) if not np.isnan(level).all() else np.nan
+    significant = level > middle * (1 + _SIGNIFICANT * MEDIAN_SPREAD / np.sqrt(count))
+    return np.where(significant, level - middle, 0.0)
+
+
 ROUNDING_LIMIT = 0.01
-"""Rounding above this part of the image flags a solution: two digits are the least that anyone can see or use."""
+"""Rounding above this part of the image flags a solution."""
 _ROUNDING_UNITS = 110 * float(np.finfo(np.float64).eps)
-"""Rounding of a number before it is magnified. LAPACK's dbdsqr, in which gesdd and gesvd both end, takes for zero what
-is below u^(-1/8) u = 49 eps of its neighbour (u = eps / 2), in each of two sides; a dozen are left to reductions and
-products. Close singular values come near it: 44 units were seen in 5500 models, a third of those of nearly equal values
-above ten (tests/hard/test_solver_digits.py holds some). A QR iteration without that shortcut is not in LAPACK."""
+"""Rounding of a number before magnification. LAPACK's dbdsqr neglects what is below u^(-1/8) u = 49 eps (u = eps / 2)
+of its neighbour, on each of two sides, and a dozen units are left to reductions and products. 44 units were seen in
+5500 models, where singular values are nearly equal (tests/hard/test_solver_digits.py)."""
 _SMALLEST, _LARGEST = 1e-30, 1e30
-"""Largest number of a factor or pattern: sigma^2, a product of eight of them, then stays far from 1e-308 and 1e308."""
+"""Limits of the largest number of a factor or pattern: sigma^2, a product of eight, stays far from 1e-308 and 1e308."""
 _UNSEEN = 1e-60
-"""Singular values below it are zero: the square of ``_SMALLEST``, a factor that small times a pattern that small."""
+"""Largest singular value of a side below which it sees nothing: the square of ``_SMALLEST``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Factorised model, ready for any number of scenes; applying it changes nothing in it.
+    """Factorised model, ready for any number of scenes; applying it changes nothing.
 
     Attributes
     ----------
     stated
-        directions of either factor that the calibration states to be above its noise; None: not stated.
+        Directions of each factor above the calibration's noise; None if not stated.
     noise
-        standard deviation of each number of the left and of the right factor, as the calibration states it.
+        Standard deviation of each number of the left and of the right factor, as the calibration states it.
     light
-        mean over scene pixels of the sum of squared patterns, of either side.
+        Mean over scene pixels of the sum of squared patterns, for each side.
     """
 
     left: Side
     right: Side
-    method: Method
     centre: bool
     stated: tuple[int, int] | None = None
     noise: tuple[float, float] = (0.0, 0.0)
@@ -96,9 +392,9 @@ class Prepared:
     def least_lambda(self) -> float:
         """Lambda at which the stated noise of the factors alone outweighs the image.
 
-        Independent errors of deviation s_L in Phi_L put noise of the variance n s_L^2 x^2 sigma_R^2 into a datum whose
-        column has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``). Its ratio to x^2
-        is the weight that the datum deserves; the largest of all columns, and of all rows, is taken.
+        Independent errors of deviation s_L in Phi_L add noise of variance n s_L^2 x^2 sigma_R^2 to a datum whose column
+        has the singular value sigma_R, for n scene pixels of mean square x^2 (times ``light``). Its ratio to x^2 is the
+        weight that the datum deserves; the largest of all columns and rows counts.
         """
         sides = zip((self.left, self.right), (self.right, self.left), self.noise, self.light, strict=True)
         return max(
@@ -107,12 +403,12 @@ class Prepared:
 
     @property
     def condition(self) -> float:
-        """The larger cond(A) of the two sides; inf when rank deficient."""
+        """Larger cond(A) of the two sides; inf when rank deficient."""
         return max(self.left.condition, self.right.condition)
 
     @property
     def condition_whole(self) -> float:
-        """cond(A) of the whole model, the product of its sides'; inf when rank deficient."""
+        """cond(A) of the whole model; inf when rank deficient."""
         return self.left.condition * self.right.condition
 
     @property
@@ -122,8 +418,7 @@ class Prepared:
 
     @property
     def lost(self) -> tuple[int, str]:
-        """Directions of the image that are not measured, and above what: a factor of a stated rank tells at most that
-        many under each pattern."""
+        """Number of directions of the image that are not measured, and the limit that they are below."""
         sides = zip((self.left, self.right), self.stated or (), strict=False)
         told = [min(side.rank, side.pattern_count * rank) for side, rank in sides] or [self.rank]
         limit = "rounding" if math.prod(told) == self.rank else "the calibration's noise"
@@ -143,34 +438,34 @@ class Prepared:
 
     @property
     def sigma(self) -> FloatArray:
-        """(r, r') singular values of the whole model, exact zeros beyond its rank."""
+        """Singular values (r, r') of the whole model, exact zeros beyond its rank."""
         return np.outer(self.left.singular, self.right.singular)
 
     def as_solved(self, frame: FloatArray) -> FloatArray:
-        """A ``frame`` (m, m') as the solver takes it: centred where the model is."""
+        """Return a ``frame`` (m, m') centred if the model is."""
         return centre_frame(frame) if self.centre else frame
 
     def slabs(self, pattern: tuple[int, int]) -> tuple[Slab, Slab]:
-        """What the row and the column of a ``pattern`` contribute."""
+        """Return the slabs of the row and of the column of a ``pattern``."""
         return self.left.slabs[pattern[0]], self.right.slabs[pattern[1]]
 
     def places(self, pattern: tuple[int, int]) -> Any:
-        """Where the coefficients of a ``pattern`` are in W."""
+        """Return the index of the coefficients of a ``pattern`` in W."""
         return np.ix_(self.left.columns(pattern[0]), self.right.columns(pattern[1]))
 
     def frame(self, weights: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """(m, m') frame of a ``pattern``, as the ``weights`` W tell it."""
+        """Return the frame (m, m') of a ``pattern`` from the ``weights`` W."""
         left, right = self.slabs(pattern)
         return np.asarray(left.matrix @ weights[left.columns][:, right.columns] @ right.matrix.T)
 
     def weights(self, frame: FloatArray, pattern: tuple[int, int]) -> FloatArray:
-        """What a ``frame`` (m, m') of a ``pattern``, as the solver takes it, adds to W at its :meth:`places`."""
+        """Return what a centred ``frame`` (m, m') of a ``pattern`` adds to W at its :meth:`places`."""
         left, right = self.slabs(pattern)
         return np.asarray(left.matrix.T @ frame @ right.matrix)
 
     @property
     def extent(self) -> str:
-        """Rank and condition of the whole model and of its two sides, as every status ends with them."""
+        """Rank and condition of the whole model and of its two sides in words."""
         left, right = self.left, self.right
         return (
             f"Rank {self.rank} of {self.unknowns} (rows {left.rank} of {left.scene_size}, columns {right.rank} of "
@@ -179,21 +474,17 @@ class Prepared:
         )
 
     def with_correlation(self) -> Prepared:
-        """The same model for images whose neighbouring pixels are alike; frames go to its own accumulator. MitsimError
-        for the Gram method."""
+        """Return the model for images whose neighbouring pixels are correlated; it has its own accumulator."""
         with single_threaded_blas():
             left = correlate_side(self.left)
             return replace(self, left=left, right=left if self.right is self.left else correlate_side(self.right))
 
     def accumulator(self) -> Accumulator:
-        """An empty sum to add frames to."""
+        """Return an empty sum of frames."""
         return Accumulator(self)
 
     def problem(self, frames: Accumulator) -> DiagonalProblem:
-        """Data of all ``frames`` and singular values in the basis where the problem is diagonal.
-
-        MitsimError when frames are missing: the closed form holds for all patterns or none.
-        """
+        """Return the data of all ``frames`` in the diagonal basis; raises MitsimError when frames are missing."""
         if frames.prepared.left is not self.left or frames.prepared.right is not self.right:
             raise MitsimError("frames were added to an accumulator of other factors; use this one's accumulator()")
         missing = frames.missing
@@ -202,20 +493,17 @@ class Prepared:
             raise MitsimError(f"{len(missing)} of {total} frames are missing, first {missing[0]}; add them all")
         sigma = self.sigma
         quarters = frames.quarters
-        if self.method == "gram":
-            rotated = self.left.basis.T @ quarters @ self.right.basis
-            quarters = np.divide(rotated, sigma, out=np.zeros_like(quarters), where=sigma > 0)
         data_count = self.left.data_rows * self.right.data_rows
         halves = Halves(quarters, self.left, self.right)
         data = quarters.sum(axis=(0, 1))
         return DiagonalProblem(sigma, data, frames.energy, data_count, halves, least=self.least_lambda)
 
     def image(self, coefficients: npt.ArrayLike) -> FloatArray:
-        """Scene image (n, n') of ``coefficients`` (r, r') in the diagonal basis: V_L coefficients V_R^T."""
+        """Return the image (n, n') V_L C V_R^T of ``coefficients`` C (r, r')."""
         return np.asarray(self.left.basis @ np.asarray(coefficients) @ self.right.basis.T)
 
     def coefficients(self, image: npt.ArrayLike) -> FloatArray:
-        """Adjoint of :meth:`image`: coefficients (r, r') V_L^T ``image`` V_R of an image (n, n')."""
+        """Return the coefficients (r, r') V_L^T X V_R of an ``image`` X (n, n'), the adjoint of :meth:`image`."""
         return np.asarray(self.left.basis.T @ np.asarray(image) @ self.right.basis)
 
     def solve(
@@ -225,26 +513,19 @@ class Prepared:
         explained: bool = True,
         lack: tuple[FloatArray, float] | None = None,
     ) -> Solution:
-        """Tikhonov solution of the added ``frames``.
+        """Return the Tikhonov solution of the added ``frames``.
 
         Parameters
         ----------
-        frames
-            all of them.
         lam
-            lambda >= 0 in the unit of (Phi_L Phi_R)^2; 0 gives the pseudo-inverse, in which singular values below
-            max(rows, columns) eps of the largest of their side count as zero; ``"auto"`` chooses it by
-            :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
+            Lambda >= 0 in the unit of (Phi_L Phi_R)^2, or "auto" (:func:`automatic_lambda`). 0 gives the
+            pseudo-inverse, in which singular values below max(rows, columns) eps of the largest of their side count as
+            zero.
         explained
-            False where factors are known not to explain what the camera sees, which ``auto`` then heeds.
+            False if the factors are known not to explain the camera, which "auto" uses.
         lack
-            what the frames are known to have beside the image, (r, r') in the diagonal basis and as energy beyond it,
-            which ``auto`` takes for noise.
-
-        Raises
-        ------
-        MitsimError
-            for missing frames or another lambda.
+            Known part of the frames beside the image, (r, r') in the diagonal basis and as energy beyond it, which
+            "auto" treats as noise.
         """
         problem, flags = self.problem(frames), tuple[str, ...]()
         if isinstance(lam, str):
@@ -253,9 +534,7 @@ class Prepared:
             known = replace(problem, struck=lack[0], energy=max(problem.energy - lack[1], 0.0)) if lack else problem
             lam = automatic_lambda(known, explained)
             flags = end_of_range(problem, lam)
-        lam = float(lam)
-        if not (np.isfinite(lam) and lam >= 0):
-            raise MitsimError(f"lambda is {lam}; give a finite number of at least 0, or auto")
+        lam = check_lambda(lam)
         sigma = problem.sigma
         filtered = np.divide(
             sigma * problem.projected, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0
@@ -271,15 +550,12 @@ class Prepared:
         )
 
     def _rounding(self, problem: DiagonalProblem, lam: float) -> float:
-        """Bound on ||error|| / ||image|| by rounding; the module's text says where it comes from."""
         sigma = problem.sigma[problem.sigma > 0]
         power = np.square(sigma) + lam
-        top = float(sigma.max())
-        magnified = top * (sigma / power).max() if self.method == "svd" else top**2 / power.min()
+        magnified = float(sigma.max()) * (sigma / power).max()
         return _ROUNDING_UNITS * max(float(magnified), 1.0) * self.left.spread * self.right.spread
 
     def _status(self, lam: float, rounding: float, scale: float) -> Status:
-        """Whether the image is complete, and what to do where it is not."""
         figures = f"{self.extent}, rounding below {rounding:.0e}."
         lost, limit = self.lost
         for name, side in (("row", self.left), ("column", self.right)):
@@ -299,8 +575,7 @@ class Prepared:
                 figures,
             )
         if rounding > ROUNDING_LIMIT:
-            least = _ROUNDING_UNITS / ROUNDING_LIMIT
-            least = scale * (least if self.method == "gram" else (least / 2) ** 2)
+            least = scale * (_ROUNDING_UNITS / ROUNDING_LIMIT / 2) ** 2
             return Status(
                 Verdict.ILL_CONDITIONED,
                 f"Ill-conditioned: rounding may change more than {ROUNDING_LIMIT:.0%} of the image",
@@ -323,35 +598,26 @@ def prepare(
     right: npt.ArrayLike,
     P_L: npt.ArrayLike,
     P_R: npt.ArrayLike,
-    method: Method = "svd",
-    structure: Structure = "auto",
     centre: bool = False,
 ) -> Prepared:
     """Factorise the model of a camera and a pattern family.
 
     Parameters
     ----------
-    left, right
-        Phi_L (m, n) and Phi_R (m', n'): scene rows to sensor rows, scene columns to sensor columns.
-    P_L, P_R
-        (n, K) and (n', K') pattern columns; pattern (i, j) is P_L[:, i] P_R[:, j]^T.
-    method
-        ``svd``: factorise the stacked matrix. ``gram``: the paper's Gram matrices, for comparison.
-    structure
-        ``block`` and ``auto`` factorise each group of scene pixels that shares no pattern energy with the
-        others alone; ``full`` takes one group.
+    left, right : (m, n) and (m', n') arrays
+        Phi_L and Phi_R: scene rows to sensor rows, scene columns to sensor columns.
+    P_L, P_R : (n, K) and (n', K') arrays
+        Pattern columns; pattern (i, j) is P_L[:, i] P_R[:, j]^T.
     centre
-        True takes row and column means out of factors and of each added frame: the constant term of a
-        FlatCam mask (1 + m m^T)/2 vanishes as long as the mask covers all that the sensor sees. Where it
-        does not, the leak is (C Phi_1) X (C Phi_1)^T / 2, with Phi_1 the shadow of the mask's outline.
+        True removes row and column means of factors and frames: the constant term of a FlatCam mask (1 + m m^T)/2
+        vanishes if the mask covers all that the sensor sees. Elsewhere the leak is (C Phi_1) X (C Phi_1)^T / 2, with
+        Phi_1 the shadow of the mask's outline.
 
     Raises
     ------
     MitsimError
-        for shapes that do not fit, values that are not finite, too large or too small to be squared, patterns
-        that light nothing that the factor sees, unknown choices.
+        If shapes do not fit, values are not finite or too large or too small to be squared, or no light is seen.
     """
-    check_choices(method, structure)
     factors = [_matrix("left factor", left), _matrix("right factor", right)]
     patterns = [_matrix("patterns P_L", P_L), _matrix("patterns P_R", P_R)]
     for name, factor, pattern in zip(("left", "right"), factors, patterns, strict=True):
@@ -367,23 +633,18 @@ def prepare(
         if not (factor.any() and pattern.any()):
             what = " once centred" if centre else ""
             raise MitsimError(f"{name} factor{what} or its patterns are all zero; there is nothing to solve for")
-    groups = [group_pixels(own, structure) for own in patterns]
-
-    def side(index: int) -> Side:
-        return factorise(factors[index], patterns[index], groups[index], method, structure, centre)
-
     # Products this small gain little from threads of BLAS, and lose a hundredfold when the cores are busy.
     with single_threaded_blas():
-        first = side(0)
-        sides = first, first if same else side(1)
-    for name, factorised in zip(("left", "right"), sides, strict=True):
+        left_side = factorise(factors[0], patterns[0], group_pixels(patterns[0]), centre)
+        right_side = left_side if same else factorise(factors[1], patterns[1], group_pixels(patterns[1]), centre)
+    for name, factorised in (("left", left_side), ("right", right_side)):
         if factorised.singular.max() < _UNSEEN:
             raise MitsimError(f"patterns light no scene pixel that the {name} factor sees; light those that it sees")
-    return Prepared(*sides, method, centre)
+    return Prepared(left_side, right_side, centre)
 
 
 def _centre_factor(factor: FloatArray) -> FloatArray:
-    """The factor without the means of its columns; a column of equal numbers leaves exact zeros, not rounding."""
+    """Remove the means of the columns, with exact zeros for a column of equal numbers."""
     centre_frame = centre_columns(factor)
     dust = len(factor) * np.finfo(np.float64).eps * np.abs(factor).max(axis=0)
     return np.where(np.abs(centre_frame).max(axis=0) > dust, centre_frame, 0.0)
@@ -406,33 +667,22 @@ def _matrix(name: str, array: npt.ArrayLike) -> FloatArray:
 # -------- Frames are added one at a time to W = sum_ij U_Li^T Y_ij U_Rj
 
 _LARGEST_SUM = 1e100
-"""Largest norm of a frame, and one over the smallest: its square, the energy, is then told from 0 and infinity."""
+"""Largest norm of a frame, and one over the smallest, so that its square is a normal number."""
 
 
 class Accumulator:
-    """Sum over frames of what the solver needs: W by quarters of the sensor, the frames' energy, and which frames came.
-
-    Made by :meth:`Prepared.accumulator`; belongs to the factors of the ``prepared`` model that made it.
-    """
+    """Sum over frames of what the solver needs: W by quarters of the sensor, and the energy of the frames."""
 
     def __init__(self, prepared: Prepared) -> None:
         left, right = prepared.left, prepared.right
         self.prepared = prepared
-        self._quarters = np.zeros((2, 2, left.accumulated_size, right.accumulated_size))
+        self._quarters = np.zeros((2, 2, len(left.singular), len(right.singular)))
         self._energy = 0.0
         self._seen = np.zeros((left.pattern_count, right.pattern_count), dtype=np.bool_)
 
     @classmethod
     def of_sums(cls, prepared: Prepared, quarters: FloatArray, energy: float) -> Accumulator:
-        """That of all frames, whose sums were kept.
-
-        Parameters
-        ----------
-        prepared
-            the model that they were added up for, bit for bit: its singular vectors have signs of their own.
-        quarters, energy
-            as the accumulator of the frames had them.
-        """
+        """Return an accumulator from the ``quarters`` and ``energy`` of an earlier one of the same model."""
         found = cls(prepared)
         found._quarters += quarters
         found._energy = energy
@@ -441,17 +691,17 @@ class Accumulator:
 
     @property
     def sum(self) -> FloatArray:
-        """W (r_left, r_right), or for the Gram method the paper's Q (n, n); a copy."""
+        """Copy of W (r, r')."""
         return np.asarray(self._quarters.sum(axis=(0, 1)))
 
     @property
     def quarters(self) -> FloatArray:
-        """(2, 2, r_left, r_right) parts of :attr:`sum` by half of the sensor's rows and of its columns; a copy."""
+        """Copy of the parts (2, 2, r, r') of W by half of the sensor's rows and columns."""
         return self._quarters.copy()
 
     @property
     def energy(self) -> float:
-        """Sum of the squares of all added frames, after centring when that was asked for."""
+        """Sum of the squares of all added frames, after centring."""
         return self._energy
 
     @property
@@ -460,20 +710,19 @@ class Accumulator:
         return [(int(i), int(j)) for i, j in np.argwhere(~self._seen)]
 
     def add(self, frame: npt.ArrayLike, row: int, column: int) -> FloatArray:
-        """Add one frame, and return what it adds to W at its places (c, c'); sums are float64.
+        """Add one frame, and return what it adds to W at its places (c, c').
 
         Parameters
         ----------
-        frame
-            (m, m') of any real dtype; for a signed pattern the difference of its two shots.
+        frame : (m, m') array
+            Real numbers; for a signed pattern the difference of its two shots.
         row, column
-            of its pattern P_L[:, row] P_R[:, column]^T.
+            Index of the pattern P_L[:, row] P_R[:, column]^T.
 
         Raises
         ------
         MitsimError
-            for another shape, a value that is not finite, numbers whose squares leave double precision, a pattern
-            index out of range, or a pattern added twice (average repeated shots first).
+            If the shape, a value or the index is not allowed, or a pattern is added twice.
         """
         self._check_index(row, column)
         values = self.prepared.as_solved(self._check_frame(frame, row, column))
@@ -510,16 +759,8 @@ class Accumulator:
 
 
 def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
-    """:attr:`Accumulator.sum` of all frames at once, without the halves, the energy and the checks: half the time.
-
-    Parameters
-    ----------
-    left, right
-        the factorised model.
-    frames
-        (K, m, K', m'), of pattern (i, j) ``frames[i, :, j]``, centred where the model is.
-    """
-    total = np.zeros((left.accumulated_size, right.accumulated_size))
+    """Return W of all ``frames`` (K, m, K', m') at once, without halves, energy and checks, in half the time."""
+    total = np.zeros((len(left.singular), len(right.singular)))
     for slab, own in zip(left.slabs, frames, strict=True):
         seen = (slab.matrix.T @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
         rows = np.arange(len(total))[slab.columns]
@@ -529,17 +770,16 @@ def project_frames(left: Side, right: Side, frames: FloatArray) -> FloatArray:
 
 
 def centre_columns(matrix: FloatArray) -> FloatArray:
-    """C ``matrix``: the mean of each column taken out."""
+    """Return ``matrix`` without the mean of each column."""
     return np.asarray(matrix - matrix.mean(axis=0, keepdims=True))
 
 
 def centre_frame(frame: FloatArray) -> FloatArray:
-    """C Y C of a ``frame`` Y, C = I - 1 1^T / m: row and column means out, as FlatCam's constant term demands."""
+    """Return C Y C of a ``frame`` Y, C = I - 1 1^T / m, without row and column means."""
     return centre_columns(frame - frame.mean(axis=1, keepdims=True))
 
 
 def _out_of_range(name: str, values: FloatArray) -> str:
-    """Why a frame whose energy is not a usable number is refused."""
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
         return f"{name} has {bad} values that are not finite; capture it again"
@@ -552,8 +792,6 @@ def _out_of_range(name: str, values: FloatArray) -> str:
 def _project(
     frame: FloatArray, left: FloatArray, right: FloatArray, halves: tuple[StripHalves, StripHalves]
 ) -> FloatArray:
-    """(2, 2, c, c') left^T frame right by ``halves`` of the rows and of the columns, the thinner factor first: the
-    frame is then read with the least arithmetic, and never copied."""
     rows, columns = halves
     if left.shape[1] < right.shape[1]:
         seen = [_product(left, frame, strips) for strips in rows]
@@ -563,7 +801,6 @@ def _project(
 
 
 def _product(first: FloatArray, second: FloatArray, strips: Strips) -> FloatArray:
-    """first^T second over the rows in ``strips``."""
     total = np.zeros((first.shape[1], second.shape[1]))
     for strip in strips:
         total += first[strip].T @ second[strip]
@@ -573,20 +810,18 @@ def _product(first: FloatArray, second: FloatArray, strips: Strips) -> FloatArra
 # -------- One side of a factorised model in, whose scene pixels are taken for independent
 
 NEIGHBOURS = 0.9
-"""rho, correlation of neighbouring pixels: chosen on scenes/colour_checker under 49 dots and 64 Hadamard patterns, in
-the dark and in two daylights, where 0.8 to 0.98 are within 0.7 dB of each other (docs/decisions/0005-neighbours.md)."""
+"""Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other
+(docs/decisions/0005-neighbours.md)."""
 
 
 def covariance_root(size: int) -> FloatArray:
-    """F (n, n), n = ``size``, lower triangular, with F F^T the covariance rho^|p - p'| of a row of pixels."""
+    """Return the lower triangular F (n, n) with F F^T the covariance rho^|p - p'| of a row of pixels."""
     place = np.arange(size)
     return np.asarray(np.linalg.cholesky(NEIGHBOURS ** np.abs(place[:, None] - place)))
 
 
 def correlate_side(side: Side) -> Side:
-    """A ``side`` whose scene pixels are correlated with their neighbours. MitsimError for one of Gram matrices."""
-    if not side.projected:
-        raise MitsimError("method gram: has no image of correlated pixels; prepare by svd")
+    """Return a ``side`` whose scene pixels are correlated with their neighbours."""
     root = covariance_root(side.scene_size)
     turned, singular, right = np.linalg.svd(side.response.T @ root, full_matrices=False)
     singular[singular <= singular.max() * side.scene_size * np.finfo(np.float64).eps] = 0.0

@@ -1,24 +1,22 @@
-"""Ways from frames to an image, by name: each prepares a camera and its patterns once, and solves any number of scenes.
+"""Solvers by name: each prepares a camera and its patterns once, and solves any number of scenes.
 
-A further one is a class with ``init`` and ``compute`` (:class:`Solver`), a line in :data:`SOLVERS`, and its name in
-:data:`mitsim.reconstruct.request.METHODS`, which is read before numpy is imported.
+A new solver is a class with ``init`` and ``compute`` (:class:`Solver`), a line in :data:`SOLVERS`, and its name in
+:data:`mitsim.reconstruct.request.METHODS`.
 
-*Total variation and bounds.* Minimises P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X) + ridge /
-2 ||X||^2, isotropic TV, over all X whose numbers are within bounds, by ADMM (Boyd et al. 2011, section 3.1.1) on X = Z,
-D = grad Z, B = Z: the X step is the Tikhonov solve around Z, diagonal in the basis of the prepared factors; the D step
-shrinks gradients; the B step clips; the Z step is a Poisson equation, diagonal in cosines, so that it costs the same
-whatever the weight. The image is Z, clipped.
+*Total variation and bounds.* P(X) = 1/2 sum_ij ||Y_ij - Phi_L (P_ij o X) Phi_R^T||^2 + weight TV(X) + ridge / 2
+||X||^2, isotropic TV, is minimised within bounds by ADMM (Boyd et al. 2011, section 3.1.1) on X = Z, D = grad Z, B = Z.
+The X step is the Tikhonov solve around Z, diagonal in the basis of the prepared factors; the D step shrinks gradients;
+the B step clips; the Z step is a Poisson equation, diagonal in cosines. The image is Z, clipped.
 
-How far an image is above the minimum is told by duality. With |Q| <= weight everywhere, Q . grad X <= weight TV(X); and
-with N that pushes against bounds alone, N . X is nowhere within them above its value at the bounds. So P is there
-nowhere below the quadratic that has Q . grad X and N . (X - bound) for these. Among all images that are no farther
-from X than r, that quadratic is at its least not below its value at X less 1/2 sum c^2 / (sigma^2 + ridge + mu) + mu
-r^2 / 2, for any mu >= 0, c being the coefficients of its gradient at X. Hence P(X) exceeds the minimum by no more than
+*Gap.* With |Q| <= weight everywhere, Q . grad X <= weight TV(X). With N that pushes against bounds alone, N . X is
+nowhere within them above its value at the bounds. So P exceeds nowhere the quadratic that has Q . grad X and N . (X -
+bound) for these terms. Among images not farther from X than r that quadratic is at least its value at X less 1/2 sum
+c^2 / (sigma^2 + ridge + mu) + mu r^2 / 2, for any mu >= 0, c being the coefficients of its gradient at X. Hence P(X)
+exceeds the minimum by at most
 
     gap = weight TV(X) - Q . grad X + N . (bound - X) + 1/2 sum c^2 / (sigma^2 + ridge + mu) + mu r^2 / 2
 
-with the Q and N that the D and B steps give, the best mu, and r = ||X||. (mu is for directions that frames hardly
-measure: at mu = 0 these would divide by sigma^2.)
+with the Q and N of the D and B steps, the best mu, and r = ||X||.
 """
 
 from __future__ import annotations
@@ -32,57 +30,52 @@ from scipy.fft import dctn, idctn
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.reconstruct.convolution import check_lambda
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda, end_of_range, noise_variance
 from mitsim.reconstruct.request import MARKOV, NONNEGATIVE, TIKHONOV, TV, Bounds
 from mitsim.reconstruct.solution import Solution, Status, Verdict
-from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
+from mitsim.reconstruct.solver import (
+    Accumulator,
+    DiagonalProblem,
+    Prepared,
+    automatic_lambda,
+    check_lambda,
+    end_of_range,
+    noise_variance,
+    prepare,
+)
 
 # ---- Total variation and bounds --------------------------------------------------------------------------------------
 
 
 _BALANCE, _STEP = 3.0, 2.0
-"""Ratio of two residuals, or of two parts of the gap, beyond which a penalty changes, and by how much at most: they set
-the speed only. Boyd et al. name 10 and 2."""
+"""Ratio of two residuals, or of two parts of the gap, beyond which a penalty changes, and the largest change."""
 _RELAXED = 1.7
-"""Over-relaxation: Boyd et al. name 1.5 to 1.8 (section 3.4.3)."""
+"""Over-relaxation (Boyd et al., section 3.4.3: 1.5 to 1.8)."""
 _BALANCED_EACH, _JUDGED_EACH = 5, 10
-"""Steps after which the penalty of X = Z is looked at, and the gap, which costs two steps: of 5, 10 and 20 those that
-end soonest over seven decades of weights (128 x 128; uniform light, dots:3, hadamard:2)."""
+"""Steps after which the penalty of X = Z is balanced, and steps after which the gap, which costs two steps, is
+computed."""
 _DAMPINGS = 10.0 ** np.arange(-20, 2.1, 0.5)
-"""mu over the largest sigma^2: from where no direction feels it to where all do."""
+"""mu over the largest sigma^2."""
 _NOTHING = 1e-300
-"""In place of a zero that is divided by: the smallest power of ten above what underflows."""
+"""Divisor in place of a zero."""
 
 
 _SINGLE = float(np.finfo(np.float32).eps) ** 2 / 2
-"""Objective over the data's energy that rounding frames to single precision adds: a gap is relative to no less."""
+"""Least objective over the data's energy that a gap refers to, because frames have single precision."""
 
 
 def automatic_weight(problem: DiagonalProblem) -> float:
-    """Weight for a ``problem``: the root of its noise variance times Tikhonov's automatic lambda.
+    """Return the root of the noise variance times Tikhonov's automatic lambda as the weight for a ``problem``.
 
-    Of noise of variance v, and slopes whose size is distributed as exp(-slope / b), the likeliest image is that of
-    weight v / b. Automatic lambda is v over the mean square of what frames tell of the image, whose root stands for b.
+    With noise of variance v and slopes distributed as exp(-slope / b), the likeliest image has the weight v / b.
+    Automatic lambda is v over the mean square of the image, whose root stands for b.
     """
     return float(np.sqrt(noise_variance(problem) * automatic_lambda(problem)))
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of an image X before it is seen: weight TV(X) + ridge / 2 ||X||^2 is added to half the squared
-    misfit, and all numbers of X are within ``bounds``.
-
-    Attributes
-    ----------
-    weight
-        of the total variation [data^2 / image].
-    ridge
-        lambda [(data / image)^2].
-    bounds
-        least and largest number of an image.
-    """
+    """Prior of an image X within ``bounds``: weight TV(X) + ridge / 2 ||X||^2 is added to half the squared misfit."""
 
     weight: float = 0.0
     ridge: float = 0.0
@@ -90,12 +83,11 @@ class Prior:
 
     @property
     def bounded(self) -> bool:
-        """Whether not every number is allowed."""
+        """Whether any bound is finite."""
         return math.isfinite(self.bounds[0]) or math.isfinite(self.bounds[1])
 
     def slack(self, image: FloatArray, pressed: FloatArray) -> float:
-        """How far <``pressed``, X> may exceed <``pressed``, ``image``> within the bounds: 0 where ``pressed`` pushes
-        against the bound that a pixel is at; inf where it pushes against none."""
+        """Return how far <``pressed``, X> may exceed <``pressed``, ``image``> within the bounds."""
         low, high = self.bounds
         down, up = np.minimum(pressed, 0.0), np.maximum(pressed, 0.0)
         total = 0.0
@@ -115,24 +107,16 @@ def solve_tv(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Total-variation solution of the added frames.
+    """Return the total-variation solution of the added frames.
 
     Parameters
     ----------
-    prepared, frames
-        the factorised model, and all its frames.
     weight
-        >= 0 [data^2 / image], or ``"auto"``: :func:`automatic_weight`; 0 is least squares, without bounds in closed
-        form.
+        Weight >= 0 [data^2 / image], or "auto" (:func:`automatic_weight`); 0 is least squares.
     iterations, tolerance
-        it stops when the relative gap is at most ``tolerance``, or after so many steps.
+        The solver stops when the relative gap is at most ``tolerance``, or after ``iterations``.
     bounds
-        least and largest number of the image; None: any.
-
-    Raises
-    ------
-    MitsimError
-        for missing frames, another weight, or no iterations.
+        Least and largest number of the image; None: any.
     """
     problem = prepared.problem(frames)
     lam = automatic_weight(problem) if weight == "auto" else check_lambda(weight)
@@ -147,23 +131,16 @@ def solve_nonnegative(
     tolerance: float = 1e-4,
     bounds: Bounds | None = None,
 ) -> Solution:
-    """Tikhonov's solution of the added frames among images within bounds.
+    """Return the Tikhonov solution of the added frames among images within bounds.
 
     Parameters
     ----------
-    prepared, frames
-        the factorised model, and all its frames.
     lam
-        lambda >= 0, or ``"auto"``: Tikhonov's (:func:`mitsim.reconstruct.regularisation.automatic_lambda`).
+        Lambda >= 0, or "auto" as for Tikhonov's solution.
     iterations, tolerance
-        as :func:`solve_tv`; the objective is half of Tikhonov's.
+        See :func:`solve_tv`.
     bounds
-        least and largest number of the image; None: 0 and inf.
-
-    Raises
-    ------
-    MitsimError
-        for missing frames, another lambda, or no iterations.
+        Least and largest number of the image; None: 0 and inf.
     """
     problem = prepared.problem(frames)
     ridge = automatic_lambda(problem) if lam == "auto" else check_lambda(lam)
@@ -187,14 +164,13 @@ def _solve(prepared: Prepared, problem: DiagonalProblem, prior: Prior, iteration
 def _minimise(
     prepared: Prepared, problem: DiagonalProblem, prior: Prior, iterations: int, tolerance: float
 ) -> tuple[FloatArray, int, float]:
-    """The image (n, n') whose relative gap is at most ``tolerance``, or that after ``iterations`` steps; the steps; its
-    relative gap."""
+    """Return the image (n, n'), the number of steps and the relative gap."""
     weight, ridge = prior.weight, prior.ridge
     squared, data = np.square(problem.sigma) + ridge, problem.sigma * problem.projected
     rho = _penalty(problem)
     smooth = prepared.image(data / (squared + rho))
-    slopes = _gradient(smooth)
-    rho_slopes = weight / max(float(_length(slopes).mean()), _NOTHING)
+    slopes = slopes_of(smooth)
+    rho_slopes = weight / max(float(lengths(slopes).mean()), _NOTHING)
     # Without bounds nothing is held to them.
     inside, rho_inside = np.clip(smooth, *prior.bounds), rho if prior.bounded else 0.0
     dual, dual_slopes, dual_inside = np.zeros_like(smooth), np.zeros_like(slopes), np.zeros_like(smooth)
@@ -213,11 +189,11 @@ def _minimise(
         bounded, pressed = dual_slopes, dual_inside
         if weight:
             target = slopes - dual_slopes
-            length = _length(target)
+            length = lengths(target)
             shrunk = target * (np.maximum(length - weight / rho_slopes, 0.0) / np.maximum(length, _NOTHING))
             bounded = rho_slopes * (target - shrunk)
             relaxed_slopes = _RELAXED * shrunk + (1 - _RELAXED) * slopes
-            source += rho_slopes * _gradient_adjoint(relaxed_slopes + dual_slopes)
+            source += rho_slopes * slopes_adjoint(relaxed_slopes + dual_slopes)
             total = total + rho_slopes * laplacian
         if prior.bounded:
             target = smooth - dual_inside
@@ -227,7 +203,7 @@ def _minimise(
             source += rho_inside * (relaxed_inside + dual_inside)
             total = total + rho_inside
         smooth = idctn(dctn(source, norm="ortho") / total, norm="ortho") if weight else source / total
-        slopes = _gradient(smooth)
+        slopes = slopes_of(smooth)
         dual += _RELAXED * updated + (1 - _RELAXED) * before - smooth
         if weight:
             dual_slopes += relaxed_slopes - slopes
@@ -256,16 +232,14 @@ def _minimise(
 
 
 def _towards(first: float, second: float, power: float) -> float:
-    """Factor of a penalty that a ``first`` number above the ``second`` one calls for: a ``power`` of their ratio, at
-    most ``_STEP``."""
+    """Return the factor, at most ``_STEP``, by which a penalty changes if ``first`` and ``second`` are not balanced."""
     ratio = max(first, _NOTHING) / max(second, _NOTHING)
     return 1.0 if 1 / _BALANCE <= ratio <= _BALANCE else float(np.clip(ratio**power, 1 / _STEP, _STEP))
 
 
 def _objective(prepared: Prepared, problem: DiagonalProblem, image: FloatArray, prior: Prior) -> float:
-    """P(X) of an ``image`` (n, n') under a ``prior``, without the energy outside the model's range."""
     misfit = problem.projected - problem.sigma * prepared.coefficients(image)
-    variation = prior.weight * float(_length(_gradient(image)).sum()) if prior.weight else 0.0
+    variation = prior.weight * float(lengths(slopes_of(image)).sum()) if prior.weight else 0.0
     return 0.5 * float(np.square(misfit).sum() + prior.ridge * np.square(image).sum()) + variation
 
 
@@ -277,13 +251,11 @@ def _gap(
     bounded: FloatArray,
     pressed: FloatArray,
 ) -> tuple[float, float]:
-    """The gap of an ``image`` (n, n') in two parts, that of the ``prior`` and that of the quadratic; ``bounded`` (2, n,
-    n') is Q, no longer than the weight anywhere, and ``pressed`` (n, n') is N."""
     pull, variation = pressed, prior.slack(image, pressed)
     if prior.weight:
-        slopes = _gradient(image)
-        variation += prior.weight * float(_length(slopes).sum()) - float(np.sum(bounded * slopes))
-        pull = pull + _gradient_adjoint(bounded)
+        slopes = slopes_of(image)
+        variation += prior.weight * float(lengths(slopes).sum()) - float(np.sum(bounded * slopes))
+        pull = pull + slopes_adjoint(bounded)
     pull = pull + prior.ridge * image
     along, seen = prepared.coefficients(pull), prepared.coefficients(image)
     unmeasured = float(np.square(pull - prepared.image(along)).sum())
@@ -297,15 +269,13 @@ def _gap(
     return max(variation, 0.0), quadratic
 
 
-def _gradient(image: FloatArray) -> FloatArray:
-    """(2, n, n') differences of an ``image`` (n, n') to the next row and column; 0 at the last."""
+def slopes_of(image: FloatArray) -> FloatArray:
     return np.stack([np.diff(image, axis=axis, append=image.take([-1], axis)) for axis in (0, 1)])
 
 
-def _gradient_adjoint(slopes: FloatArray) -> FloatArray:
-    """(n, n') adjoint of :func:`_gradient`, of ``slopes`` (2, n, n')."""
+def slopes_adjoint(slopes: FloatArray) -> FloatArray:
     down, across = slopes[0, :-1], slopes[1, :, :-1]
-    total = np.zeros(slopes.shape[1:])
+    total = np.zeros(slopes.shape[1:], slopes.dtype)
     total[1:] += down
     total[:-1] -= down
     total[:, 1:] += across
@@ -313,8 +283,7 @@ def _gradient_adjoint(slopes: FloatArray) -> FloatArray:
     return total
 
 
-def _length(slopes: FloatArray) -> FloatArray:
-    """(n, n') lengths of ``slopes`` (2, n, n')."""
+def lengths(slopes: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.square(slopes).sum(axis=0)))
 
 
@@ -323,7 +292,7 @@ def _norm(values: FloatArray) -> float:
 
 
 def _penalty(problem: DiagonalProblem) -> float:
-    """ADMM penalty, which sets the speed only: the Tikhonov lambda balances both of its steps."""
+    """Return the ADMM penalty, which sets the speed only: Tikhonov's lambda balances both of its steps."""
     measured = np.square(problem.sigma[problem.sigma > 0])
     if problem.data_count > measured.size:
         lam = automatic_lambda(problem)
@@ -385,14 +354,14 @@ Patterns = tuple[FloatArray, FloatArray]
 
 
 class Solver(Protocol):
-    """A way from frames to an image: prepared once for a camera and its patterns, and then applied to any scenes.
+    """Solver of images: prepared once for a camera and its patterns, and applied to any number of scenes.
 
     Attributes
     ----------
     linear
-        whether images at one lambda are linear in the frames, so that noise of the frames is told for each pixel.
+        Whether images at one lambda are linear in the frames, so that their noise is known for each pixel.
     whole
-        whether every pattern's slab has all coefficients, not those of the pixels that it lights alone.
+        Whether every pattern's slab has all coefficients.
     """
 
     linear: bool
@@ -400,37 +369,35 @@ class Solver(Protocol):
 
     @property
     def name(self) -> str:
-        """The method's."""
+        """Method name."""
         ...
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """What depends on the ``camera`` and the ``patterns`` alone; applying it changes nothing in it."""
+        """Return the model of a ``camera`` under ``patterns``."""
         ...
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of one scene.
+        """Return the image of one scene from all its added ``frames``.
 
         Parameters
         ----------
-        prepared, frames
-            what :meth:`init` gives, and all frames, added up.
         lam
-            lambda; what ``auto`` does is the solver's own.
+            Lambda; each solver defines "auto".
         **iterative
-            what was asked for of ``bounds`` and ``iterations``; a solver that iterates has these arguments.
+            ``bounds`` and ``iterations`` as requested, for a solver that iterates.
         """
         ...
 
 
 class Tikhonov(Solver):
-    """Least squares with lambda ||X||^2: pixels are independent, the solution is in closed form."""
+    """Least squares with lambda ||X||^2 in closed form."""
 
     name, linear, whole = TIKHONOV, True, False
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """The ``camera``'s model under ``patterns``, factorised."""
+        """Return the factorised model of a ``camera`` under ``patterns``."""
         prepared = prepare(camera.left, camera.right, *patterns, centre=camera.manifest.centre)
         stated = camera.manifest.noise
         left, right = (float(np.square(side).sum(axis=1).mean()) for side in patterns)
@@ -440,28 +407,17 @@ class Tikhonov(Solver):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``.
-
-        Parameters
-        ----------
-        prepared, frames
-            what :meth:`init` gives, and all frames, added up.
-        lam
-            lambda; ``auto``: :func:`mitsim.reconstruct.regularisation.automatic_lambda`.
-        **iterative
-            nothing: a closed form has neither bounds nor steps.
-        """
+        """See :meth:`Solver.compute`."""
         return prepared.solve(frames, lam)
 
 
 class Markov(Tikhonov):
-    """Least squares where neighbouring pixels are alike, for noisy frames: lambda times X in the metric of their
-    inverse covariance."""
+    """Least squares for noisy frames, with the inverse covariance of neighbouring pixels as the metric of X."""
 
     name, whole = MARKOV, True
 
     def init(self, camera: Factors, patterns: Patterns) -> Prepared:
-        """The ``camera``'s model under ``patterns``, factorised in the basis of correlated pixels."""
+        """Return the model factorised in the basis of correlated pixels."""
         return super().init(camera, patterns).with_correlation()
 
 
@@ -473,34 +429,22 @@ class Nonnegative(Tikhonov):
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``.
-
-        Parameters
-        ----------
-        prepared, frames, lam, **iterative
-            as :func:`solve_nonnegative` takes them.
-        """
+        """See :func:`solve_nonnegative`."""
         return solve_nonnegative(prepared, frames, lam, **iterative)
 
 
 class TotalVariation(Tikhonov):
-    """Least squares with lambda times the total variation of X, within bounds, by iterations."""
+    """Least squares with lambda times the total variation of X within bounds, by iterations."""
 
     name, linear = TV, False
 
     def compute(
         self, prepared: Prepared, frames: Accumulator, lam: float | Literal["auto"], **iterative: Any
     ) -> Solution:
-        """The image of ``frames``.
-
-        Parameters
-        ----------
-        prepared, frames, lam, **iterative
-            as :func:`solve_tv` takes them.
-        """
+        """See :func:`solve_tv`."""
         return solve_tv(prepared, frames, lam, **iterative)
 
 
 _ALL = Tikhonov(), Markov(), Nonnegative(), TotalVariation()
 SOLVERS: dict[str, Solver] = {solver.name: solver for solver in _ALL}
-"""By the method that an image is asked by."""
+"""Solvers by method name."""

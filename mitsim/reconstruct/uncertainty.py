@@ -1,49 +1,40 @@
-"""The factorised model, lambda and stated noise in; a standard uncertainty for each pixel of the image out, by source.
+"""Standard uncertainty for each pixel of an image by source, from the factorised model, lambda and stated noise.
 
-With G = sigma / (sigma^2 + lambda) the image X = V_L (G o W) V_R^T is linear in the frames, W = sum_ij U_Li^T Y_ij
-U_Rj. Independent noise of variance v in all data leaves, V o V being the squares of V's numbers,
+*Noise of frames.* With G = sigma / (sigma^2 + lambda) the image X = V_L (G o W) V_R^T is linear in the frames.
+Independent noise of variance v in all data leaves
 
     var X = (V_L o V_L) (v G o G) (V_R o V_R)^T
 
-Light differs from frame to frame and over the sensor. Taking the variance of frame (i, j) for a product of its means by
-sensor row and by sensor column, v_ij = r_ij c_ij^T / mean, v becomes sum_ij ((U_Li o U_Li)^T r_ij) ((U_Rj o U_Rj)^T
-c_ij)^T / mean, number by number. (For patterns whose blocks share no row, such as ``random``, coefficients are then
-correlated, which is left out.) The noise N of a frame that is taken off all others comes in as (sum_i U_Li)^T N (sum_j
-U_Rj), whose numbers are correlated too; with G = sum_k g_k h_k^T that is exact, sum_k A_k N B_k^T, A_k = V_L diag(g_k)
-(sum_i U_Li)^T.
+Taking the variance of frame (i, j) as a product of its means by sensor row and column, v_ij = r_ij c_ij^T / mean, v
+becomes sum_ij ((U_Li o U_Li)^T r_ij) ((U_Rj o U_Rj)^T c_ij)^T / mean. (For patterns whose blocks share no row, such as
+``random``, correlations between coefficients are neglected.) The noise N of a frame that is subtracted from all others
+adds (sum_i U_Li)^T N (sum_j U_Rj) to W. With G = sum_k g_k h_k^T its image is exactly sum_k A_k N B_k^T, A_k = V_L
+diag(g_k) (sum_i U_Li)^T.
 
-Factors are off by independent numbers of deviation s_L, one and the same in all frames. To first order the frames are
-then off by d_L (P_ij o X) Phi_R^T, and, with Q = X V_R S_R, the image by V_L [G o (T Q)] V_R^T, where T = sum_i U_Li^T
-d_L diag(p_i) has independent numbers of variance s_L^2 rho[a, p], rho[a, p] = ||sum_i P_L[p, i] U_Li[:, a]||^2. So
+*Noise of factors.* Independent errors of deviation s_L are the same in all frames. With Q = X V_R S_R they change the
+image by V_L [G o (T Q)] V_R^T to first order, where T = sum_i U_Li^T d_L diag(p_i) has independent numbers of variance
+s_L^2 rho[a, p], rho[a, p] = ||sum_i P_L[p, i] U_Li[:, a]||^2. So
 
     var X[p, q] = s_L^2 sum_a V_L[p, a]^2 sum_p' rho[a, p'] (sum_b G[a, b] Q[p', b] V_R[q, b])^2
 
-and the same with the sides exchanged. G is taken apart into a few products of a row and a column. (For patterns whose
-blocks share no row, such as ``random``, and for neighbours alike, rho leaves out what is correlated between
-coefficients.) Where the basis V is not orthonormal (:mod:`mitsim.reconstruct.solver`) V makes the image, its dual sees
-light; formulas are the same.
+and likewise with the sides exchanged, where G is a sum of a few products of a row and a column. Where V is not
+orthonormal, V makes the image and its dual responds to light.
 
-Print that changes within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its
-light g / 12 pixels off the centre; what that does to the image stands for print that may have hard edges or none, which
-is the least. Finer print is told by what halves of the sensor disagree on (:mod:`mitsim.reconstruct.subpixel`).
+*Print* within a projector pixel casts another shadow than the board's. A ramp of slope g a pixel has its light g / 12
+pixels off the centre. Finer print follows from the disagreement of the sensor's halves
+(:mod:`mitsim.reconstruct.accumulation`). *Rendering* has errors by projector pixel, which are kept as the image is.
+*Regularisation* removes lambda x / (sigma^2 + lambda) of each coefficient x, as large as the scene's energy there.
 
-Simulated light is off by its sampling, projector pixel by projector pixel: an error of the image that is kept as the
-image is. What lambda takes away, lambda x / (sigma^2 + lambda) of each coefficient x, is no noise, but as large as the
-scene has energy there, by the power spectrum that the data tell (:func:`scene_spectrum`).
-
-*The scene's spectrum.* A scene is a mean m, and detail that is taken for stationary: its cosine coefficients are
-independent numbers whose variance S hangs on frequency. Coefficient (a, b) of the diagonal basis, whose vectors have
-the cosines C_L and C_R and whose image of ones is c, is m c_ab and detail of the mean square e = sum_kl C_L[k, a]^2
-S[k, l] C_R[l, b]^2; its datum has the variance sigma^2 e + noise about sigma m c. So m follows from all data at once,
-by weighted least squares, even where no datum of its own stands above the noise. Every datum tells of all frequencies
-that its vector holds: under patterns that leave dark pixels between lit ones, well-seen coefficients hold the finest.
-
-S is linear, in the logarithm of frequency, between octaves, apart for frequencies along rows and columns, where prints
-have most of their edges, and between these. It is chosen by the data's likelihood and what is known of scenes before:
-log S falls with the square of frequency, as spectra of photographs do (Field, J. Opt. Soc. Am. A 4, 1987), and departs
-from that by a normal process that forgets itself over octaves. So where data tell nothing, S goes on as the last
-octaves that are told, and further on as scenes do. How far off that may be, the curvature of the likelihood says
-(Laplace's method), and how well such a spectrum fits the data at all (Birge's ratio).
+*The scene's spectrum.* A scene is a mean m, and stationary detail, whose cosine coefficients are independent with a
+variance S of frequency. Coefficient (a, b) of the diagonal basis, whose vectors have the cosines C_L and C_R and whose
+image of ones is c, is m c_ab and detail of the mean square e = sum_kl C_L[k, a]^2 S[k, l] C_R[l, b]^2. Its datum has
+the variance sigma^2 e + noise about sigma m c. So m follows from all data by weighted least squares. S is linear, in
+the logarithm of frequency, between octaves, separately for frequencies along rows and columns, where prints have most
+of their edges, and between these. S maximises the data's likelihood with a prior: log S falls with the square of
+frequency, as spectra of photographs do (Field, J. Opt. Soc. Am. A 4, 1987), apart from a normal process that is
+correlated over octaves. So S continues beyond the data as the last determined octaves, and then as photographs do. Its
+error follows from the curvature of the likelihood (Laplace's method) and from the fit of such a spectrum (Birge's
+ratio).
 """
 
 from __future__ import annotations
@@ -61,62 +52,54 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.arrays import FloatArray
 from mitsim.core.exr import Channel
 from mitsim.core.manifests import FactorNoise
-from mitsim.reconstruct.accumulation import Accumulation
+from mitsim.reconstruct.accumulation import PRINT, Accumulation, Model, disagreement
 from mitsim.reconstruct.factorisation import Side
-from mitsim.reconstruct.regularisation import DiagonalProblem, coefficient_noise
 from mitsim.reconstruct.solution import Solution
-from mitsim.reconstruct.subpixel import PRINT, Model, disagreement
+from mitsim.reconstruct.solver import DiagonalProblem, coefficient_noise
 
 # ---- The scene's power spectrum --------------------------------------------------------------------------------------
 
 
 _FALL = -2.0
-"""Power of frequency that spectra of scenes fall with (Field 1987)."""
+"""Power of frequency of the spectra of scenes (Field 1987)."""
 _CONTRAST = 0.4
-"""Standard deviation of a scene over its mean, before anything is known: 0.2 (gravel) to 0.6 (a portrait) in eight
-photographs of scikit-image."""
+"""Prior standard deviation of a scene over its mean: 0.2 (gravel) to 0.6 (a portrait) in eight photographs."""
 _DEPARTURE, _MEMORY = 2.0, 4.0
-"""Standard deviation of log S about that, and the octaves over which it forgets itself. Of 1 to 3, and of 2 to 8,
-with a slope of its own or without, no choice covers clearly better (docs/physics.md, uncertainty)."""
+"""Prior standard deviation of log S, and its correlation length in octaves (docs/physics.md, uncertainty)."""
 _ALIKE = 0.8
-"""Correlation of log S along rows and columns with log S between them: their difference then deviates by 1.3; 14
-photographs have 0.5 +- 0.7, prints of squares and bars 2 and more."""
+"""Correlation of log S along rows and columns with log S between them."""
 _NARROW = 16
-"""Frequencies count as along an axis where one is less than this part of the other, and by the logarithm up to equal
-ones: the four octaves that 64 pixels have beside the mean and the finest."""
+"""Frequencies are along an axis where one is less than this part of the other."""
 _SINGLE, _BANDS = 8, 4
-"""Frequencies below which each is a band of its own, and bands an octave above; S changes by a fifth within one."""
+"""Frequencies below which each is a band, and bands an octave above."""
 _CERTAIN = 100.0
-"""Data of a group that count in full where they are signal; more only tell how far a scene is from stationary, a tenth
-in amplitude."""
+"""Largest effective number of signal data of a group, because scenes are not exactly stationary."""
 _NOISE_CERTAIN = 2000.0
-"""Data of noise that count in full; more only tell how far off the noise is, which some thousand data outside the
-model's range, or medians of as many within, tell to 2 or 3 %."""
+"""Largest effective number of noise data, because the noise is known to 2 or 3 %."""
 _GREY, _BRIGHT = 0.35, 1.0
-"""Mean reflectance that weighs the data before any is known, and the standard deviation of means about 0: all that
-reflectances may be."""
+"""Mean reflectance before any data, and the standard deviation of means."""
 _STEPS, _STILL = 60, 1e-4
-"""Most steps of Newton's method, and the log-likelihood below which a step ends it: 10 to 30 are taken."""
+"""Largest number of Newton steps, and the log-likelihood below which a step ends them."""
 _FARTHEST = 3.0
 """Largest step of log S."""
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """The mean and the power spectrum of a scene.
+    """Mean and power spectrum of a scene.
 
     Attributes
     ----------
     mean, mean_variance
-        of the image, and the variance of that.
-    even
-        (r, r') coefficients of an image of ones.
+        Mean of the image, and its variance.
+    even : (r, r') array
+        Coefficients of an image of ones.
     log_power, covariance
-        (J,) log S at all nodes, and its (J, J) covariance.
-    shares
-        (J, r, r') mean square of each coefficient by a unit of S of each.
+        log S (J,) at all nodes, and its covariance (J, J).
+    shares : (J, r, r') array
+        Mean square of each coefficient by a unit of S of each node.
     departure
-        mean square by which groups of data are off what S makes of them, over what chance explains; 1 at least.
+        Mean square misfit of groups of data to S over chance; 1 at least.
     """
 
     mean: float
@@ -129,27 +112,20 @@ class Spectrum:
 
     @property
     def energy(self) -> FloatArray:
-        """(r, r') mean square of each coefficient about the mean's."""
+        """Mean square (r, r') of each coefficient without the mean."""
         return np.asarray(np.tensordot(np.exp(self.log_power), self.shares, axes=1))
 
     def spread(self, weights: FloatArray) -> float:
-        """Variance of the logarithm of the sum of all coefficients' mean squares times ``weights`` (r, r')."""
+        """Return the variance of the logarithm of the sum of coefficients' mean squares times ``weights`` (r, r')."""
         parts = np.exp(self.log_power) * np.tensordot(self.shares, weights, axes=2)
         parts = parts / max(float(parts.sum()), 1e-300)
         return float(parts @ self.covariance @ parts)
 
 
 def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: float | FloatArray) -> Spectrum | None:
-    """The spectrum of a scene; None where there are no data.
+    """Return the spectrum of a scene, or None without data.
 
-    Parameters
-    ----------
-    sides
-        of the model.
-    problem
-        its data in the diagonal basis.
-    noise
-        variance of each number of ``problem.projected`` (r, r'), or of all.
+    ``noise`` is the variance of each number of ``problem.projected`` (r, r'), or of all.
     """
     sigma, measured = problem.sigma, problem.sigma > 0
     if not problem.projected[measured].any():
@@ -173,7 +149,6 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
     usual = np.square(_CONTRAST) * frequencies.sum() / detail_energy * fall
 
     def mean(power: FloatArray) -> tuple[float, float]:
-        """The mean and its variance, by least squares weighted for the spectrum S = ``power`` (J,)."""
         weights = sigma * even / (np.square(sigma) * np.tensordot(power, shares, axes=1) + level)
         variance = 1 / (_BRIGHT**-2 + float(np.sum(weights * sigma * even)))
         return variance * float(np.sum(weights * problem.projected)), variance
@@ -189,12 +164,10 @@ def scene_spectrum(sides: tuple[Side, Side], problem: DiagonalProblem, noise: fl
 
 
 def _cosines(side: Side) -> FloatArray:
-    """(n, n) orthonormal cosines of a ``side``'s scene pixels, by column."""
     return np.asarray(dct(np.eye(side.scene_size), axis=0, norm="ortho").T)
 
 
 def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.intp]]:
-    """First of ``size`` frequencies, mean and number of frequencies, of bands in which S hardly differs."""
     every = np.arange(size)
     band = np.floor(_BANDS * np.log2(np.maximum(every, _SINGLE) / _SINGLE)) + np.minimum(every, _SINGLE)
     starts = np.flatnonzero(np.diff(band, prepend=-1))
@@ -203,10 +176,10 @@ def _bands(size: int) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.
 
 
 def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
-    """Weights (J, r, c) at all frequencies but the mean's, and the octaves between nodes.
+    """Return weights (J, r, c) at all frequencies but the mean's, and the octaves between nodes.
 
-    J / 2 octaves along rows and columns, then those between; ``down`` (r,) and ``across`` (c,) are frequencies in parts
-    of the finest, 0 the first.
+    J / 2 octaves are along rows and columns, then those between; ``down`` (r,) and ``across`` (c,) are frequencies in
+    parts of the finest, 0 the first.
     """
     rows, columns = down[:, None], across
     least = min(down[1] if len(down) > 1 else 1.0, across[1] if len(across) > 1 else 1.0)
@@ -221,16 +194,9 @@ def _nodes(down: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Means over coefficients that are seen alike (by half octaves of ``seen``) and hold the same frequencies.
+    """Return means (groups, J) of sigma^2 times shares over similar coefficients, counts, and their squared data.
 
-    Parameters
-    ----------
-    seen, data
-        (count,) sigma^2 and squared data, both over the noise.
-    shares
-        (J, count).
-
-    Returns the groups' (groups, J) sigma^2 times shares, their sizes, and their squared data.
+    ``seen`` and ``data`` (count,) are sigma^2 and squared data over the noise; ``shares`` is (J, count).
     """
     octaves = len(shares) // 2
     whole = np.maximum(shares.sum(axis=0), 1e-300)
@@ -246,14 +212,9 @@ def _group(seen: FloatArray, shares: FloatArray, data: FloatArray) -> tuple[Floa
 def _likeliest(
     told: FloatArray, counts: FloatArray, found: FloatArray, usual: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """log S (J,), its covariance and the departure from it, by Fisher scoring.
+    """Return log S (J,), its covariance and the departure from it, by Fisher scoring.
 
-    Parameters
-    ----------
-    told, counts, found
-        of :func:`_group`.
-    usual, precision
-        (J,) and (J, J) of log S before.
+    ``told, counts, found`` are those of :func:`_group`; ``usual`` (J,) and ``precision`` (J, J) are the prior.
     """
     signal = np.maximum(1 - 1 / np.maximum(found, 1.0), 0.0)
     weight = counts / (1 + counts * (np.square(signal) / _CERTAIN + 1 / _NOISE_CERTAIN))
@@ -290,51 +251,48 @@ def _likeliest(
 
 
 _LOST = 1e-5
-"""Part of the energy of G that its few products may leave out: 0.3 % of its norm, less than 1 % of a variance."""
+"""Part of the energy of G that its few products may omit."""
 _EXTRAPOLATED = 1.35
-"""Factor by which a stated uncertainty may be off from which that is said: data then hold less than frequencies of half
-the detail that is lost."""
+"""Factor of its error from which a stated uncertainty is called extrapolated."""
 _AS_STATED = 1.5
-"""Factor that chi-square may be off from 1 before noise counts as other than stated: 1.2 in its deviation."""
+"""Factor that chi-square may be off from 1 before the residual replaces the stated noise."""
 _NEAR = 2.0
-"""Scene pixels around a place whose detail tells of lost detail there: of 1, 2 and 4 that which covers best."""
+"""Standard deviation [scene pixels] of the neighbourhood of lost detail."""
 _UNSURE = 0.1
-"""Detail near a place, in parts of its mean, that places are alike by before any is seen; 0.3 and 1 cover as well."""
+"""Prior detail near a place, in parts of its mean."""
 NO_UNCERTAINTY = {
     "uncertainty": None,
     "uncertainty_budget": None,
     "uncertainty_extrapolated": None,
     "regularisation_bias_factor": None,
 }
-"""Entries of result.json where it is not known."""
+"""Entries of result.json where the uncertainty is not known."""
 
 
 RANDOM = ("frame_noise", "ambient_frame", "rendering")
-"""Sources that another capture draws anew; the others are the same in all captures with one calibration."""
+"""Sources that another capture draws anew."""
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Standard uncertainty of an image: (n, n') by source, ``regularisation_bias`` among them; and the factor, either
-    way, that this one is known to."""
+    """Standard uncertainty (n, n') of an image by source, and the factor that ``regularisation_bias`` is known to."""
 
     sources: dict[str, FloatArray]
     bias_factor: float = 1.0
 
     @property
     def random(self) -> FloatArray:
-        """(n, n') of what another capture draws anew: noise of the frames, and their rendering where simulated."""
+        """Part (n, n') that another capture draws anew."""
         return _together([values for name, values in self.sources.items() if name in RANDOM])
 
     @property
     def systematic(self) -> FloatArray:
-        """(n, n') of what captures with these factors share: noise of the factors, print within a pixel, exposure, what
-        lambda takes away."""
+        """Part (n, n') that captures with these factors share."""
         return _together([values for name, values in self.sources.items() if name not in RANDOM])
 
     @property
     def total(self) -> FloatArray:
-        """(n, n') standard uncertainty."""
+        """Standard uncertainty (n, n')."""
         return _together(list(self.sources.values()))
 
     @property
@@ -344,14 +302,12 @@ class Uncertainty:
 
     @property
     def extrapolated(self) -> bool:
-        """Whether most of it is detail that lambda takes away and that the data hardly tell: it then follows from
-        coarser detail and from scenes as they are."""
+        """Whether most of it is detail that lambda removes and that the data hardly determine."""
         lost = self.budget.get("regularisation_bias", 0.0)
         return self.bias_factor > _EXTRAPOLATED and 2 * lost**2 > _rms(self.total) ** 2
 
     def loss(self, image: FloatArray) -> str:
-        """Return a sentence if lambda takes away more of an ``image`` (n, n') than it leaves, or if the uncertainty
-        exceeds the image; otherwise nothing."""
+        """Return a sentence if lambda removes most of an ``image``, or the uncertainty exceeds it, else nothing."""
         lost, left, total = self.budget.get("regularisation_bias", 0.0), _rms(image), _rms(self.total)
         if lost > left:
             return (
@@ -368,7 +324,7 @@ class Uncertainty:
 
     @property
     def gist(self) -> str:
-        """The uncertainty of the whole image in a few words."""
+        """Uncertainty of the whole image in a few words."""
         return f"standard uncertainty {_rms(self.total):.1e} rms"
 
     def __str__(self) -> str:
@@ -378,12 +334,12 @@ class Uncertainty:
         return f"{self.gist}: {by_source or 'no noise is stated'}{known}"
 
     def channels(self) -> dict[str, Channel]:
-        """(n, n') channels of uncertainty.exr."""
+        """Return the channels (n, n') of uncertainty.exr."""
         parts = {"uncertainty": self.total, "random": self.random, "systematic": self.systematic}
         return {name: values.astype(np.float32) for name, values in parts.items()}
 
     def summary(self) -> dict[str, Any]:
-        """What result.json and the command line's JSON say of it."""
+        """Return the entries of result.json."""
         return {
             "uncertainty": _rms(self.total),
             "uncertainty_budget": self.budget,
@@ -394,7 +350,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """How noise of a ``model``'s data comes to be noise of its image at ``lam``, lambda."""
+    """Propagation of noise of a ``model``'s data to its image at ``lam``."""
 
     model: Model
     lam: float
@@ -408,10 +364,9 @@ class Propagation:
 
     @cached_property
     def terms(self) -> tuple[FloatArray, FloatArray]:
-        """g (r, k) and h (r', k) of which G is the sum of products, few that leave out ``_LOST`` of its energy.
+        """Factors g (r, k) and h (r', k) of whose products G is the sum, except ``_LOST`` of its energy.
 
-        Each takes away the row and the column of the largest number that is left: for so smooth a table as many as an
-        SVD takes or one more, in a tenth of the time.
+        Each product removes the row and the column of the largest remaining number, in a tenth of the time of an SVD.
         """
         rest, energy = self.gain.copy(), float(np.square(self.gain).sum())
         rows, columns = list[FloatArray](), list[FloatArray]()
@@ -423,16 +378,13 @@ class Propagation:
         return np.stack(rows, axis=1), np.stack(columns, axis=1)
 
     def of_white(self, variance: float) -> FloatArray:
-        """(n, n') variance of the image by independent noise of this ``variance`` in all data."""
+        """Return the variance (n, n') of the image by independent noise of this ``variance`` in all data."""
         return self._spread(np.full(self.gain.shape, variance))
 
     def of_frames(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(n, n') variance of the image by noise of the frames.
+        """Return the variance (n, n') of the image by noise of the frames.
 
-        Parameters
-        ----------
-        rows, columns
-            (K, K', m) and (K, K', m') mean variance of a datum of each pattern by sensor row, and by sensor column.
+        ``rows`` (K, K', m) and ``columns`` (K, K', m') are the mean variances of a datum by sensor row and column.
         """
         left, right = self.model.sides
         squares = [np.square(slab.matrix) for slab in right.slabs]
@@ -448,33 +400,20 @@ class Propagation:
         return self._spread(total)
 
     def of_ambient_frame(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(n, n') variance of the image by one noisy frame, taken off every measurement.
-
-        Parameters
-        ----------
-        rows, columns
-            (m,) and (m',) mean variance of its pixels by sensor row, and by sensor column.
-        """
+        """Return the variance (n, n') by a frame of mean variances ``rows`` and ``columns`` taken off all others."""
         sides = zip(self.model.sides, (rows, columns), strict=True)
         left, right = (side.common * np.sqrt(variance)[:, None] for side, variance in sides)
         mean = max(float(rows.mean()), float(columns.mean()))
         return np.asarray(self._image_variance(left, right) / (mean or 1.0))
 
     def of_light(self, variance: float) -> FloatArray:
-        """(n, n') variance of the image by an independent error of this ``variance`` in every scene pixel's light."""
+        """Return the variance (n, n') of the image by an independent error of every scene pixel's light."""
         left, right = self.model.sides
         if left.dual is None and right.dual is None:  # what coefficients get is then independent too
             return self._spread(variance * np.square(self._sigma))
         return variance * self._image_variance(left.response, right.response)
 
     def _image_variance(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """(n, n') variance of the image of W = left^T E right, E (s, s') independent numbers of variance 1.
-
-        Parameters
-        ----------
-        left, right
-            (s, r) and (s', r').
-        """
         products = []
         for side, own, seen in zip(self.model.sides, self.terms, (left, right), strict=True):
             taken = np.stack([(side.basis * term) @ seen.T for term in own.T], axis=1)
@@ -482,13 +421,11 @@ class Propagation:
         return np.asarray(np.einsum("pkl,qkl->pq", *products, optimize=True))
 
     def of_regularisation(self, problem: DiagonalProblem, variance: float) -> tuple[FloatArray, float]:
-        """(n, n') mean square of what lambda takes away from the image of a ``problem``, and the factor within which
-        its root is known. The ``variance`` of the data is used where there are no more data than unknowns to measure it
-        by.
+        """Return the mean square (n, n') of what lambda removes from the image, and the factor of its error.
 
-        A coefficient's mean square is told by its datum and by the scene's spectrum, each as well as it knows. The mean
-        is lost as an image of ones is, detail where there is more of it than of noise and detail everywhere: that is
-        told by what lambda would take away of the image.
+        ``variance`` of the data replaces the measured one if there are no more data than unknowns. A coefficient's mean
+        square follows from its datum and from the scene's spectrum, weighted by their errors. The mean is lost as an
+        image of ones is, and detail where lambda would remove more of the image.
         """
         told_by_data = problem.data_count > np.count_nonzero(problem.sigma)
         noise = coefficient_noise(problem) if told_by_data else variance
@@ -500,7 +437,6 @@ class Propagation:
         detail = problem.projected - spectrum.mean * self._sigma * spectrum.even
 
         def seen_part(energy: FloatArray) -> FloatArray:
-            """(r, r') share of each coefficient that its own datum tells where its mean square is ``energy``."""
             return np.divide(power * energy, power * energy + noise, out=np.zeros_like(power), where=power > 0)
 
         spread = spectrum.spread(np.square(lost) * (1 - seen_part(spectrum.energy)))
@@ -518,20 +454,19 @@ class Propagation:
         return of_mean + placed, float(np.exp(np.sqrt(spread * spectrum.departure) / 2))
 
     def of_factors(self, noise: FactorNoise, image: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, n') variances of an ``image`` by ``noise`` of the left factor, and of the right one."""
+        """Return the variances (n, n') of an ``image`` by ``noise`` of the left factor, and of the right one."""
         left, right = self.model.sides
         rows = _of_factor(left, right, self.model.patterns[0], self.terms, image)
         columns = _of_factor(right, left, self.model.patterns[1], self.terms[::-1], image.T).T
         return noise.left**2 * rows, noise.right**2 * columns
 
     def of_lack(self, struck: FloatArray) -> FloatArray:
-        """(n, n') mean square, near each place, of what the image is off by where terms that the factors lack add
-        ``struck`` (r, r') to the coefficients W."""
+        """Return the local mean square error (n, n') of the image by terms that add ``struck`` (r, r') to W."""
         off = np.square(self.model.prepared.image(self.gain * struck))
         return np.asarray(gaussian_filter(off, _NEAR, mode="nearest"))
 
     def of_print(self, image: FloatArray) -> FloatArray:
-        """(n, n') mean square of what an ``image`` is off by when its print changes within every projector pixel."""
+        """Return the mean square error (n, n') of an ``image`` whose print changes within every projector pixel."""
         left, right = self.model.sides
         rows, columns = (np.gradient(image, axis=axis) / 12 if image.shape[axis] > 1 else 0 * image for axis in (0, 1))
         moved = [each.sum(axis=0) for each in self.model.moved]
@@ -541,11 +476,9 @@ class Propagation:
         )
 
     def _spread(self, variances: FloatArray) -> FloatArray:
-        """(n, n') variance of the image, that of each coefficient of W being ``variances`` (r, r')."""
         return self._pixel_variance(np.square(self.gain) * variances)
 
     def _pixel_variance(self, variances: FloatArray) -> FloatArray:
-        """(n, n') variance of the image, that of each of its coefficients being ``variances`` (r, r')."""
         left, right = (np.square(side.basis) for side in self.model.sides)
         return np.asarray(left @ variances @ right.T)
 
@@ -557,15 +490,8 @@ class Propagation:
 def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0) -> Uncertainty:
     """Compute the standard uncertainty of a ``solution`` that is linear in its frames.
 
-    Parameters
-    ----------
-    data
-        all frames, accumulated.
-    solution
-        their image.
-    chi_square
-        energy of the residual over what noise as stated puts there. Where it is far from 1 the frames do not have the
-        stated noise, and theirs is taken to be what the residual shows.
+    ``chi_square`` is the energy of the residual over that of the stated noise. Where it is far from 1, the residual
+    replaces the stated noise of the frames.
     """
     noise, image, manifest = data.noise, solution.image, data.factors.manifest
     problem, lack = data.prepared.problem(data.frames), data.lack(image)
@@ -598,7 +524,6 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
 def _of_factor(
     own: Side, other: Side, patterns: FloatArray, terms: tuple[FloatArray, FloatArray], image: FloatArray
 ) -> FloatArray:
-    """(n, n') variance of an ``image`` by independent numbers of variance 1 in the factor of its ``own`` side."""
     seen = image @ other.response
     # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
@@ -616,8 +541,7 @@ def _of_factor(
 
 
 def _responses(side: Side, kinds: FloatArray) -> FloatArray:
-    """rho (r, c): squared norm of sum_i P[p, i] U_i[:, a], of coefficient a for light of a pixel of a kind, whose P[p]
-    is one of ``kinds`` (c, K)."""
+    """Return rho (r, c), the squared norm of sum_i P[p, i] U_i[:, a], for kinds of pixels with P[p] in ``kinds``."""
     stack = np.zeros((len(side.singular), side.pattern_count, side.sensor_size))
     for index, slab in enumerate(side.slabs):
         stack[slab.columns, index] = slab.matrix.T
@@ -626,7 +550,6 @@ def _responses(side: Side, kinds: FloatArray) -> FloatArray:
 
 
 def _together(parts: list[FloatArray]) -> FloatArray:
-    """Root of the sum of squares."""
     return np.sqrt(sum(np.square(part) for part in parts))
 
 

@@ -28,7 +28,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import check_arguments
 from mitsim.core.files import write_bytes
 from mitsim.core.images import lightness
-from mitsim.reconstruct.depth_map import SPARE
+from mitsim.reconstruct.depth import SPARE
 from mitsim.report.pages import page_figure, render_page, typeset
 from mitsim.report.plots import BLACK, BLUE, GREY, ORANGE, PALE
 

@@ -52,10 +52,9 @@ from mitsim.reconstruct.reconstruct import (
     may_replace,
     reconstruct_request,
 )
-from mitsim.reconstruct.regularisation import automatic_lambda
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solution import Solution, Status
-from mitsim.reconstruct.solver import prepare
+from mitsim.reconstruct.solver import automatic_lambda, prepare
 from mitsim.report.colour_image import ColourImage, begin_image
 from mitsim.report.folder_page import report_folder
 
@@ -414,7 +413,7 @@ def _board_of(calibration: Path, lines: ColourManifest) -> float | None:
 # channel or plane that sees several lines has the one separable camera that is nearest to them; only the joint solve
 # knows that each line has its own.
 #
-# Lambda is chosen without a truth: each plane, or channel, chooses its own (:mod:`mitsim.reconstruct.regularisation`).
+# Lambda is chosen without a truth: each plane, or channel, chooses its own (:mod:`mitsim.reconstruct.solver`).
 # The joint solve takes the geometric mean of the planes' lambdas, because the planes have the same scene and nearly the
 # same noise.
 

@@ -43,8 +43,7 @@ from mitsim.devices.session import (
     load_recipe,
 )
 from mitsim.light.light import SampledLight
-from mitsim.reconstruct.estimate_factors import Estimate, decibels
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.report import plots
 from mitsim.report.lit_scene import LINE, IdealCamera, LitScene, ShadowRow, lights, point_profiles, shadow_row
 from mitsim.report.pages import Mean, with_error

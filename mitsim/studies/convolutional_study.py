@@ -32,7 +32,8 @@ from mitsim.devices.mask_profile import load_psf
 from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.metrics import psnr, relative_error
-from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera, FactorisedClasses, solve_iteratively
+from mitsim.reconstruct.convolution import Classes, FactorisedClasses, solve_iteratively
+from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import prepare
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK
@@ -104,7 +105,7 @@ def _truth(studio: Studio, point: Point) -> FloatArray:
 def _measure(studio: Studio, point: Point) -> Found:
     truth, k, seed = _truth(studio, point), round(point["patterns"] ** 0.5), int(point["seed"])
     psf, bench = _psf(point["file"], point.setup.variant), studio.bench(point.setup)
-    whole = ConvolutionalCamera(psf, len(truth))
+    whole = ShiftedLight.of(psf, len(truth))
     with single_threaded_blas():
         if point["part"] == "speed":
             camera = replace(whole, sensor=psf.shape) if point["sensor"] == CROPPED else whole
@@ -256,7 +257,7 @@ class DiffuserShots:
     Attributes
     ----------
     frames
-        (patterns, rows, columns) in the unit of ``ConvolutionalCamera.frames``: a white scene is 1.
+        (patterns, rows, columns) in the unit of ``ShiftedLight.image_of``: a white scene is 1.
     exposure_s
         of each shot.
     saturated
@@ -269,7 +270,7 @@ class DiffuserShots:
 
 
 def take(
-    camera: ConvolutionalCamera,
+    camera: ShiftedLight,
     family: PatternFamily,
     reflectance: FloatArray,
     sensor: SensorModel,
@@ -289,10 +290,10 @@ def take(
     seed
         of the noise.
     """
-    expected = np.maximum(np.stack(list(camera.frames(family, reflectance))), 0.0)  # transforms leave 1e-17 below zero
+    expected = np.maximum(camera.under(family).image_of(reflectance), 0.0)  # transforms leave 1e-17 below zero
     peak = float(expected.max())
     if convention != CONVENTIONS[0]:
-        peak = max(float(frame.max()) for frame in camera.frames(parse_patterns("uniform", camera.n), reflectance))
+        peak = float(camera.under(parse_patterns("uniform", family.n)).image_of(reflectance).max())
     time = exposure_for_peak(peak * WHITE_W_M2, Exposure().fraction, sensor, WAVELENGTH_NM)
     if convention == CONVENTIONS[2]:
         time /= len(expected)
@@ -403,7 +404,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
         where iterations do not come to the direct solution.
     """
     camera = classes.camera
-    family = parse_patterns(f"dots:{classes.k}", camera.n)
+    family = parse_patterns(f"dots:{classes.k}", len(truth))
     lam = best_image(whole, take(whole.camera, family, truth, sensor, seed=seed), truth)[0].lam
     frames = take(camera, family, truth, sensor, seed=seed).frames
     start = time.process_time()
@@ -412,7 +413,7 @@ def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorMode
     exact, direct_exact_s = _time(factorised, frames, _TIGHT)
     direct, direct_s = _time(factorised, frames, _LOOSE)
     marks = _Marks(exact.image, truth, time.process_time())
-    iterative = solve_iteratively(camera, family, frames, lam, 0.0, _MOST_STEPS, marks)
+    iterative = solve_iteratively(camera.under(family), frames, lam, 0.0, _MOST_STEPS, marks)
     if len(marks.seconds) < len(("error", "answer")):
         raise MitsimError(f"iterations did not come to the direct solution at lambda {lam:g}: {iterative.status}")
     return {

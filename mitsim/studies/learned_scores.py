@@ -132,7 +132,7 @@ def _with_correlation(prepared: Prepared, sums: Accumulator) -> tuple[Prepared, 
     other = prepared.with_correlation()
     turns = []
     for before, after in ((prepared.left, other.left), (prepared.right, other.right)):
-        turn = np.zeros((before.accumulated_size, after.accumulated_size))
+        turn = np.zeros((len(before.singular), len(after.singular)))
         for index, (one, two) in enumerate(zip(before.slabs, after.slabs, strict=True)):
             turn[before.columns(index)] += one.matrix.T @ two.matrix
         turns.append(turn)

@@ -220,7 +220,7 @@ def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, a
     its row and the right one of its column.
 
     The sessions are rendered without the sensor's noise, and what it does to factors is added in closed form
-    (:func:`mitsim.reconstruct.estimate_factors.predicted_error`): seven times 512 noisy frames take four times as long.
+    (:func:`mitsim.reconstruct.factors.predicted_error`): seven times 512 noisy frames take four times as long.
 
     Parameters
     ----------

@@ -42,8 +42,7 @@ from mitsim.light.grids import LightEstimate
 from mitsim.light.light import SampledLight
 from mitsim.metrics import psnr
 from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.reconstruct.background import separate
-from mitsim.reconstruct.focus import FactorOfDepths, parallax_of
+from mitsim.reconstruct.focus import FactorOfDepths, parallax_of, separate
 from mitsim.reconstruct.solution import Solution
 from mitsim.reconstruct.solver import Accumulator, Prepared
 from mitsim.report import EQUAL_PEAK, RENDERED

@@ -24,8 +24,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.prepare import CommonFactor, Preparer
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import SensorModel
-from mitsim.reconstruct.known_frames import plane_offsets
-from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes
+from mitsim.reconstruct.shifted_codes import Codes, Exposure, Pose, Shape, find_pose, fit_codes, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.sensor.chain import expose
 

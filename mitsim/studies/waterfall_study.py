@@ -42,8 +42,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import load_recipe
 from mitsim.metrics import psnr
-from mitsim.reconstruct.estimate_factors import Estimate, factors_of_sums, stripe_sums
-from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.factors import Estimate, Factors, factors_of_sums, stripe_sums
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene

@@ -23,7 +23,7 @@ from mitsim.core.exr import write_frame
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.estimate_factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
+from mitsim.reconstruct.factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report.reconstruct_run import reconstruct
 from tests.robustness import Recorder

@@ -180,20 +180,6 @@ def test_rounding_is_bounded_or_flagged(measured: Recorder, exponent: int) -> No
         assert again.ok and again.rounding < ROUNDING_LIMIT
 
 
-def test_gram_is_flagged_where_the_default_is_not() -> None:
-    """lambda_rel 1e-15: eps / lambda_rel leaves the Gram matrix no two digits; the default has six."""
-    factor, one, image = spread(1e5), np.ones((8, 1)), np.random.default_rng(0).random((8, 8))
-    found = {}
-    for method in ("svd", "gram"):
-        prepared = prepare(factor, factor, one, one, method=method)
-        sums = summed(prepared, frames_of(factor, factor, one, one, image))
-        found[method] = prepared.solve(sums, 1e-15)
-        check_ending(str(found[method].status), prepared)
-    assert found["svd"].ok and found["svd"].rounding < 1e-6
-    assert not found["gram"].ok and "raise lambda above 2.4e-12" in str(found["gram"].status)
-    assert np.linalg.norm(found["gram"].image - found["svd"].image) < found["gram"].rounding * np.linalg.norm(image)
-
-
 def test_the_report_s_numbers_are_json() -> None:
     """An infinite condition becomes null, as JSON has no infinity; the status still says inf."""
     from mitsim.core.files import plain

@@ -82,20 +82,18 @@ def gate(relative: float) -> float:
 # ---- how many digits -------------------------------------------------------------------------------------------------
 
 
-def digits_table() -> list[tuple[float, float, float, float]]:
-    """(lambda_rel, error of svd, of gram, of the paper's plain Gram form); n = 8, m = 16, cond(Phi) = 1e4 each side."""
+def digits_table() -> list[tuple[float, float, float]]:
+    """(lambda_rel, error of the solver, of the paper's plain Gram form); n = 8, m = 16, cond(Phi) = 1e4 each side."""
     one, image = np.ones((8, 1)), np.random.default_rng(3).random((8, 8))
     left, right = (with_spectrum(np.geomspace(1, 1e-4, 8), 16, seed) for seed in (1, 2))
     frames = frames_of(left, right, one, one, image)
     exact = Exact(left, right, one, one, frames)
     rows = []
     for relative in (*LAMBDAS, 0.0):
-        found = [solved(left, right, one, one, frames, relative, **form) for form in ({}, {"method": "gram"})]
-        answer = exact.image(found[0].lam)
-        plain = plain_gram(left, right, frames[0, 0], found[0].lam)
-        rows.append(
-            (relative, *map(exact.error, found), float(np.linalg.norm(plain - answer) / np.linalg.norm(answer)))
-        )
+        found = solved(left, right, one, one, frames, relative)
+        answer = exact.image(found.lam)
+        plain = plain_gram(left, right, frames[0, 0], found.lam)
+        rows.append((relative, exact.error(found), float(np.linalg.norm(plain - answer) / np.linalg.norm(answer))))
     return rows
 
 
@@ -108,21 +106,19 @@ def plain_gram(left: np.ndarray, right: np.ndarray, frame: np.ndarray, lam: floa
 
 def test_digits_at_every_lambda(measured: Recorder) -> None:
     """The default stays below the gate 10 eps / sqrt(lambda_rel); cond(Phi) is 1e4 a side, the judge has 50 digits."""
-    for relative, svd, _, _ in digits_table():
+    for relative, svd, _ in digits_table():
         # lambda = 0: the condition of both sides together, 1e4 * 1e4, magnifies eps.
         measured(svd, at_most=gate(relative) if relative else 10 * EPS * 1e8, what=f"{relative:.0e}")
 
 
 def test_gram_matrices_lose_twice_as_many_digits(measured: Recorder) -> None:
-    """By `method="gram"` and by the paper's plain form, and at lambda = 0 the image; no worse than eps / lambda_rel."""
+    """By the paper's plain form, and at lambda = 0 the image; no worse than eps / lambda_rel."""
     rows = digits_table()
-    for _, _, gram, plain in rows[-1:]:
-        measured(gram, at_least=1e-3, what="gram at 0")
-        measured(plain, at_least=1e-3, what="plain at 0")
-    for relative, _, gram, plain in rows[:-1]:
-        assert gram < 10 * EPS / relative and plain < 10 * EPS / relative, "and no worse than eps / lambda_rel"
-    for _, svd, gram, plain in rows[3:]:  # lambda_rel of 1e-8 and below
-        assert gram > 100 * svd and plain > 100 * svd
+    measured(rows[-1][2], at_least=1e-3, what="plain at 0")
+    for relative, _, plain in rows[:-1]:
+        assert plain < 10 * EPS / relative, "and no worse than eps / lambda_rel"
+    for _, svd, plain in rows[3:]:  # lambda_rel of 1e-8 and below
+        assert plain > 100 * svd
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -245,9 +241,8 @@ def test_negative_eigenvalues_of_a_gram_matrix(measured: Recorder) -> None:
         denominators = np.outer(values, values) / values.max() ** 2 + kind(relative)
         assert denominators.min() < 0 < denominators.max()
     one = np.ones((128, 1))
-    for method in ("svd", "gram"):
-        side = prepare(phi, phi, one, one, method=method).left
-        assert (side.singular >= 0).all() and 10 < side.rank < 128
+    side = prepare(phi, phi, one, one).left
+    assert (side.singular >= 0).all() and 10 < side.rank < 128
 
 
 def test_a_plain_gram_solution_breaks_where_the_default_does_not(measured: Recorder) -> None:

@@ -7,10 +7,10 @@ over prints. So there are PRINTS prints of SESSIONS sessions each, 200 in all. T
 well.
 
 Expectation: print within a pixel is stated as that of prints that may have hard edges or none, `detail.PRINT` = 1.95
-times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.subpixel`). With v^2 = u^2 - (1
-- 1 / PRINT) print^2, normal errors lie within 1.96 u in erf(1.96 u / v / sqrt 2) of the pixels: 95.2 to 97.6 % by print
-and patterns, and 95 % where nothing is print. (Held against 93 to 97 %, one print of `dots:2` had 97.004 %: 96.8 were
-to be expected.)
+times the energy of the ramps that these smooth prints are made of (`mitsim.reconstruct.accumulation`). With v^2 = u^2
+- (1 - 1 / PRINT) print^2, normal errors lie within 1.96 u in erf(1.96 u / v / sqrt 2) of the pixels: 95.2 to 97.6 % by
+print and patterns, and 95 % where nothing is print. (Held against 93 to 97 %, one print of `dots:2` had 97.004 %: 96.8
+were to be expected.)
 
 Chance: shared errors have some 16 independent places in 16 x 16 smooth pixels, so their variance scatters by sqrt(2 /
 16) = 35 % from print to print. They are a quarter of v^2: 4.4 % of v, which moves coverage by 0.17 of that, 0.76 %;
@@ -39,9 +39,9 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.session import load_recipe
+from mitsim.reconstruct.accumulation import PRINT
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.subpixel import PRINT
 from mitsim.reconstruct.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from mitsim.calibrate.lit_session import LitSession
 from mitsim.calibrate.session_plan import PredictedSession
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
-from mitsim.reconstruct.estimate_factors import Estimate
+from mitsim.reconstruct.factors import Estimate
 from tests.unit.calibrate.test_responses import lit_session
 
 SEEDS, DRAWS = 120, 480

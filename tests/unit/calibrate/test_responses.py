@@ -29,7 +29,7 @@ from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.optics.frames import Frame
 from mitsim.reconstruct.captured_session import Ladder, calibrate_frames
-from mitsim.reconstruct.estimate_factors import Estimate
+from mitsim.reconstruct.factors import Estimate
 from mitsim.sensor.chain import Digital
 
 SENSOR = SensorModel(

@@ -33,8 +33,7 @@ from mitsim.optics.frames import mixes
 from mitsim.optics.shadow import scene_factor
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.captured_session import calibrate_frames
-from mitsim.reconstruct.estimate_factors import Estimate
-from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.factors import Estimate, Factors, load_calibration
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "other_kernels")
 N = 16

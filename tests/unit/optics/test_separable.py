@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import hadamard
 
 from mitsim.optics.terms import best_term, centre_terms, lacking, relative_difference
-from mitsim.reconstruct.estimate_factors import estimate_factors
+from mitsim.reconstruct.factors import estimate_factors
 
 Terms = list[tuple[np.ndarray, np.ndarray]]
 

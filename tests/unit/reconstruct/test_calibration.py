@@ -8,7 +8,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.estimate_factors import (
+from mitsim.reconstruct.factors import (
     AmbientLight,
     StripeSums,
     _rank_one_split,

@@ -8,11 +8,18 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.accumulation import accumulate
+from mitsim.reconstruct.accumulation import (
+    LitFrame,
+    Model,
+    accumulate,
+    disagreement,
+    factor_slope,
+    offset_responses,
+    print_part,
+)
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.subpixel import LitFrame, Model, disagreement, factor_slope, offset_responses, print_part
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import PITCH, PIXELS, Bench, N, shadow
 

@@ -12,8 +12,7 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.estimate_factors import estimate_factors
-from mitsim.reconstruct.factors import Factors, load_calibration
+from mitsim.reconstruct.factors import Factors, estimate_factors, load_calibration
 from mitsim.reconstruct.solution import Status, Verdict
 
 N, ROWS, COLUMNS = 12, 20, 17

@@ -402,7 +402,7 @@ def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: boo
     """Depth moves rows by less than a pixel here, and their dots' shadows span little."""
     level = replace(calibrated(), manifest=calibrated().manifest.model_copy(update={"parallax": LEVEL}))
     run, ends = shots(400.0, patterns), (-2e-4, 2e-4)
-    groups = tuple(group_pixels(each, "auto") for each in run.patterns)
+    groups = tuple(group_pixels(each) for each in run.patterns)
     one, each = CommonBasis(run, level, ends), CommonBasis(run, level, ends, (groups[0], groups[1]))
     assert (each.stack.shape[1] < one.stack.shape[1] / 2) == own
     for shift in (-2e-4, -0.7e-4, 0.0, 1.3e-4):

@@ -21,8 +21,7 @@ from mitsim.core.manifests import Digital
 from mitsim.core.prepare import Preparer
 from mitsim.core.spectral_manifests import CALIBRATION, read_colours
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.known_frames import _differences_of_turned, plane_offsets
-from mitsim.reconstruct.shifted_codes import TURNS
+from mitsim.reconstruct.shifted_codes import TURNS, _differences_of_turned, plane_offsets
 from mitsim.reconstruct.solution import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
 

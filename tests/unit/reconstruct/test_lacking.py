@@ -11,11 +11,10 @@ import pytest
 
 from mitsim.core.exr import read_frame
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.accumulation import Lack, accumulate
+from mitsim.reconstruct.accumulation import Lack, Model, accumulate
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.subpixel import Model
 from tests.ideal_sessions import Bench, picture, shadow
 
 SECOND = 0.05 * shadow()[::-1], shadow()[::-1]

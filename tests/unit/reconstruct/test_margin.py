@@ -13,8 +13,8 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.background import Margin
 from mitsim.reconstruct.factors import Factors
+from mitsim.reconstruct.focus import Margin
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_focus import PARALLAX, WINDOW, N, shadow

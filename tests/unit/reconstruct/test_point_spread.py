@@ -15,10 +15,13 @@ from scipy.optimize import lsq_linear, nnls
 from mitsim.core.errors import MitsimError
 from mitsim.reconstruct.point_spread import (
     ShiftedLight,
+    automatic_prior,
+    find_fit,
+    frame_error,
+    frame_noise,
     minimise,
     reduce_frame,
 )
-from mitsim.reconstruct.point_spread_fit import automatic_prior, find_fit, frame_error, frame_noise
 from mitsim.reconstruct.point_spread_image import solve_point_spread
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solvers import Prior

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution
@@ -103,12 +102,10 @@ def test_the_covariance_is_that_of_a_first_order_markov_field() -> None:
     assert precision == pytest.approx(exact, abs=1e-9)
 
 
-def test_equal_sides_are_factorised_once_and_gram_is_refused() -> None:
+def test_equal_sides_are_factorised_once() -> None:
     factor, lit = np.random.default_rng(0).random((9, 5)), np.ones((5, 1))
     found = prepare(factor, factor, lit, lit).with_correlation()
     assert found.left is found.right and found.left.slabs[0].matrix.shape == (9, 5)
-    with pytest.raises(MitsimError, match="prepare by svd"):
-        prepare(factor, factor, lit, lit, method="gram").with_correlation()
 
 
 def test_rounding_is_told_by_the_covariance_too() -> None:

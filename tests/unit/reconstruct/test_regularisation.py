@@ -13,7 +13,7 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulation import accumulate
-from mitsim.reconstruct.regularisation import (
+from mitsim.reconstruct.solver import (
     RISK_POWER,
     DiagonalProblem,
     _least,
@@ -22,9 +22,9 @@ from mitsim.reconstruct.regularisation import (
     end_of_range,
     is_misfit,
     noise_variance,
+    prepare,
     risk_score,
 )
-from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.solvers import solve_tv
 from tests.ideal_sessions import PIXELS, Bench, shadow
 

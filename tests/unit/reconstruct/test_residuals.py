@@ -9,11 +9,10 @@ from mitsim.core.manifests import Digital, FactorNoise, Patterns
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import misfit, residuals
-from mitsim.reconstruct.accumulation import FrameNoise, factor_energy
+from mitsim.reconstruct.accumulation import FrameNoise, LitFrame, LitFrames, Model, factor_energy, orthonormal
 from mitsim.reconstruct.misfit import weigh
 from mitsim.reconstruct.residuals import NoiseTest, Residuals
 from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.subpixel import LitFrame, LitFrames, Model, orthonormal
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import bench
 from tests.unit.reconstruct.test_factors import N, factors

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.background import Separation, separate
+from mitsim.reconstruct.focus import Separation, separate
 from mitsim.reconstruct.solver import Prepared, prepare
 from tests.ideal_sessions import picture, shadow
 

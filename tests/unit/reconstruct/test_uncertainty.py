@@ -13,12 +13,10 @@ from scipy.fft import idctn
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, FactorNoise
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.accumulation import accumulate
+from mitsim.reconstruct.accumulation import EDGES, PRINT, Model, accumulate, print_energy
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-from mitsim.reconstruct.regularisation import DiagonalProblem, automatic_lambda
-from mitsim.reconstruct.solver import prepare
-from mitsim.reconstruct.subpixel import EDGES, PRINT, Model, print_energy
+from mitsim.reconstruct.solver import DiagonalProblem, automatic_lambda, prepare
 from mitsim.reconstruct.uncertainty import Propagation, _cosines, scene_spectrum, uncertainty
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, bench, picture, shadow
 

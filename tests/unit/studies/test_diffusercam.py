@@ -10,14 +10,15 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import load_sensor
 from mitsim.metrics import psnr
-from mitsim.reconstruct.convolution import Classes, ConvolutionalCamera
+from mitsim.reconstruct.convolution import Classes
+from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.report import CONVENTIONS
 from mitsim.studies.convolutional_study import best_image, race, take
 
 N = 12
 SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
 BLUR = np.exp(-np.square(np.arange(-8, 9) / 1.5) / 2)
-CAMERA = ConvolutionalCamera(np.outer(BLUR, BLUR) / BLUR.sum() ** 2, N, (22, 25))
+CAMERA = ShiftedLight.of(np.outer(BLUR, BLUR) / BLUR.sum() ** 2, N, (22, 25))
 TRUTH = np.random.default_rng(2).uniform(0.1, 0.9, (N, N))
 
 
@@ -30,8 +31,8 @@ def test_exposure_follows_the_convention_and_noise_the_light(convention: str) ->
     """
     family = parse_patterns("dots:3", N)
     shots = take(CAMERA, family, TRUTH, SENSOR, convention)
-    own = np.stack(list(CAMERA.frames(family, TRUTH)))
-    uniform = next(CAMERA.frames(parse_patterns("uniform", N), TRUTH))
+    own = CAMERA.under(family).image_of(TRUTH)
+    uniform = CAMERA.image_of(TRUTH)
     peak = own.max() if convention == "equal peak" else uniform.max()
     electrons = own * 0.8 * 4 * 32360 / peak / (9 if convention == "equal total" else 1)
     unit = electrons.max() / own.max()
@@ -60,8 +61,8 @@ def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
 def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None, k: int) -> None:
     """On all light, where the direct solver iterates on small grids, and cropped, where it factorises; under uniform
     light, where lambda matters, and dots. (Planted: lambda doubled for one of them.)"""
-    camera = ConvolutionalCamera(CAMERA.psf, N, sensor)
-    whole = ConvolutionalCamera(CAMERA.psf, N)
+    camera = ShiftedLight.of(CAMERA.psf, N, sensor)
+    whole = ShiftedLight.of(CAMERA.psf, N)
     found = race(Classes(camera, k), Classes(whole, k), TRUTH, SENSOR, 0)
     assert found["difference"] <= 1e-6
     assert 0 < found["iterations"] <= found["iterations_exact"]

@@ -12,7 +12,7 @@ from mitsim.devices.projector import Spectrum
 from mitsim.metrics import relative_error
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
-from mitsim.reconstruct.estimate_factors import estimate_factors
+from mitsim.reconstruct.factors import estimate_factors
 from mitsim.report import lit_scene
 from mitsim.report.lit_scene import IdealCamera
 from mitsim.sensor.chain import electrons_from_irradiance

@@ -14,8 +14,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import Preparation
-from mitsim.reconstruct.known_frames import plane_offsets
-from mitsim.reconstruct.shifted_codes import Codes, Side
+from mitsim.reconstruct.shifted_codes import Codes, Side, plane_offsets
 from mitsim.reconstruct.solver import centre_frame
 from mitsim.studies.twin_capture import Learned, Measured, Recipe, draw_noise, noise_of, read_captures
 from mitsim.studies.twin_files import TwinFiles
