@@ -150,7 +150,7 @@ class Diagonal:
     @classmethod
     def of(cls, prepared: Prepared, like: Tensor) -> Diagonal:
         def slabs(side: Side) -> FloatArray:
-            stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), side.accumulated_size))
+            stack = np.zeros((side.pattern_count, -(-side.sensor_size // BIN), len(side.singular)))
             for whole, slab in zip(stack, side.slabs, strict=True):
                 whole[:, slab.columns] = _bin(slab.matrix)
             return stack

@@ -173,13 +173,14 @@ class _NumberRow:
 
 _FALLOFF = "falloff, gloss and parallax"
 _FOLLOWED = "light over several surfaces, in mirrors and of lamps"
+_CELLS = "{n}x{n} cells of even light"
 _HIDDEN = "{hidden} projector pixels are hidden from part of the sensor"
 _NUMBERS = (
     _NumberRow("anchors", f"{_FALLOFF} over the sensor: one anchor", f"{_FALLOFF}: {{n}}x{{n}} anchors",
                {"anchors": 1, "occluded_anchors": 1}),
     _NumberRow("layers", "the light is seen at {depth:.1f} mm; one layer",
                "the light is seen from {near:.0f} to {far:.0f} mm; {n} layers", {"layers": ()}),
-    _NumberRow("cells", *["{n}x{n} cells of even light a projector pixel"] * 2),
+    _NumberRow("cells", f"{_CELLS} a projector pixel", f"{_CELLS} a projector pixel"),
     _NumberRow("followed_anchors", f"{_FOLLOWED}: one point",
                f"{_FOLLOWED}: {{n}}x{{n}} in cells of {{width}}x{{width}} pixels", {"followed_anchors": 1},
                "no light over several surfaces, in mirrors or of lamps is followed"),

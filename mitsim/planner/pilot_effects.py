@@ -170,7 +170,7 @@ class AnchorRuns:
 
     def _simulation(self, anchors: int = 1, cells: int = 1, layers: tuple[float, ...] = ()) -> Simulation:
         changes: dict[str, Any] = {"coarse_layers": True, "layers": layers} if layers else {}
-        settings = replace(self.base, **changes, **{self._pass.anchors: anchors})
+        settings = replace(self.base, **changes | {self._pass.anchors: anchors})
         return self.sample.simulation(self.bench, settings, one_line=True, judging_cells=cells)
 
     def _grids(self, simulation: Simulation) -> list[Grid]:

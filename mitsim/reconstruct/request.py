@@ -169,8 +169,7 @@ class ImageRequest(Options):
         return self.focus in ("auto", "map")
 
     def check_point_spread(self, reduce: int) -> None:
-        """Refuse options that an image by a point spread function does not have, and a ``reduce`` that is no number of
-        pixels."""
+        """Refuse options that a point spread function does not have, and a ``reduce`` that is no number of pixels."""
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:
             raise ArgumentError("reduce", f"{reduce}: give a whole number, 1 to {MOST_REDUCED}")
         for name, neutral in (("focus", None), ("margin", 0)):
