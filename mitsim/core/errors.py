@@ -109,7 +109,7 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     several = {name for name, each in signature.parameters.items() if each.kind in _SEVERAL}
     kinds = {
         name: _kinds(each.annotation, function)
-        if isinstance(each.annotation, str) and each.kind != inspect.Parameter.VAR_KEYWORD
+        if isinstance(each.annotation, str) and not each.annotation.startswith("Unpack")
         else []
         for name, each in signature.parameters.items()
     }
@@ -117,11 +117,12 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
         for name, bound in signature.bind(*arguments, **named).arguments.items():
-            allowed = kinds[name]
-            for value in bound if name in several else (bound,):
+            allowed, keywords = kinds[name], name in several and isinstance(bound, dict)
+            given = bound.items() if keywords else [(name, each) for each in (bound if name in several else (bound,))]
+            for told, value in given:
                 if allowed and not any(allows(value) for _, allows in allowed):
                     words = " or ".join(dict.fromkeys(words for words, _ in allowed))
-                    raise ArgumentError(name, f"{short_text(value)}: give {words}")
+                    raise ArgumentError(told, f"{short_text(value)}: give {words}")
         plain = {name: plain_number(value) for name, value in named.items()}
         return function(*map(plain_number, arguments), **plain)  # type: ignore[arg-type]
 

@@ -365,7 +365,7 @@ TYPOS = (
     (["plan", "photograph", "--variant", "llvm_ad_grey"], "llvm_ad_grey"),
     (["plan", "photograph", "-D", "mask"], "NAME=VALUE"),
     (["plan", "photograph", "-D", "camera=x"], "camera=x"),
-    (["plan", "photograph", "--seed", "-1"], "seed: got -1"),
+    (["plan", "photograph", "--seed", "-1"], "seed got -1"),
     (["plan", "photograph", "--patterns", "dost:7"], "dost:7"),
     (["plan", "nosuch.xml"], "nosuch.xml"),
     (["demo", "photogaph"], "did you mean photograph?"),

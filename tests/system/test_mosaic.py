@@ -146,7 +146,7 @@ def test_a_run_behind_filters_goes_on_and_comes_apart(
             ("--colour", "mosaic", "--camera", "imx249"),
             "imx249.toml has no mosaic of colour filters; give one",
         ),
-        ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use --colour mosaic"),
+        ("capture", ("--colour", "lines", "--camera", "ov5647", "--patterns", "dots:2"), "use colour mosaic"),
         (
             "capture",
             ("--colour", "no", "--camera", "ov5647", "--patterns", "dots:2"),

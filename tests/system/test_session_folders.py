@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mitsim.report.quality import reconstruct_colours
 
 import mitsim as ms
 from mitsim.core.exr import read_frame, write_frame
+from mitsim.report.reconstruct_run import reconstruct_colours
 from tests.coloured import folders
 
 IMAGE: dict[str, Any] = {"run": "run", "calibration": "calibration"}

@@ -373,7 +373,7 @@ def test_a_sessions_list_says_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(MitsimError, match=r"f_3\.png is listed, but no file of that name is there; did you mean"):
         load_frames(folder)
     write_list(folder, frames=[{"file": "frames/f_0.png", **shown[0]}])
-    with pytest.raises(MitsimError, match=r"frames\.0\.file: got 'frames/f_0.png'; give text without / and"):
+    with pytest.raises(MitsimError, match=r"frames\.0\.file: got 'frames/f_0.png'; give a name without folders"):
         load_frames(folder)
     write_list(folder, prepare={"channel": "gr", "orientation": "file"})
     with pytest.raises(MitsimError, match="prepare: orientation 'file' would exchange the mosaic's colours"):

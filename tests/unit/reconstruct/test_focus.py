@@ -292,11 +292,11 @@ def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
 @pytest.mark.parametrize(
     ("depth_range", "focus", "fragment"),
     [
-        ((450.0, 350.0), "auto", "nearer one first"),
+        ((450.0, 350.0), "auto", "smaller one first"),
         ((-1.0, 350.0), "auto", "above 0"),
         ((350.0, np.inf), "auto", "two depths"),
-        ((350.0,), "map", "two depths"),
-        ("ab", "auto", "give two depths"),
+        ((350.0,), "map", "two numbers"),
+        ("ab", "auto", "give two numbers"),
         ((350.0, np.nan), "auto", "two depths"),
         ((350.0, 450.0), None, "focus auto or map"),
         ((350.0, 450.0), 400.0, "focus auto or map"),

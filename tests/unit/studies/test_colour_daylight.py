@@ -128,7 +128,7 @@ def test_claims_say_up_to_which_illuminance_they_hold() -> None:
 
 def test_tables_have_every_illuminance_and_what_it_takes() -> None:
     ladder, needed = colour_study.ladder_tables(rows_of(2.0, 30.0))
-    assert [row[0] for row in ladder.rows] == ["0", "60", "600"] and len(ladder.headings) == 7
+    assert [row[0] for row in ladder.rows] == ["0", "60", "600"] and len(ladder.head) == 7
     assert ladder.rows[2][1:4] == ("6.00 \N{PLUS-MINUS SIGN} 0.01", "6.00 \N{PLUS-MINUS SIGN} 0.01", "5.00")
     assert "of 2 exposures" in ladder.title
     assert needed.rows[0] == ("49 dots", "30", "30", "3; 2", "3; 20")

@@ -88,7 +88,7 @@ def test_every_figure_is_drawn() -> None:
 def test_the_page_has_every_patch() -> None:
     """By patch: floor, truth and three families; images 2 % too bright are off the truth's, which is the floor's."""
     ways, ladder, needed, patches = colour_study._tables(results(own=1.02, one=1.3, dim=1.02, bright=1.3, joint=1.01))
-    assert patches.headings == ("Patch", "Floor", "Truth", "Uniform", "49 dots", "64 Hadamard")
+    assert patches.head == ("Patch", "Floor", "Truth", "Uniform", "49 dots", "64 Hadamard")
     assert [row[0] for row in patches.rows] == ["mean of 24", *chart().names]
     assert all(row[1] == row[2] and row[3] == row[4] for row in patches.rows)
     assert patches.rows[0][1] == "4.37" and float(patches.rows[0][4]) != 4.37

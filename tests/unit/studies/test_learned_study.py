@@ -212,7 +212,7 @@ def test_the_page_is_drawn_of_all_and_of_a_few() -> None:
     experiment = find_experiment("learned")
     results = Results(Table(tuple(rows(lambda *_: 0.0))))
     tables = experiment.tables(results)
-    assert all(len(row) == len(table.headings) for table in tables for row in table.rows)
+    assert all(len(row) == len(table.head) for table in tables for row in table.rows)
     psnr, gain = ({row[0]: row[1:] for row in table.rows} for table in tables[:2])
     assert psnr["refined (rendered)"][1].startswith("27.0")
     assert gain["refined (rendered)"][1] == "+0.0 \N{PLUS-MINUS SIGN} 0.1, 0.0"
