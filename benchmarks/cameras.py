@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from mitsim.core.configuration import shipped_path
-from mitsim.devices.flatlist import Procedure
 from mitsim.devices.sensor import SensorModel, load_sensor
 from mitsim.studies.characterise import Row, characterise
+from mitsim.studies.emva_options import Procedure
 
 SHOWN = {"system_gain": "K [DN/e-]", "quantum_efficiency": "eta", "dark_noise": "sigma_d [e-]", "full_well": "F [e-]"}
 """Figures that have a column of their own."""
@@ -51,8 +51,7 @@ def main() -> int:
     for name, sensor in cameras().items():
         done = characterise(sensor, procedure)
         rows = {row.name: row for row in done.rows}
-        off = {row.name: row.deviations for row in done.rows}
-        off |= {row.name: row.deviations for row in done.fields if row.deviations is not None}
+        off = {row.name: row.deviations for row in (*done.rows, *done.fields) if row.deviations is not None}
         worst = max(off, key=lambda figure: abs(off[figure]))
         cells = " | ".join(cell(rows.get(figure)) for figure in SHOWN)
         print(f"| `{name}` | {cells} | {len(off)} | {abs(off[worst]):.1f} | `{worst}` |", flush=True)
