@@ -330,7 +330,8 @@ def test_a_saturated_capture_is_flagged(call: Callable[..., Any], lab: Any, tmp_
 def test_an_under_determined_image_is_flagged(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
     # 12 sensor rows cannot tell 16 scene rows apart under one pattern.
     scene = lab.write_scene("few", pixels=12)
-    assert call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform").code == 0
+    captured = call("capture", scene, *lab.electronics, "-o", tmp_path / "run", "--patterns", "uniform")
+    assert captured.code == 1 and "noise cannot be told from the image" in captured.err
     assert call("calibrate", scene, *lab.electronics, "-o", tmp_path / "cal").code in (0, 1)
     outcome = call("reconstruct", tmp_path / "run", "--calibration", tmp_path / "cal", "--json", "--lambda", "1")
     assert outcome.code == 1
