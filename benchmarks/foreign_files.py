@@ -310,7 +310,7 @@ def read_picture(path: Path, right: dict[str, Any]) -> Iterator[tuple[str, Calla
 
     from mitsim.acquire.sense import read_image
     from mitsim.core.images import read_images
-    from mitsim.core.reflectance import read_reflectance
+    from mitsim.core.prepare import read_reflectance
     from mitsim.scene.load import load_scene
 
     codes, most = np.load(f"{path}.npy").astype(float), right["most"]

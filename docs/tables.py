@@ -19,14 +19,16 @@ from mitsim.core.manifests import (
     AmbientFile,
     CalibrationManifest,
     ClosingFile,
+    ColourManifest,
     Digital,
     FactorNoise,
+    Line,
+    MosaicManifest,
     Parallax,
     Patterns,
     RunManifest,
     ShotFile,
 )
-from mitsim.core.spectral_manifests import ColourManifest, Line, MosaicManifest
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.framelist import DarkFile, FrameList, StripeFile

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mitsim.core.job import Clock as Clock
     from mitsim.core.job import Job as Job
     from mitsim.core.job import Limits as Limits
-    from mitsim.core.progress import progress as progress
+    from mitsim.core.job import progress as progress
     from mitsim.core.runs import Capture as Capture
     from mitsim.core.runs import MosaicCapture as MosaicCapture
     from mitsim.core.runs import load_mosaic as load_mosaic
@@ -81,8 +81,7 @@ _HOMES = {
         "calibrate.model": "calibrate_model",
         "calibrate.session_plan": "CalibrationPlan plan_calibration",
         "core.errors": "ArgumentError MitsimError",
-        "core.job": "Clock Job Limits",
-        "core.progress": "progress",
+        "core.job": "Clock Job Limits progress",
         "core.runs": "Capture MosaicCapture load_mosaic load_run",
         "devices.session": "Modelling load_recipe",
         "exchange.formats": "export import_file import_frames pattern_pictures",

@@ -32,13 +32,27 @@ from mitsim.bench.request import (
     check_image,
     family_of,
 )
-from mitsim.core.configuration import CAMERA, load_model, locate, opening_words, shipped_files
+from mitsim.core.configuration import (
+    CAMERA,
+    LIMITS,
+    OUTPUT,
+    QUALITY,
+    WHAT,
+    FilePath,
+    Options,
+    load_model,
+    locate,
+    opening_words,
+    option,
+    shipped_files,
+    takes,
+    validated_by,
+)
 from mitsim.core.environment import DEFAULT_VARIANT, Check
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.job import Job
-from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, FilePath, Options, option, takes, validated_by
-from mitsim.core.spectral_manifests import BANDS, LINES, RUN, bands_of
-from mitsim.core.spectral_manifests import MOSAIC as MOSAIC_RUN
+from mitsim.core.manifests import BANDS, LINES, RUN, bands_of
+from mitsim.core.manifests import MOSAIC as MOSAIC_RUN
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe

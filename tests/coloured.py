@@ -9,10 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsim.core.manifests import AmbientFile, Digital, Patterns, RunManifest
-from mitsim.core.recorders import AMBIENT, Recorder, frame_name
-from mitsim.core.runs import Capture, LineTruth, MosaicCapture
-from mitsim.core.spectral_manifests import MosaicManifest
+from mitsim.core.manifests import AmbientFile, Digital, MosaicManifest, Patterns, RunManifest
+from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, frame_name
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.colour import chart

@@ -19,7 +19,7 @@ from mitsim.core.manifests import (
     RunManifest,
     ShotFile,
 )
-from mitsim.core.recorders import AMBIENT, CLOSING, claim_run, frame_name
+from mitsim.core.runs import AMBIENT, CLOSING, claim_run, frame_name
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.solution import Status, Verdict
 

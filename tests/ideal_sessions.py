@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mitsim.core.manifests import CalibrationManifest, Digital, FactorNoise, Patterns, RunManifest
-from mitsim.core.recorders import Recorder, frame_name
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns

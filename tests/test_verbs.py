@@ -22,8 +22,8 @@ import mitsim as ms
 from mitsim.bench import request
 from mitsim.bench.request import Request
 from mitsim.cli.commands import message_of
+from mitsim.core.configuration import Options
 from mitsim.core.errors import ArgumentError
-from mitsim.core.options import Options
 from mitsim.exchange.capture_list import FrameKeys
 from mitsim.exchange.formats import ExportKeys, PictureKeys
 from mitsim.learn.pair_request import PairKeys

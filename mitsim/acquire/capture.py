@@ -29,17 +29,25 @@ from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.feasibility import obstacles
 from mitsim.bench.request import Request, Task
+from mitsim.core.configuration import takes
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, check_arguments, cut
 from mitsim.core.exr import Channel
 from mitsim.core.files import FRAMES, output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import ClosingFile, Patterns, RunHead, RunManifest
-from mitsim.core.options import takes
+from mitsim.core.manifests import (
+    MOSAIC,
+    RUN,
+    ClosingFile,
+    ColourManifest,
+    MosaicManifest,
+    Patterns,
+    RunHead,
+    RunManifest,
+    write_colours,
+)
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.recorders import AMBIENT, CLOSING, Recorder, claim_run, frame_name
-from mitsim.core.runs import Capture, LineTruth, MosaicCapture
-from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, MosaicManifest, write_colours
+from mitsim.core.runs import AMBIENT, CLOSING, Capture, LineTruth, MosaicCapture, Recorder, claim_run, frame_name
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import load_recipe

@@ -22,8 +22,8 @@ from mitsim.acquire.spectral import SpectralBench, line_alone, plan_request
 from mitsim.bench.apparatus import Apparatus, Opened, reopen
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
+from mitsim.core.manifests import BANDS, LINES, MONO, MOST_LINES, RUN, bands_of, check_undecided, spectral_of
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import BANDS, LINES, MONO, MOST_LINES, RUN, bands_of, check_undecided, spectral_of
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Lines
 from mitsim.light.cost_model import traced_for

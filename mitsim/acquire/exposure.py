@@ -16,7 +16,7 @@ from mitsim.core.exr import Channel
 from mitsim.core.job import Job
 from mitsim.core.manifests import MOST_SHOTS, AmbientFile
 from mitsim.core.parallel import Behind, in_threads
-from mitsim.core.recorders import AMBIENT, Recorder
+from mitsim.core.runs import AMBIENT, Recorder
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import Devices
 from mitsim.devices.patterns import PatternFamily, Shot

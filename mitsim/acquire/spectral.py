@@ -29,8 +29,8 @@ from mitsim.bench.feasibility import obstacles
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.manifests import MOSAIC, MOST_LINES, ColourManifest, Line, MosaicManifest, spectral_of
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import MOSAIC, MOST_LINES, ColourManifest, Line, MosaicManifest, spectral_of
 from mitsim.devices.lamps import SPECTRA_NM, Band, CountedLamps, Response, line_units
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.projector import Lines, Spectrum

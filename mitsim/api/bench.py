@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
 from mitsim.bench.request import Request, SessionRequest, Task
+from mitsim.core.configuration import takes
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, check_arguments, is_masked
 from mitsim.core.job import Job
-from mitsim.core.options import takes
 
 # What needs numpy, or the renderer, is imported where it is used: what opens a bench refuses a misspelt name first.
 if TYPE_CHECKING:

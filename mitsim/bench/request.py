@@ -15,15 +15,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from mitsim.bench.effects import check_switches, parse_switches
-from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate
+from mitsim.core.configuration import (
+    CAMERA,
+    DEVICES,
+    LIMITS,
+    PROJECTOR,
+    QUALITY,
+    FilePath,
+    Options,
+    load_model,
+    locate,
+    option,
+    shipped_names,
+    validated_by,
+)
 from mitsim.core.environment import DEFAULT_VARIANT, check_variant
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
 from mitsim.core.files import check_plain
 from mitsim.core.job import Job
-from mitsim.core.manifests import MOST_SHOTS
-from mitsim.core.options import DEVICES, LIMITS, QUALITY, FilePath, Options, option, shipped_names, validated_by
+from mitsim.core.manifests import BANDS, LINES, MOST_SHOTS, bands_of, check_undecided, spectral_of
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import BANDS, LINES, bands_of, check_undecided, spectral_of
 from mitsim.core.worker import pause_collector
 from mitsim.devices.patterns import pattern_names, read_name
 from mitsim.devices.sensor import EXPOSURE_FRACTION, EXPOSURE_S, SensorModel, load_sensor

@@ -33,10 +33,9 @@ from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import output_folder, whole_folder
 from mitsim.core.job import Cost, Job, Limits
-from mitsim.core.manifests import CalibrationManifest
+from mitsim.core.manifests import CALIBRATION, CalibrationManifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import CALIBRATION
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight

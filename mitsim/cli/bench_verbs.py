@@ -35,9 +35,9 @@ from mitsim.cli.screen import (
     plan_lines,
     total_of_lines,
 )
+from mitsim.core.configuration import LIMITS, OUTPUT, QUALITY, WHAT, Options, option, refuse_unused
 from mitsim.core.errors import MitsimError
-from mitsim.core.options import LIMITS, OUTPUT, QUALITY, WHAT, Options, option, refuse_unused
-from mitsim.core.spectral_manifests import MONO, RUN
+from mitsim.core.manifests import MONO, RUN
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.learn.pair_request import PairOptions

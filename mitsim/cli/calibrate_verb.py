@@ -16,9 +16,9 @@ import typer
 from mitsim.bench.request import NO, Exposure, FixedColour, Opening, Request, SessionRequest, Task
 from mitsim.cli.commands import Common, LimitedPictured, Resumed, check_work, complete_scene, option_name, verb
 from mitsim.cli.screen import finish, finish_folder, memory_line, payload_of_lines, total_of_lines
+from mitsim.core.configuration import OUTPUT, WHAT, option
 from mitsim.core.errors import MitsimError
-from mitsim.core.options import OUTPUT, WHAT, option
-from mitsim.core.spectral_manifests import CALIBRATION
+from mitsim.core.manifests import CALIBRATION
 from mitsim.core.worker import RESUME, advise
 from mitsim.verbs import calibrate_in, open_as
 

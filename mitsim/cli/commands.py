@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 from mitsim.bench.request import Variant
-from mitsim.core.configuration import shipped_files
+from mitsim.core.configuration import LIMITS, OUTPUT, WHAT, Options, option, shipped_files
 from mitsim.core.errors import ArgumentError, MitsimError, printable
-from mitsim.core.job import Limits, running_seconds
-from mitsim.core.options import LIMITS, OUTPUT, WHAT, Options, option
-from mitsim.core.progress import progress
+from mitsim.core.job import Limits, progress, running_seconds
 
 if TYPE_CHECKING:
     from mitsim.core.job import Job

@@ -11,10 +11,9 @@ import mitsim
 from mitsim.bench.request import Irradiance
 from mitsim.cli.commands import Common, Limited, Overwritten, Pictured, Resumed, completing, option_name, show, verb
 from mitsim.cli.screen import finish, finish_folder, finish_frame, page_line, page_of
-from mitsim.core.configuration import CAMERA
+from mitsim.core.configuration import CAMERA, DEVICES, WHAT, option, shipped_names
 from mitsim.core.errors import MitsimError
-from mitsim.core.options import DEVICES, WHAT, option, shipped_names
-from mitsim.core.spectral_manifests import JOINT, MOSAIC, RUN, SpectralFolder, check_way, is_coloured, open_lines
+from mitsim.core.manifests import JOINT, MOSAIC, RUN, SpectralFolder, check_way, is_coloured, open_lines
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts

@@ -25,10 +25,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mitsim.cli.commands import Pictured, message_of
+from mitsim.core.configuration import OUTPUT, PANELS
 from mitsim.core.errors import MitsimError, printable
 from mitsim.core.files import PICTURES
-from mitsim.core.options import OUTPUT, PANELS
-from mitsim.core.spectral_manifests import RUN, read_colours
+from mitsim.core.manifests import RUN, read_colours
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -277,7 +277,7 @@ def payload_of_lines(kind: str, results: Mapping[str, Mapping[str, Any]], output
     Parameters
     ----------
     kind
-        of its folder, one of :data:`mitsim.core.spectral_manifests.KINDS`.
+        of its folder, one of :data:`mitsim.core.manifests.KINDS`.
     results
         JSON of each line, by its name.
     output

@@ -25,14 +25,15 @@ from mitsim.core.configuration import (
     DEFAULT_CAMERA,
     PROJECTOR,
     RECIPE,
+    WHAT,
     load_model,
     opening_words,
     read_toml,
+    refuse_unused,
     shipped_files,
     toml_value,
 )
 from mitsim.core.errors import MitsimError, near_name
-from mitsim.core.options import WHAT, refuse_unused
 
 # ---- What is shipped -------------------------------------------------------------------------------------------------
 

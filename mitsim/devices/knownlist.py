@@ -15,8 +15,7 @@ from mitsim.core.configuration import Configuration, read_table, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import Preparation
-from mitsim.core.manifests import RunManifest, read_manifest
-from mitsim.core.spectral_manifests import MOSAIC, RUN, ColourManifest, open_lines
+from mitsim.core.manifests import MOSAIC, RUN, ColourManifest, RunManifest, open_lines, read_manifest
 
 MOST_CAPTURES = 4096
 """Of a list: more than a day of taking them."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.spectral_manifests import MOST_LINES
+from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.projector import Lines, Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel
 

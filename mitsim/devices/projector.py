@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from mitsim.core.arrays import ByValue, FloatArray
 from mitsim.core.configuration import Configuration
 from mitsim.core.errors import MitsimError
-from mitsim.core.spectral_manifests import MOST_LINES
+from mitsim.core.manifests import MOST_LINES
 
 _ROUNDING = 1e-6
 """How far the weights of a spectrum may sum from 1: six written digits."""

@@ -9,14 +9,37 @@ from typing import Any, Literal, TypedDict
 
 from pydantic import Field, model_validator
 
-from mitsim.core.configuration import CAMERA, LIST, Configuration, Positive, locate, read_table, validate
+from mitsim.core.configuration import (
+    CAMERA,
+    LIST,
+    QUALITY,
+    Configuration,
+    FilePath,
+    Options,
+    Positive,
+    locate,
+    option,
+    read_table,
+    shipped_names,
+    validate,
+)
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.imagelist import ALL, BARE, CORRECTIONS, Crop, Preparation, Raw, Wanted, check_channel, image_files
-from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital, read_manifest
-from mitsim.core.options import QUALITY, FilePath, Options, option, shipped_names
+from mitsim.core.manifests import (
+    CALIBRATION,
+    MOST_PIXELS,
+    RUN,
+    CalibrationManifest,
+    ClosingKind,
+    ColourManifest,
+    Digital,
+    check_lines,
+    lines_of_planes,
+    read_colours,
+    read_manifest,
+)
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import CALIBRATION, RUN, ColourManifest, check_lines, lines_of_planes, read_colours
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor

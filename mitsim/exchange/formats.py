@@ -13,14 +13,24 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from mitsim.core.configuration import CAMERA, PROJECTOR
+from mitsim.core.configuration import (
+    CAMERA,
+    DEVICES,
+    OUTPUT,
+    PROJECTOR,
+    QUALITY,
+    WHAT,
+    FilePath,
+    Options,
+    option,
+    shipped_names,
+    takes,
+)
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import check_apart, check_plain, output_file, whole_folder
 from mitsim.core.imagelist import check_channel
-from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, RunManifest, read_manifest
-from mitsim.core.options import DEVICES, OUTPUT, QUALITY, WHAT, FilePath, Options, option, shipped_names, takes
+from mitsim.core.manifests import MOSAIC, MOST_PIXELS, RUN, CalibrationManifest, RunManifest, open_lines, read_manifest
 from mitsim.core.seeds import check_root
-from mitsim.core.spectral_manifests import MOSAIC, RUN, open_lines
 from mitsim.devices.patterns import read_name, takes_seed
 from mitsim.exchange.capture_list import TURNED, FrameFacts
 

@@ -18,9 +18,8 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import Channels, Metadata, Value
 from mitsim.core.files import FRAME_LIMITS, MOST_BYTES, fits_a_frame, parse_json
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import CalibrationManifest, RunManifest
-from mitsim.core.recorders import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN
+from mitsim.core.manifests import CALIBRATION, MOSAIC, RUN, CalibrationManifest, RunManifest
+from mitsim.core.runs import TRUTH
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,

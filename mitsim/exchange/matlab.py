@@ -27,9 +27,18 @@ from mitsim.core.arrays import FloatArray, is_hdf5, read_variables, write_variab
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
 from mitsim.core.imagelist import ALL, WAVELENGTHS_NM, check_channel
-from mitsim.core.manifests import SIDES, CalibrationManifest, Digital, RunManifest, ShotFile
-from mitsim.core.recorders import TRUTH
-from mitsim.core.spectral_manifests import CALIBRATION, MOSAIC, RUN, lines_of_planes
+from mitsim.core.manifests import (
+    CALIBRATION,
+    MOSAIC,
+    RUN,
+    SIDES,
+    CalibrationManifest,
+    Digital,
+    RunManifest,
+    ShotFile,
+    lines_of_planes,
+)
+from mitsim.core.runs import TRUTH
 from mitsim.exchange.capture_list import TURNED
 from mitsim.exchange.hdf5 import read_matlab
 from mitsim.exchange.packed import (

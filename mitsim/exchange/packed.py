@@ -18,28 +18,25 @@ from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata, checksum, read_frame, verify, write_frame
 from mitsim.core.files import LOCK, MOST_BYTES, fits_a_frame, parse_json, read_text, whole_folder, write_text
 from mitsim.core.manifests import (
+    CALIBRATION,
+    COLOUR,
     MANIFEST,
+    MOSAIC,
+    RUN,
     SIDES,
     CalibrationManifest,
+    ColourManifest,
+    MosaicManifest,
     RunManifest,
     ShotFile,
+    SpectralFolder,
+    checked_colours,
     checked_manifest,
+    open_lines,
     read_manifest,
     write_manifest,
 )
-from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import load_run
-from mitsim.core.spectral_manifests import (
-    CALIBRATION,
-    COLOUR,
-    MOSAIC,
-    RUN,
-    ColourManifest,
-    MosaicManifest,
-    SpectralFolder,
-    checked_colours,
-    open_lines,
-)
+from mitsim.core.runs import TRUTH, load_run
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
 Reader = Callable[[str], tuple[Channels, Metadata]]
@@ -307,7 +304,7 @@ def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ())
     text
         of the colour.json that it holds.
     kind
-        of folder that this is to be of, one of :data:`mitsim.core.spectral_manifests.KINDS`.
+        of folder that this is to be of, one of :data:`mitsim.core.manifests.KINDS`.
     place
         the file, for messages.
     files

@@ -16,8 +16,7 @@ from mitsim.core.configuration import CAMERA, PROJECTOR, load_model, locate, val
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import whole_file, whole_folder, write_json, write_text
 from mitsim.core.job import Cost, Limits
-from mitsim.core.manifests import ClosingKind, Patterns, RunManifest
-from mitsim.core.spectral_manifests import COLOUR
+from mitsim.core.manifests import COLOUR, ClosingKind, Patterns, RunManifest
 from mitsim.devices.framelist import FrameList
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel

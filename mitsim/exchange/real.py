@@ -27,7 +27,7 @@ from mitsim.core.images import Numbers, image_pages, read_images
 from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import AmbientFile, CalibrationManifest, ClosingFile, Patterns, RunHead, RunManifest
 from mitsim.core.prepare import LEAST_RESPONSE, CommonFactor, Preparer
-from mitsim.core.recorders import AMBIENT, CLOSING, frame_name
+from mitsim.core.runs import AMBIENT, CLOSING, frame_name
 from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE
 from mitsim.exchange.capture_list import Electronics, RealCapture

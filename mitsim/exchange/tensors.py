@@ -15,8 +15,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError, cut, reason_of
 from mitsim.core.files import whole_file
 from mitsim.core.manifests import SIDES, RunManifest
-from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import Capture
+from mitsim.core.runs import TRUTH, Capture
 from mitsim.exchange.packed import FACTORS, Calibration, Packed, Run
 
 _PATTERNS = ("P_L", "P_R")

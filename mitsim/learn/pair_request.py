@@ -11,10 +11,9 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator
 
 from mitsim.bench.request import Exposure, ExposureKeys, Request
-from mitsim.core.configuration import Configuration, load_model, validate
+from mitsim.core.configuration import Configuration, FilePath, Options, load_model, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.imagelist import PRINTS
-from mitsim.core.options import FilePath, Options, option
 from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 

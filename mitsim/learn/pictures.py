@@ -20,7 +20,7 @@ import numpy.typing as npt
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import check_plain
-from mitsim.core.reflectance import read_reflectance
+from mitsim.core.prepare import read_reflectance
 from mitsim.core.seeds import stream
 from mitsim.learn.pair_request import picture_files
 

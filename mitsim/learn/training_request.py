@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from mitsim.bench.request import Seeded, SeedKeys
+from mitsim.core.configuration import LIMITS, QUALITY, option
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
-from mitsim.core.options import LIMITS, QUALITY, option
 
 UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
     "unrolled",

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsim.bench.request import Request, Task
+from mitsim.core.configuration import takes
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
-from mitsim.core.options import takes
 from mitsim.learn.pair_request import CALIBRATION, PairOptions, PairsRequest
 from mitsim.learn.training_request import Schedule, Training
 

@@ -20,7 +20,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.files import MOST_BYTES, json_text, plain, read_json, write_text
 from mitsim.core.images import from_above, table
 from mitsim.core.job import Cost
-from mitsim.core.spectral_manifests import MONO
+from mitsim.core.manifests import MONO
 from mitsim.light.settings import Estimate, Settings
 from mitsim.version import __version__
 

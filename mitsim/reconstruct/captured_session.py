@@ -28,10 +28,9 @@ from mitsim.core.exr import checksum, verify
 from mitsim.core.files import output_folder
 from mitsim.core.images import image_size, own_end, read_image
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest, Digital
+from mitsim.core.manifests import CALIBRATION, CalibrationManifest, Digital, lines_of_planes, write_colours
 from mitsim.core.parallel import in_threads, single_threaded_blas
 from mitsim.core.prepare import CommonFactor
-from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.core.worker import workers
 from mitsim.devices.framelist import DarkFile, SessionFrames, StripeFile, load_frames
 from mitsim.devices.patterns import stripe_signs

@@ -27,9 +27,8 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import output_folder
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest, FactorNoise
+from mitsim.core.manifests import CALIBRATION, RUN, CalibrationManifest, FactorNoise, open_lines, write_colours
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.spectral_manifests import CALIBRATION, RUN, open_lines, write_colours
 from mitsim.devices.knownlist import MOST_TERMS, KnownCaptures, load_known
 from mitsim.reconstruct.factors import (
     LARGEST_ERROR,

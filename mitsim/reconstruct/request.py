@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
+from mitsim.core.configuration import QUALITY, Options, option, validated_by
 from mitsim.core.errors import ArgumentError, MitsimError, short_text
-from mitsim.core.options import QUALITY, Options, option, validated_by
 
 if TYPE_CHECKING:
     from mitsim.core.manifests import Parallax

@@ -20,10 +20,19 @@ from mitsim.core.exr import finite_channel, read_frame, verify_files
 from mitsim.core.files import PAGE, PICTURES, output_folder, prepare_output, read_json, remove_page, write_text
 from mitsim.core.images import lightness, png
 from mitsim.core.job import size_text
-from mitsim.core.manifests import MANIFEST, CalibrationManifest, read_manifest
-from mitsim.core.recorders import TRUTH
-from mitsim.core.runs import load_mosaic, load_run
-from mitsim.core.spectral_manifests import CALIBRATION, COLOUR, IMAGE, MOSAIC, RUN, SpectralFolder, open_lines
+from mitsim.core.manifests import (
+    CALIBRATION,
+    COLOUR,
+    IMAGE,
+    MANIFEST,
+    MOSAIC,
+    RUN,
+    CalibrationManifest,
+    SpectralFolder,
+    open_lines,
+    read_manifest,
+)
+from mitsim.core.runs import TRUTH, load_mosaic, load_run
 from mitsim.devices.chart import ChartPlace
 from mitsim.metrics import Quality, truth_for
 from mitsim.reconstruct.colour import chart, linear_srgb

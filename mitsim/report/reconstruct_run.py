@@ -21,23 +21,24 @@ from mitsim.core.exr import write_frame
 from mitsim.core.files import output_folder, read_json, write_bytes
 from mitsim.core.images import png
 from mitsim.core.job import Job
-from mitsim.core.manifests import CalibrationManifest, read_manifest
-from mitsim.core.parallel import single_threaded_blas
-from mitsim.core.runs import load_mosaic, load_run
-from mitsim.core.spectral_manifests import (
+from mitsim.core.manifests import (
     COLOUR,
     DEMOSAIC,
     IMAGE,
     JOINT,
     MOSAIC,
     RUN,
+    CalibrationManifest,
     ColourManifest,
     check_lines,
     check_way,
     is_coloured,
     open_lines,
     read_colours,
+    read_manifest,
 )
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.runs import load_mosaic, load_run
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
@@ -190,7 +191,7 @@ def reconstruct_colours(
         Clock of the work.
     **options
         Options of :func:`reconstruct`, for every line. Of a run behind colour filters: ``way``, one of
-        :data:`mitsim.core.spectral_manifests.WAYS`, and ``lam``, of each plane or channel where these are solved one by
+        :data:`mitsim.core.manifests.WAYS`, and ``lam``, of each plane or channel where these are solved one by
         one. ``page=False`` leaves out pictures and report.html, which :func:`mitsim.report_folder` makes later.
 
     Raises

@@ -1,6 +1,6 @@
 """Pictures and meshes of the user in the tree of a checked scene, converted to files that Mitsuba reads.
 
-A picture becomes the reflectances of a sheet (:func:`mitsim.core.reflectance.read_reflectance`), in the middle of a
+A picture becomes the reflectances of a sheet (:func:`mitsim.core.prepare.read_reflectance`), in the middle of a
 square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
 plane y = 0, and the middle of its box is over the origin.
 """
@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.errors import MitsimError
-from mitsim.core.reflectance import fit_square, read_reflectance
+from mitsim.core.prepare import fit_square, read_reflectance
 from mitsim.scene.check import PICTURE, CheckedScene
 from mitsim.scene.headers import check_obj, check_ply
 from mitsim.scene.tree import placement_of, tilts

@@ -19,18 +19,21 @@ from pydantic.fields import FieldInfo
 
 from mitsim.bench.request import NO, Family, FixedColour, Opening, Planned, Request, Sampled, SessionRequest
 from mitsim.core.configuration import (
+    FilePath,
     Mistake,
+    Options,
     Place,
     Table,
     locate,
+    option,
     read_toml,
     refuse_together,
     shipped_path,
     validate,
+    validated_by,
 )
 from mitsim.core.errors import ArgumentError, MitsimError, cut, is_path, near_name, printable, short_text
 from mitsim.core.files import PAGE, PICTURES, resolve
-from mitsim.core.options import FilePath, Options, option, validated_by
 from mitsim.devices.session import SessionRecipe
 from mitsim.exchange.formats import PNG, Exported, check_format
 from mitsim.reconstruct.request import MODEL, ImageRequest

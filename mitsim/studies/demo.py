@@ -26,8 +26,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import Channel, read_frame
 from mitsim.core.files import write_json
 from mitsim.core.job import Job
-from mitsim.core.recorders import frame_name
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, frame_name
 from mitsim.devices.session import load_recipe
 from mitsim.light.light import SampledLight, pinhole_view
 from mitsim.reconstruct.factors import Factors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mitsim.bench.request import Lit, Seeded, SeedKeys
-from mitsim.core.options import option
+from mitsim.core.configuration import option
 from mitsim.devices.sensor import SensorModel
 
 

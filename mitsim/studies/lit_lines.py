@@ -41,9 +41,9 @@ from mitsim.core import spectral_manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import CAMERA, load_model, locate
 from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import RUN
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import RUN
 from mitsim.devices.chart import ChartPlace
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel

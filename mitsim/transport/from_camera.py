@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsim.core.spectral_manifests import MOST_LINES
+from mitsim.core.manifests import MOST_LINES
 from mitsim.devices.lamps import SPECTRA_NM, Band, Response
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths

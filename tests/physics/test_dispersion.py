@@ -21,7 +21,7 @@ from mitsim.acquire.reference import reference
 from mitsim.acquire.spectral import SpectralBench, line_alone, lit_by_lamps
 from mitsim.api.bench import Bench, open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.core.spectral_manifests import RUN
+from mitsim.core.manifests import RUN
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.direct import DirectTracer, FluxTracer
 from mitsim.transport.from_camera import FromCameraTracer, LampResponse, LampTracer

@@ -458,7 +458,7 @@ def test_a_terminal_sees_rows_that_go_away(
         "reconstruct": ("reconstruct", lab.run, "--calibration", lab.calibration, "-o"),
     }[verb]
 
-    monkeypatch.setattr("mitsim.core.progress._SHORTEST_S", 0.0)  # the laboratory's stages take no time
+    monkeypatch.setattr("mitsim.core.job._SHORTEST_S", 0.0)  # the laboratory's stages take no time
 
     def call(name: str, *options: str) -> tuple[str, str]:
         place = () if verb == "plan" else (tmp_path / name,)

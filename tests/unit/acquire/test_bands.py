@@ -12,8 +12,8 @@ from mitsim.acquire import choose_colour as bands
 from mitsim.api.bench import Bench
 from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
+from mitsim.core.manifests import RUN
 from mitsim.core.seeds import integer
-from mitsim.core.spectral_manifests import RUN
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Lines
 from mitsim.light.plan import Plan

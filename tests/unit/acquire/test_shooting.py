@@ -10,7 +10,7 @@ import pytest
 from mitsim.acquire.capture import Shooting, Totals
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.core.recorders import Recorder
+from mitsim.core.runs import Recorder
 from mitsim.devices.patterns import parse_patterns
 from mitsim.light import memory
 from mitsim.light.memory import frames_at_once, frames_bytes

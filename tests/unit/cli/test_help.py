@@ -19,8 +19,8 @@ from mitsim.bench.request import Seeded
 from mitsim.cli import app
 from mitsim.cli.commands import show, verb
 from mitsim.cli.screen import parts_of
+from mitsim.core.configuration import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
 from mitsim.core.errors import ArgumentError
-from mitsim.core.options import DEVICES, LIMITS, OUTPUT, QUALITY, WHAT, option
 from mitsim.devices.patterns import pattern_names
 from mitsim.reconstruct.request import method_names
 

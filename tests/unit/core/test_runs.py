@@ -11,8 +11,7 @@ import pytest
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import Recorder, claim_run, frame_name
-from mitsim.core.runs import Capture, load_run
+from mitsim.core.runs import Capture, Recorder, claim_run, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 
 N, PIXELS = 6, 5

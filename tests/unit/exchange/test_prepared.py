@@ -30,9 +30,8 @@ from mitsim.cli import app
 from mitsim.core.errors import MitsimError
 from mitsim.core.imagelist import PLANES, Crop, Preparation, Wanted, planes_of
 from mitsim.core.images import image_size, read_image, read_images
-from mitsim.core.manifests import Digital
+from mitsim.core.manifests import CALIBRATION, Digital, lines_of_planes, write_colours
 from mitsim.core.prepare import Preparer
-from mitsim.core.spectral_manifests import CALIBRATION, lines_of_planes, write_colours
 from mitsim.devices.framelist import load_frames
 from mitsim.exchange.capture_list import CaptureList, RealCapture, load_capture_list
 from mitsim.exchange.formats import export, import_file

@@ -24,7 +24,7 @@ from mitsim.acquire.capture import _of_unknown_light
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
-from mitsim.core.spectral_manifests import MOSAIC, RUN
+from mitsim.core.manifests import MOSAIC, RUN
 from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response
 from mitsim.devices.patterns import Lighting
 from mitsim.devices.projector import Spectrum

@@ -17,9 +17,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.core.imagelist import Preparation
 from mitsim.core.images import orient
-from mitsim.core.manifests import Digital
+from mitsim.core.manifests import CALIBRATION, Digital, read_colours
 from mitsim.core.prepare import Preparer
-from mitsim.core.spectral_manifests import CALIBRATION, read_colours
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.shifted_codes import TURNS, _differences_of_turned, plane_offsets
 from mitsim.reconstruct.solution import Verdict

@@ -16,8 +16,7 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness, read_image
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import Recorder, frame_name
-from mitsim.core.runs import Capture
+from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.reconstruct.solution import Verdict

@@ -15,8 +15,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.core.job import Cost
 from mitsim.core.manifests import CalibrationManifest, Digital, Patterns, RunHead, RunManifest
-from mitsim.core.recorders import Recorder, frame_name
-from mitsim.core.runs import Capture, load_run
+from mitsim.core.runs import Capture, Recorder, frame_name, load_run
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct import request
 from mitsim.reconstruct.accumulation import accumulate

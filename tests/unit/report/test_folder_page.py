@@ -22,10 +22,8 @@ from mitsim.core.exr import write_frame
 from mitsim.core.files import write_json
 from mitsim.core.images import lightness
 from mitsim.core.job import Job
-from mitsim.core.manifests import MANIFEST
-from mitsim.core.recorders import RunFolder
-from mitsim.core.runs import load_run
-from mitsim.core.spectral_manifests import RUN, ColourManifest, write_colours
+from mitsim.core.manifests import MANIFEST, RUN, ColourManifest, write_colours
+from mitsim.core.runs import RunFolder, load_run
 from mitsim.light.plan import PlanRow
 from mitsim.report.folder_page import report_folder
 from mitsim.report.pages import Picture, PlanChart, Scale, contact_sheet, lines_of, plan_rows

@@ -15,7 +15,7 @@ import mitsim as ms
 from mitsim.acquire.sense import read_image
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.core.reflectance import read_reflectance
+from mitsim.core.prepare import read_reflectance
 from mitsim.scene.headers import check_image, check_obj, check_ply
 from mitsim.scene.load import load_scene
 

@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
+from mitsim.core.manifests import HALF, JOINT, WAYS, check_way
 from mitsim.core.runs import load_mosaic
-from mitsim.core.spectral_manifests import HALF, JOINT, WAYS, check_way
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.report.colour_image import ColourImage
@@ -165,7 +165,7 @@ def test_a_manifest_has_a_weight_for_each_line(pair: tuple[Path, Path], tmp_path
 
 
 def test_a_way_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.core.spectral_manifests.find_spec", lambda name: None)
+    monkeypatch.setattr("mitsim.core.manifests.find_spec", lambda name: None)
     with pytest.raises(MitsimError, match=r"demosaic: colour-demosaicing is not installed; pip install 'mitsim\[mo"):
         check_way(WAYS[-1])
     assert check_way(JOINT) == JOINT

@@ -15,7 +15,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import Bench, open_bench
-from mitsim.core.spectral_manifests import RUN
+from mitsim.core.manifests import RUN
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import SensorPoints
 from mitsim.transport.indirect import IndirectTracer

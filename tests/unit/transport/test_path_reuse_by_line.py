@@ -19,7 +19,7 @@ import pytest
 
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
-from mitsim.core.spectral_manifests import RUN
+from mitsim.core.manifests import RUN
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.records import Bundle, PathSamples, aligned_grid
 from tests.conftest import write_small_scene
