@@ -1,20 +1,15 @@
 """Measured total error of `mitsim capture` against an independent answer, and its seconds, predicted and taken.
 
-    python benchmarks/accuracy.py --json FILE [--scene photograph ...] [--accuracy 1e-2 ...] [--old PATH]
+    python benchmarks/accuracy.py --json FILE [--scene photograph ...] [--accuracy 1e-2 ...] [--seeds N]
 
 The answer is light of two other seeds with every effect of the scene, one step finer in anchors, layers, cells and
-coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the
-squared error of all frames a without the noise of the answer; its standard error is the jackknife's over shots. That
-does not see noise which all shots share, of lamps and of followed light: at 3e-4 two halves said 1.5 times the accuracy
-of cookie_bag, with an interval of 1.15 to 1.84, where eight say 0.65 to 0.9. ``--halves N`` makes answers of more, over
-all pairs of which the error is the mean, and whose own jackknife is added.
-Captures are processes of their own, from the shell to their exit. ``--old`` names a checkout of an earlier version,
-to be timed and judged beside this one with the same packages. What FILE and the answers beside it hold
-already is not repeated, so the work can be cut short at any time; ``--answers`` makes those alone, which need no idle
-machine. ``--seeds N`` tells of how many captures with other seeds the error lies within the accuracy, and below the
-bound that the run states; it is not timed. ``--equal N`` compares seconds at equal measured errors: with each of N
-seeds the earlier version at 1e-3, and this one at 1e-3 and coarser accuracies, in turn, against the same answer. The
-coarsest accuracy whose root mean square error over the seeds is not above the earlier version's is its equal.
+coarse cells than the plan at 3e-4. With r1, r2 its two halves, <a - r1, a - r2> / <r1, r2> is the squared error of all
+frames a without the noise of the answer; its standard error is the jackknife's over shots. That does not see noise
+which all shots share, of lamps and of followed light: at 3e-4 two halves found 1.5 times the accuracy of cookie_bag,
+with an interval of 1.15 to 1.84, where eight find 0.65 to 0.9. ``--halves N`` makes answers of more halves; the error
+is then the mean over all pairs, and their own jackknife is added. Captures are processes of their own, from the shell
+to their exit. What FILE and the answers beside it hold already is not repeated. ``--seeds N`` counts captures with
+other seeds whose error lies within the accuracy, and below the bound that the run states; it is not timed.
 
     python benchmarks/accuracy.py --cover 200 --json FILE --scene corner [--patterns uniform ...] [--camera FILE] ...
 
@@ -35,18 +30,18 @@ import os
 import re
 import resource
 import shutil
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from harness import ROOT, arguments, held, show, write
 
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer
@@ -65,7 +60,6 @@ SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),
     *("compact_disc", "mirror", "lamp_bench", "cookie_bag"),
 )
-ROOT = Path(__file__).parents[1]
 PATTERNS, ACCURACIES = "dots:7", (1e-2, 3e-3, 1e-3, 3e-4)
 FINEST, NOISE = 3e-4, 1e-3
 """Accuracy whose settings the answer goes one step beyond, and the Monte Carlo error of each of its halves, whose own
@@ -75,9 +69,8 @@ SEEN = 3
 SEED, ANSWERS = 0, 811
 PLANNED = 40
 """Seeds of ``--cover`` that share a plan."""
-PROMISED, COARSER = 1e-3, tuple(1e-3 * 2 ** (step / 4) for step in range(6))
-"""What the earlier version is asked for by ``--equal``, and what this one is: each has some 0.7 of the paths of the one
-before."""
+PROMISED = 1e-3
+"""Accuracy at which versions are compared."""
 Frames = npt.NDArray[np.floating[Any]]
 
 
@@ -94,6 +87,14 @@ def answer(scene: str, noise: float, halves: int = 2) -> npt.NDArray[np.float32]
         light = trace_light(bench, plan, family.lighting, integer(seed, "answer"), Sampling(by_pixel=False)).merge()
         found.append([frame.irradiance.astype(np.float32) for frame in light.frames(family.lighting, 0)])
     return np.array(found)
+
+
+def answer_of(scene: str, file: Path, noise: float, halves: int = 2) -> npt.NDArray[np.float32]:
+    """The :func:`answer` of a ``scene``, kept beside ``file``."""
+    kept = file.with_suffix(f".{Path(scene).stem}.npy")
+    if not kept.exists():
+        np.save(kept, answer(scene, noise, halves))
+    return np.asarray(np.load(kept))
 
 
 def captured(
@@ -162,11 +163,6 @@ def bracketed(products: Frames, energies: Frames) -> dict[str, float]:
     square, spread = squared_error(products, energies)
     ends = {"error": square, "low": square - 2 * spread, "high": square + 2 * spread}
     return {name: math.sqrt(max(value, 0)) for name, value in ends.items()}
-
-
-def judged(scene: str, accuracy: float, halves: Frames, tree: Path | None, seed: int = SEED) -> dict[str, Any]:
-    """One capture, held against the answer."""
-    return held_against(halves, scene, captured(scene, accuracy, tree, seed))
 
 
 def held_against(halves: Frames, scene: str, run: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,63 +279,6 @@ def coverage(scene: str, patterns: str, accuracy: float, seeds: int, options: ar
     }
 
 
-def side_by_side(scene: str, seed: int, halves: Frames, old: Path, warm: bool) -> dict[str, Any]:
-    """One run of the earlier version and one of this at each coarser accuracy; ``warm``: after uncounted ones."""
-    for tree in (old, None) if warm else ():
-        captured(scene, PROMISED, tree, seed)
-    runs = {"old": judged(scene, PROMISED, halves, old, seed)}
-    return runs | {f"{accuracy:.3g}": judged(scene, accuracy, halves, None, seed) for accuracy in COARSER}
-
-
-def table(row: Mapping[str, Any]) -> str:
-    """A line for each run of ``compared``, for people."""
-    lines = [
-        f"  {name:<8} error {each['error']:.2e} [{each['low']:.1e}, {each['high']:.1e}]"
-        f" {each['seconds']:6.2f} s, light {each['light']:5.2f} s"
-        for name, each in row.items()
-        if isinstance(each, dict)
-    ]
-    if row["equal"]:
-        lines += [f"  equal: {row['equal']}, {row['ratio']:.2f} times faster, light {row['light_ratio']:.2f} times"]
-    return "\n".join(lines)
-
-
-def compared(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """Errors and seconds of ``old`` and of each accuracy of this version, over the seeds, and which of these is equal.
-
-    Parameters
-    ----------
-    runs
-        of each name, runs with the same seeds, as ``judged`` gives them.
-
-    Returns
-    -------
-    dict
-        ``error``, ``low`` and ``high`` of all seeds' squares together, median ``seconds`` and ``light`` (transport and
-        optics) by name; ``equal``, the name of the coarsest whose error is not above that of ``old``, and the medians
-        over seeds of what ``old`` took over it, ``ratio`` and ``light_ratio``.
-    """
-    found: dict[str, Any] = {}
-    light = {
-        name: [run["stages"]["transport"] + run["stages"]["optics"] for run in each] for name, each in runs.items()
-    }
-    for name, each in runs.items():
-        of_shots = np.mean([run["shares"] for run in each], axis=0)
-        seconds = statistics.median(run["seconds"] for run in each)
-        found[name] = {**bracketed(*of_shots), "seconds": seconds, "light": statistics.median(light[name])}
-    fit = [name for name in runs if name != "old" and found[name]["error"] <= found["old"]["error"]]
-    if not fit:
-        return {**found, "equal": None}
-    equal = max(fit, key=float)
-    pairs = zip(runs["old"], runs[equal], strict=True)
-    return {
-        **found,
-        "equal": equal,
-        "ratio": statistics.median(old["seconds"] / new["seconds"] for old, new in pairs),
-        "light_ratio": statistics.median(old / new for old, new in zip(light["old"], light[equal], strict=True)),
-    }
-
-
 class _Unit:
     """A frame of 1 W m^-2."""
 
@@ -347,14 +286,10 @@ class _Unit:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, required=True)
+    parser = arguments(__doc__, required=True)
     parser.add_argument("--scene", action="append", default=[])
     parser.add_argument("--accuracy", action="append", type=float, default=[])
-    parser.add_argument("--old", type=Path)
-    parser.add_argument("--answers", action="store_true")
     parser.add_argument("--seeds", type=int, default=0)
-    parser.add_argument("--equal", type=int, default=0)
     parser.add_argument("--noise", type=float, default=NOISE)
     parser.add_argument("--halves", type=int, default=2)
     parser.add_argument("--cover", type=int, default=0)
@@ -366,47 +301,27 @@ def main() -> None:
     parser.add_argument("--camera")
     parser.add_argument("--projector")
     options = parser.parse_args()
-    if options.equal and not options.old:
-        parser.error("--equal needs --old, the checkout to compare with")
-    found = json.loads(options.json.read_text()) if options.json.exists() else {}
+    found = held(options.json, {})
     for scene in options.scene or SCENES:
         rows = found.setdefault(scene, {})
-        for patterns, accuracy in itertools.product(options.patterns, options.accuracy or ACCURACIES[:1]):
-            if options.cover and (key := f"cover {patterns} {accuracy:g}") not in rows:
-                rows[key] = coverage(scene, patterns, accuracy, options.cover, options)
-                print(scene, key, *(f"{name} {value:.3g}" for name, value in rows[key].items()), sep="\n  ", flush=True)
-                options.json.write_text(json.dumps(found, indent=1))
         if options.cover:
+            for patterns, accuracy in itertools.product(options.patterns, options.accuracy or ACCURACIES[:1]):
+                if (key := f"cover {patterns} {accuracy:g}") not in rows:
+                    rows[key] = coverage(scene, patterns, accuracy, options.cover, options)
+                    show(f"{scene} {key}", rows[key])
+                    write(options.json, found)
             continue
-        kept = options.json.with_suffix(f".{Path(scene).stem}.npy")
-        if not kept.exists():
-            np.save(kept, answer(scene, options.noise, options.halves))
-        for accuracy in (options.accuracy or ACCURACIES) if options.seeds else ():
-            if (key := f"seeds {accuracy:g}") not in rows:
-                rows[key] = row = covered(scene, accuracy, options.seeds, np.load(kept))
-                print(f"{scene} {accuracy:g}: within {row['within_accuracy']}, {row['within_bound']} of {row['seeds']}")
-                options.json.write_text(json.dumps(found, indent=1))
-        for seed in range(1, options.equal + 1):
-            runs = rows.setdefault("runs", {})
-            if str(seed) not in runs:
-                runs[str(seed)] = side_by_side(scene, seed, np.load(kept), options.old, warm=seed == 1)
-            each = list(runs.values())
-            rows["equal"] = row = compared({name: [run[name] for run in each] for name in each[0]})
-            options.json.write_text(json.dumps(found, indent=1))
-            print(f"{scene}, {len(each)} seeds\n{table(row)}", flush=True)
-        others = options.answers or options.seeds or options.equal
-        for accuracy in () if others else options.accuracy or ACCURACIES:
-            for name, tree in (("new", None), ("old", options.old)):
-                key = f"{name} {accuracy:g}"
-                if key in rows or (name == "old" and tree is None):
-                    continue
-                rows[key] = row = judged(scene, accuracy, np.load(kept), tree)
-                reported = f"error {row['error']:.2e} [{row['low']:.1e}, {row['high']:.1e}]"
-                print(
-                    f"{scene} {key}: {reported}, {row['seconds']:.1f} s, predicted {row['predicted_seconds']:.1f}",
-                    flush=True,
-                )
-                options.json.write_text(json.dumps(found, indent=1))
+        halves = answer_of(scene, options.json, options.noise, options.halves)
+        for accuracy in options.accuracy or ACCURACIES:
+            key = f"seeds {accuracy:g}" if options.seeds else f"new {accuracy:g}"
+            if key not in rows:
+                if options.seeds:
+                    rows[key] = covered(scene, accuracy, options.seeds, halves)
+                else:
+                    rows[key] = held_against(halves, scene, captured(scene, accuracy, None))
+                shown = ("within_accuracy", "within_bound", "error", "low", "high", "seconds", "predicted_seconds")
+                show(f"{scene} {key}", {name: rows[key][name] for name in shown if name in rows[key]})
+                write(options.json, found)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ too: note the old version on the same machine, in an environment of its own.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import os
@@ -25,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+from harness import arguments, write
 
 SCENES = (
     "photograph", "colour_chart", "resolution_target", "keystone", "lamp_bench", "cards", "corner", "gift_card",
@@ -121,17 +121,16 @@ def measure(python: str, scenes: list[str]) -> dict[str, dict[str, str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("what", choices=("note", "compare"))
     parser.add_argument("file", type=Path)
     parser.add_argument("--python", default=sys.executable, help="of the environment whose mitsim is run")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--json", type=Path, help="write the comparison to this file")
     options = parser.parse_args()
     here, results = machine(options.python), measure(options.python, options.scenes)
     if options.what == "note":
         noted = {"machine": here, "accuracy": ACCURACY, "checksums": results}
-        options.file.write_text(json.dumps(noted, indent=1) + "\n", encoding="utf-8")
+        write(options.file, noted)
         return
     noted = json.loads(options.file.read_text(encoding="utf-8"))
     if noted["machine"] != here:
@@ -145,8 +144,7 @@ def main() -> None:
     for row in different:
         print(f"{row['scene']} {row['result']}: differs")
     print(f"{len(rows) - len(different)} of {len(rows)} results bit-equal")
-    if options.json:
-        options.json.write_text(json.dumps({"machine": here, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    write(options.json, {"machine": here, "rows": rows})
     sys.exit(bool(different))
 
 

@@ -9,10 +9,9 @@ is. Ends with 1 where one is off by five or more.
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
 from typing import Any
+
+from harness import arguments, write
 
 from mitsim.core.configuration import shipped_path
 from mitsim.devices.sensor import SensorModel, load_sensor
@@ -39,10 +38,9 @@ def cell(row: Row | None) -> str:
 
 def main() -> int:
     """The table."""
-    parser = argparse.ArgumentParser()
-    for name in ("pixels", "frames", "seed"):
+    parser = arguments(__doc__, seed=True)
+    for name in ("pixels", "frames"):
         parser.add_argument(f"--{name}", type=int, default=getattr(Procedure, name))
-    parser.add_argument("--json", type=Path, help="result file")
     given = parser.parse_args()
     procedure, report = Procedure(pixels=given.pixels, frames=given.frames, seed=given.seed), dict[str, Any]()
     print(
@@ -56,8 +54,7 @@ def main() -> int:
         cells = " | ".join(cell(rows.get(figure)) for figure in SHOWN)
         print(f"| `{name}` | {cells} | {len(off)} | {abs(off[worst]):.1f} | `{worst}` |", flush=True)
         report[name] = done.payload()
-    if given.json:
-        given.json.write_text(json.dumps(report, indent=1), encoding="utf-8")
+    write(given.json, report)
     return int(any(
         abs(row["deviations"] or 0) >= 5
         for done in report.values() for row in (*done["figures"], *done["camera_found"])

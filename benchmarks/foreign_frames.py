@@ -1,6 +1,6 @@
 """Judge the frame checks of `reconstruct` on frames of another forward model: kinds of faults, severities, families.
 
-    python benchmarks/foreign_frames.py RESULT.json [--kinds ...] [--families ...] [--severities 0 1 2] [--runs 1]
+    python benchmarks/foreign_frames.py --json FILE [--kinds ...] [--families ...] [--severities 0 1 2] [--runs 1]
         [--good 0] [--seed 0] [--peaks 20000 ...] [--old OLD.json]
 
 The forward model below is written in numpy and shares no code with mitsim. Only the stripes of the calibration session
@@ -23,23 +23,24 @@ An image that states no uncertainty counts as silent where its error is more tha
 ``--good`` adds runs without a fault. Their false alarms are refusals, warnings of the import, and flags of the misfit;
 flags for other reasons, for example "Lambda takes away more of the image than it leaves", are counted apart. The table
 shows, for each kind and family, one letter for each run, ordered by severity. ``--old`` compares with an earlier
-RESULT.json and lists the runs that were flagged there and are not flagged now. A run takes about 0.5 s.
+file and lists the runs that were flagged there and are not flagged now. A run takes about 0.5 s.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import arguments, lost, ratios, show, write
 from PIL import Image
 from scipy.linalg import hadamard
 from scipy.ndimage import gaussian_filter, median_filter
@@ -209,6 +210,7 @@ class Run:
         signs = (1, -1) if self.signed else (0,)
         columns = range(self.sides[1].shape[1])
         self.shots = [(i, j, sign) for i in range(self.sides[0].shape[1]) for j in columns for sign in signs]
+        self.rows, self.columns = np.indices(self.camera.pixels)
         self.exposure = 1.0
         light = [self.light_of(shot) for shot in range(len(self.shots))]
         self.exposure = self.peak / max(float(each.max()) for each in light)
@@ -218,6 +220,10 @@ class Run:
     def peak_dn(self) -> float:
         """Digital numbers of the brightest pixel above the black level."""
         return self.peak * self.camera.gain
+
+    def time(self, shot: int) -> float:
+        """Part of the run at which a ``shot`` is taken."""
+        return shot / (len(self.light) - 1)
 
     def lamp(self, shot: int) -> np.ndarray:
         """(n, n) part of full power that each projector pixel emits in a ``shot``."""
@@ -266,264 +272,159 @@ class Run:
 
 # ---- Faults: each changes a run, and returns the numbers of its wrong frames; empty: all, or none in particular ------
 
-Fault = Callable[[Run, Any, np.random.Generator], "set[int] | None"]
-FAULTS: dict[str, tuple[tuple[Any, ...], Fault, str]] = {}
-"""Levels of the three severities, the fault, and what it needs: "frames" that differ, "time", "square" or nothing."""
+Level = Any
+Fault = Callable[[Run, Level, np.random.Generator], "set[int] | None"]
+Light = Callable[[np.ndarray, int], np.ndarray]
+"""Light of a frame and the number of its shot in, light out."""
 
 
-def fault(*levels: Any, needs: str = "") -> Callable[[Fault], Fault]:
-    """Register a fault under the name of its function."""
-
-    def register(function: Fault) -> Fault:
-        FAULTS[function.__name__] = levels, function, needs
-        return function
-
-    return register
-
-
-def _any(run: Run, rng: np.random.Generator, count: int = 1) -> list[int]:
-    """Numbers of shots that have at least a third of the mean light of the brightest."""
+def some_shots(run: Run, rng: np.random.Generator, count: int = 1) -> set[int]:
+    """Return shots that have at least a third of the mean light of the brightest."""
     means = np.array([light.mean() for light in run.light])
-    chosen = rng.choice(np.flatnonzero(means > means.max() / 3), count, replace=False)
-    return sorted(int(shot) for shot in chosen)
+    bright = np.flatnonzero(means > means.max() / 3)
+    return {int(shot) for shot in rng.choice(bright, min(count, max(len(run.shots) // 3, 1)), replace=False)}
 
 
-def _pixelwise(run: Run, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Change the digital numbers of each frame on its own."""
-    run.after.append(lambda frames: [change(frame.copy()) for frame in frames])
+def every(make: Callable[[Run, Level, np.random.Generator], Light]) -> Fault:
+    """The light of all frames is changed."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> None:
+        change = make(run, level, rng)
+        run.light = [change(light, shot) for shot, light in enumerate(run.light)]
+
+    return lay
 
 
-def _grid(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    rows, columns = np.indices(run.camera.pixels)
-    return rows, columns
+def single(
+    change: Callable[[Run, Level, np.random.Generator, np.ndarray, int], np.ndarray], many: bool = False
+) -> Fault:
+    """The light of one frame is changed, or of as many as the level says."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> set[int]:
+        shots = some_shots(run, rng, level if many else 1)
+        for shot in shots:
+            run.light[shot] = change(run, level, rng, run.light[shot], shot)
+        return shots
+
+    return lay
 
 
-# -- What is stated of the camera
+def numbers(make: Callable[[Run, Level, np.random.Generator], Callable[[np.ndarray], np.ndarray]]) -> Fault:
+    """The digital numbers of each frame are changed on their own."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> None:
+        change = make(run, level, rng)
+        run.after.append(lambda frames: [change(frame.copy()) for frame in frames])
+
+    return lay
 
 
-@fault(0.5, 2.0, 4.0)
-def gain(run: Run, level: float, rng: np.random.Generator) -> None:
-    """True gain over the stated one."""
-    run.stated["gain"] = run.camera.gain / level
+def seen(camera: Callable[[Run, Level, np.random.Generator, int], dict[str, Any]]) -> Fault:
+    """Frames are seen anew: arguments of :meth:`Run.light_of` by shot, which may be none."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> None:
+        run.light = [run.light_of(shot, **camera(run, level, rng, shot)) for shot in range(len(run.light))]
+
+    return lay
 
 
-@fault(0.003, 0.02, 0.1)
-def black_level(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Wrong black level, part of the peak."""
-    step = max(level * run.peak_dn, 0.5) * rng.choice([-1, 1])
-    run.stated["black"] = max(run.camera.black + step, 0.0)
+def stated(change: Callable[[Run, Level, np.random.Generator], dict[str, float]]) -> Fault:
+    """Something else is stated of the camera."""
+    return lambda run, level, rng: run.stated.update(change(run, level, rng))
 
 
-@fault(0.3, 2.0, 5.0)
-def read_noise(run: Run, level: float, rng: np.random.Generator) -> None:
-    """True read noise over the stated one."""
-    run.stated["read"] = run.camera.read / level
+def order(change: Callable[[Run, Level, np.random.Generator], tuple[list[int], set[int]]]) -> Fault:
+    """Frames are in another order: for each place the shot there, and the places at fault."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> set[int]:
+        places, wrong = change(run, level, rng)
+        run.light = [run.light[place] for place in places]
+        return wrong
+
+    return lay
 
 
-# -- Single frames, and time
+def hand(count: int) -> Fault:
+    """A dark hand of some radius, part of the scene, is in some successive frames."""
+
+    def lay(run: Run, level: Level, rng: np.random.Generator) -> set[int]:
+        some = min(count, max(len(run.light) // 2, 1))
+        first = int(rng.integers(len(run.light) - some + 1))
+        y, x = np.mgrid[: run.camera.n, : run.camera.n] / run.camera.n
+        row, column = rng.uniform(0.2, 0.8, 2)
+        scene = np.where(np.hypot(y - row, x - column) < level, 0.15 * run.scene, run.scene)
+        for shot in range(first, first + some):
+            run.light[shot] = run.light_of(shot, scene)
+        return set(range(first, first + some))
+
+    return lay
 
 
-@fault(0.2, 0.5, 1.0, needs="time")
-def foreign(run: Run, level: float, rng: np.random.Generator) -> set[int]:
-    """Part of another scene in one frame."""
+def other_scene(run: Run, level: float, rng: np.random.Generator, light: np.ndarray, shot: int) -> np.ndarray:
     other = picture(PICTURES[(PICTURES.index(run.picture) + 1) % 5], run.camera.n, run.seed + 1)
-    (shot,) = _any(run, rng)
-    run.light[shot] = (1 - level) * run.light[shot] + level * run.light_of(shot, other)
-    return {shot}
+    return np.asarray((1 - level) * light + level * run.light_of(shot, other))
 
 
-@fault(1, 2, 6, needs="time")
-def rolled(run: Run, level: int, rng: np.random.Generator) -> set[int]:
-    """Pixels by which one frame is rolled."""
-    (shot,) = _any(run, rng)
-    run.light[shot] = np.roll(run.light[shot], level, int(rng.integers(2)))
-    return {shot}
-
-
-@fault(1, 2, 4, needs="frames")
 def repeated(run: Run, level: int, rng: np.random.Generator) -> set[int]:
-    """Frames in place of which the frame before was saved again."""
-    shots = set(_any(run, rng, min(level, len(run.shots) // 3)))
+    shots = some_shots(run, rng, level)
     run.after.append(lambda frames: [frames[k - 1] if k in shots else frame for k, frame in enumerate(frames)])
     return shots
 
 
-@fault(1, 2, 4, needs="time")
-def black_frame(run: Run, level: int, rng: np.random.Generator) -> set[int]:
-    """Frames without light."""
-    shots = set(_any(run, rng, min(level, len(run.shots) // 3)))
-    for shot in shots:
-        run.light[shot] = np.zeros(run.camera.pixels)
-    return shots
-
-
-@fault(0.1, 0.3, 0.6, needs="time")
-def half_lost(run: Run, level: float, rng: np.random.Generator) -> set[int]:
-    """Part of the rows that one frame lost."""
-    (shot,) = _any(run, rng)
-    run.light[shot] = run.light[shot] * (_grid(run)[0] < (1 - level) * run.camera.pixels[0])
-    return {shot}
-
-
-@fault(0.97, 0.9, 0.5, needs="time")
-def dimmed(run: Run, level: float, rng: np.random.Generator) -> set[int]:
-    """Light of one frame."""
-    (shot,) = _any(run, rng)
-    run.light[shot] = run.light[shot] * level
-    return {shot}
-
-
-@fault(0.01, 0.03, 0.1, needs="time")
-def flicker(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Standard deviation of the power of frames."""
-    run.light = [light * (1 + level * rng.standard_normal()) for light in run.light]
-
-
-@fault(0.02, 0.05, 0.1, needs="time")
-def drift(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Power that the lamp loses during the run."""
-    run.light = [light * (1 - level * k / (len(run.light) - 1)) for k, light in enumerate(run.light)]
-
-
-def _hand(run: Run, level: float, rng: np.random.Generator, count: int) -> set[int]:
-    first = int(rng.integers(len(run.light) - count + 1))
-    y, x = np.mgrid[: run.camera.n, : run.camera.n] / run.camera.n
-    row, column = rng.uniform(0.2, 0.8, 2)
-    scene = np.where(np.hypot(y - row, x - column) < level, 0.15 * run.scene, run.scene)
-    for shot in range(first, first + count):
-        run.light[shot] = run.light_of(shot, scene)
-    return set(range(first, first + count))
-
-
-@fault(0.1, 0.2, 0.35, needs="time")
-def hand_in_three(run: Run, level: float, rng: np.random.Generator) -> set[int]:
-    """Radius of a dark hand in three frames, part of the scene."""
-    return _hand(run, level, rng, min(3, len(run.light) // 2))
-
-
-@fault(0.1, 0.2, 0.35, needs="time")
-def hand_in_one(run: Run, level: float, rng: np.random.Generator) -> set[int]:
-    """Radius of a dark hand in one frame."""
-    return _hand(run, level, rng, 1)
-
-
-@fault(0.1, 0.5, 1.0, needs="time")
-def camera_moved(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Sensor pixels that the camera moved midway."""
-    for shot in range(len(run.light) // 2, len(run.light)):
-        run.light[shot] = run.light_of(shot, moved=level)
-
-
-@fault(0.1, 0.5, 1.0, needs="time")
-def camera_creeps(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Sensor pixels that the camera moves in all, evenly, in eight steps."""
-    for shot in range(len(run.light)):
-        run.light[shot] = run.light_of(shot, moved=level * (8 * shot // len(run.light)) / 7)
-
-
-@fault(1, 2, 4, needs="time")
-def scene_moved(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Quarters of a scene pixel that the picture moved midway."""
-    for shot in range(len(run.light) // 2, len(run.light)):
-        run.light[shot] = run.light_of(shot, steps=(level, 0))
-
-
-@fault(1, 5, 0, needs="frames")
-def swapped(run: Run, level: int, rng: np.random.Generator) -> set[int]:
-    """Distance of two frames that are exchanged; 0: of three pairs of neighbours."""
+def swapped(run: Run, level: int, rng: np.random.Generator) -> tuple[list[int], set[int]]:
     count = len(run.light)
-    firsts = _any(run, rng, 1) if level else [k for k in (1, count // 2, count - 3)]
-    wrong = set()
-    for first in firsts:
+    places, wrong = list(range(count)), set[int]()
+    for first in some_shots(run, rng) if level else (1, count // 2, count - 3):
         other = (first + (level or 1)) % count
-        run.light[first], run.light[other] = run.light[other], run.light[first]
+        places[first], places[other] = places[other], places[first]
         wrong |= {first, other}
-    return wrong
+    return places, wrong
 
 
-@fault(0.01, 0.05, 0.2, needs="frames")
+def other_order(run: Run, level: str, rng: np.random.Generator) -> tuple[list[int], set[int]]:
+    count = len(run.light)
+    if level == "reversed":
+        return list(range(count))[::-1], set()
+    if level == "column-major":
+        key = [(j, i, -sign) for i, j, sign in run.shots]
+        return sorted(range(count), key=key.__getitem__), set()
+    if run.signed:
+        changes = [int((np.diff(side) != 0).sum()) for side in hadamard(run.sides[0].shape[1])]
+        number = {shot: k for k, shot in enumerate(run.shots)}
+        return [number[changes.index(i), changes.index(j), sign] for i, j, sign in run.shots], set()
+    return [*range(count // 2, count), *range(count // 2)], set()
+
+
 def lag(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Part of the frame before in each frame."""
     before = [run.light[0], *run.light[:-1]]
     run.light = [(1 - level) * light + level * last for light, last in zip(run.light, before, strict=True)]
 
 
-@fault("column-major", "reversed", "sequency or halves", needs="frames")
-def order(run: Run, level: str, rng: np.random.Generator) -> None:
-    """Order in which shots were written."""
-    count = len(run.light)
-    if level == "reversed":
-        places = list(range(count))[::-1]
-    elif level == "column-major":
-        places = sorted(range(count), key=lambda k: (run.shots[k][1], run.shots[k][0], -run.shots[k][2]))
-    elif run.signed:
-        changes = [int((np.diff(side) != 0).sum()) for side in hadamard(run.sides[0].shape[1])]
-        sides = (changes.index(0), changes.index(1), changes.index(2), changes.index(3)) if len(changes) == 4 else ()
-        number = {shot: k for k, shot in enumerate(run.shots)}
-        places = [number[sides[i], sides[j], sign] for i, j, sign in run.shots]
-    else:
-        places = [*range(count // 2, count), *range(count // 2)]
-    run.light = [run.light[place] for place in places]
-
-
-@fault(1, 2, -1, needs="frames")
-def late(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Shots by which all frames are late, in a ring."""
-    run.light = [run.light[(k - level) % len(run.light)] for k in range(len(run.light))]
-
-
-# -- Sensor
-
-
-def _spots(run: Run, rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
-    rows, columns = _grid(run)
+def dust(run: Run, level: float, rng: np.random.Generator) -> Light:
     spots = np.zeros(run.camera.pixels, bool)
-    for row, column in rng.uniform(0, 1, (count, 2)) * run.camera.pixels:
-        spots |= np.hypot(rows - row, columns - column) < radius
-    return spots
+    for row, column in rng.uniform(0, 1, (5, 2)) * run.camera.pixels:
+        spots |= np.hypot(run.rows - row, run.columns - column) < 2.5
+    return lambda light, shot: light * (1 - level * spots)
 
 
-@fault(0.05, 0.2, 0.6)
-def dust(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Light that five spots of dust take away."""
-    run.light = [light * (1 - level * spots) for spots in [_spots(run, rng, 5, 2.5)] for light in run.light]
-
-
-@fault(0.1, 0.4, 0.9)
-def hair(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Light that a hair across the sensor takes away."""
-    rows, columns = _grid(run)
+def hair(run: Run, level: float, rng: np.random.Generator) -> Light:
     angle, place = rng.uniform(0, np.pi), rng.uniform(0.3, 0.7, 2) * run.camera.pixels
-    distance = (rows - place[0]) * np.cos(angle) + (columns - place[1]) * np.sin(angle)
-    run.light = [light * (1 - level * (abs(distance) < 0.8)) for light in run.light]
+    distance = (run.rows - place[0]) * np.cos(angle) + (run.columns - place[1]) * np.sin(angle)
+    return lambda light, shot: light * (1 - level * (abs(distance) < 0.8))
 
 
-@fault(3, 20, 100)
-def hot_pixels(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Number of hot pixels."""
+def hot_pixels(run: Run, level: int, rng: np.random.Generator) -> Light:
     hot = np.zeros(run.camera.pixels)
     hot.flat[rng.choice(hot.size, level, replace=False)] = rng.uniform(0.2, 1.0, level) * run.peak
-    run.light = [light + hot for light in run.light]
+    return lambda light, shot: light + hot
 
 
-@fault(0.02, 0.1, 0.5, needs="time")
-def hot_column(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Charge of a column from the middle of the run on, part of the peak."""
-    column = int(rng.integers(run.camera.pixels[1]))
-    for shot in range(len(run.light) // 2, len(run.light)):
-        run.light[shot] = run.light[shot] + level * run.peak * (_grid(run)[1] == column)
+def hot_column(run: Run, level: float, rng: np.random.Generator) -> Light:
+    column = run.columns == int(rng.integers(run.camera.pixels[1]))
+    return lambda light, shot: light + level * run.peak * column * (shot >= len(run.light) // 2)
 
 
-@fault(1, 2, 4)
-def dead_row(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Number of rows without light."""
-    dead = rng.choice(run.camera.pixels[0], level, replace=False)
-    run.light = [light * ~np.isin(_grid(run)[0], dead) for light in run.light]
-
-
-@fault(0.15, 0.3, 0.5)
-def region(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Side of a region of the sensor that is shifted by a pixel, part of the sensor."""
+def region(run: Run, level: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     sizes = [int(level * size) for size in run.camera.pixels]
     at = [int(rng.integers(size - own + 1)) for size, own in zip(run.camera.pixels, sizes, strict=True)]
     place = tuple(slice(first, first + own) for first, own in zip(at, sizes, strict=True))
@@ -532,95 +433,42 @@ def region(run: Run, level: float, rng: np.random.Generator) -> None:
         frame[place] = np.roll(frame[place], 1, axis=1)
         return frame
 
-    _pixelwise(run, shifted)
+    return shifted
 
 
-@fault("one", "half", "all")
 def dropped_line(run: Run, level: str, rng: np.random.Generator) -> set[int]:
-    """Frames that lost a line, so that all lines below moved up."""
     count = len(run.light)
-    shots = {"one": set(_any(run, rng)), "half": set(range(count // 2, count)), "all": set(range(count))}[level]
+    shots = {"one": some_shots(run, rng), "half": set(range(count // 2, count)), "all": set(range(count))}[level]
     line = int(rng.integers(run.camera.pixels[0] // 4, 3 * run.camera.pixels[0] // 4))
     for shot in shots:
         run.light[shot] = np.concatenate([np.delete(run.light[shot], line, axis=0), run.light[shot][-1:]])
     return shots if level == "one" and count > 1 else set()
 
 
-@fault(0.002, 0.01, 0.05)
 def bands(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Amplitude of bands that add to rows, part of the peak."""
-    rows, period = _grid(run)[0], rng.uniform(6, 20)
+    period, phases, most = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, len(run.light)), 2**run.camera.bits - 1
+
+    def change(frames: list[np.ndarray]) -> list[np.ndarray]:
+        waves = [level * run.peak_dn * np.sin(2 * np.pi * run.rows / period + phase) for phase in phases]
+        return [np.clip(np.rint(frame + wave), 0, most) for frame, wave in zip(frames, waves, strict=False)]
+
+    run.after.append(change)
+
+
+def row_flicker(run: Run, level: float, rng: np.random.Generator) -> Light:
+    period = run.camera.pixels[0] / rng.uniform(1.2, 3.0)
     phases = rng.uniform(0, 2 * np.pi, len(run.light))
-    waves = [level * run.peak * np.sin(2 * np.pi * rows / period + phase) for phase in phases]
-    run.after.append(
-        lambda frames: [
-            np.clip(np.rint(frame + run.camera.gain * wave), 0, 2**run.camera.bits - 1)
-            for frame, wave in zip(frames, waves, strict=True)
-        ]
-    )
+    return lambda light, shot: light * (1 + level * np.sin(2 * np.pi * run.rows / period + phases[shot]))
 
 
-@fault(0.01, 0.05, 0.2)
-def row_flicker(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Amplitude of a lamp that flickers while rows are read, part of the light."""
-    rows, period = _grid(run)[0], run.camera.pixels[0] / rng.uniform(1.2, 3.0)
-    phases = rng.uniform(0, 2 * np.pi, len(run.light))
-    lights = zip(run.light, phases, strict=True)
-    run.light = [light * (1 + level * np.sin(2 * np.pi * rows / period + phase)) for light, phase in lights]
-
-
-@fault(0.8, 0.65, 0.5)
-def clipped(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Part of the peak from which numbers are clipped."""
-    top = np.rint(run.camera.black + run.camera.gain * (level * run.peak + run.camera.dark))
-    _pixelwise(run, lambda frame: np.minimum(frame, top))
-
-
-@fault(0.3, 0.7, 1.0)
-def denoised(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Weight of a median of 3 x 3 pixels."""
-    _pixelwise(run, lambda frame: np.rint((1 - level) * frame + level * median_filter(frame, 3)))
-
-
-@fault(0.4, 0.7, 1.5)
-def blurred(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Standard deviation of a blur of frames, in pixels."""
-    _pixelwise(run, lambda frame: np.rint(gaussian_filter(frame, level)))
-
-
-@fault(0.95, 0.8, 1 / 2.2)
-def gamma(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Power of the tone curve."""
+def gamma(run: Run, level: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     black, span = run.camera.black, 2**run.camera.bits - 1 - run.camera.black
-    _pixelwise(run, lambda frame: np.rint(black + span * (np.maximum(frame - black, 0) / span) ** level))
+    return lambda frame: np.rint(black + span * (np.maximum(frame - black, 0) / span) ** level)
 
 
-@fault(0.02, 0.1, 0.3)
-def nonlinear(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Light that the brightest pixel loses to the sensor's curve."""
-    run.light = [light * (1 - level * light / run.peak) for light in run.light]
-
-
-@fault(10, 8, 6)
-def bits(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Bits that are left of numbers, in their old range."""
-    step = 2 ** (run.camera.bits - level)
-    _pixelwise(run, lambda frame: np.floor(frame / step) * step)
-
-
-@fault(2, 4, 8)
-def aligned(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Factor of all numbers, clipped at 16 bits."""
-    _pixelwise(run, lambda frame: np.minimum(frame * level, 65535 // level * level))
-
-
-@fault(95, 75, 40)
 def jpeg(run: Run, level: int, rng: np.random.Generator) -> None:
-    """Quality of JPEG files of 8 bits from which the numbers are read back."""
-
     def packed(frames: list[np.ndarray]) -> list[np.ndarray]:
-        scale = 255 / max(float(frame.max()) for frame in frames)
-        made = []
+        scale, made = 255 / max(float(frame.max()) for frame in frames), []
         for frame in frames:
             with tempfile.TemporaryFile() as file:
                 Image.fromarray(np.rint(frame * scale).astype(np.uint8)).save(file, "JPEG", quality=level)
@@ -631,93 +479,109 @@ def jpeg(run: Run, level: int, rng: np.random.Generator) -> None:
     run.after.append(packed)
 
 
-@fault(0.005, 0.02, 0.1)
-def smear(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Part of a column's mean light that each of its pixels gets."""
-    run.light = [light + level * light.mean(axis=0) for light in run.light]
-
-
-@fault("left-right", "up-down", "half turn")
-def turned(run: Run, level: str, rng: np.random.Generator) -> None:
-    """Mirrored or turned frames."""
-    steps = {"left-right": (1, -1), "up-down": (-1, 1), "half turn": (-1, -1)}[level]
-    run.light = [light[:: steps[0], :: steps[1]].copy() for light in run.light]
-
-
-@fault("transposed", "quarter turn", "other diagonal", needs="square")
-def transposed(run: Run, level: str, rng: np.random.Generator) -> None:
-    """Frames with rows and columns exchanged."""
-    steps = {"transposed": (1, 1), "quarter turn": (-1, 1), "other diagonal": (-1, -1)}[level]
-    run.light = [light.T[:: steps[0], :: steps[1]].copy() for light in run.light]
-
-
-# -- Light and optics
-
-
-@fault(0.02, 0.1, 0.3)
-def ambient(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Even ambient light, part of the peak."""
-    run.light = [light + level * run.peak for light in run.light]
-
-
-@fault(0.01, 0.05, 0.2, needs="time")
-def ambient_growing(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Even ambient light at the end of the run, from none at its start, part of the peak."""
-    run.light = [light + level * run.peak * k / (len(run.light) - 1) for k, light in enumerate(run.light)]
-
-
-@fault(0.01, 0.05, 0.2)
-def ambient_tilted(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Ambient light that grows along the columns, part of the peak."""
-    slope = _grid(run)[1] / run.camera.pixels[1]
-    run.light = [light + level * run.peak * slope for light in run.light]
-
-
-@fault(0.02, 0.1, 0.3)
-def glare(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Part of its own mean light that each frame gets everywhere."""
-    run.light = [light + level * light.mean() for light in run.light]
-
-
-@fault(0.01, 0.05, 0.2, needs="frames")
-def leak(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Light of dark projector pixels, part of that of lit ones."""
-    lamps = (run.lamp(shot) for shot in range(len(run.light)))
-    run.light = [run.light_of(shot, lamp=lamp + level * (1 - lamp)) for shot, lamp in enumerate(lamps)]
-
-
-@fault(0.01, 0.03, 0.1)
-def depth(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Relative distance by which the scene is too far or too near."""
-    level *= rng.choice([-1, 1])
-    run.light = [run.light_of(shot, nearer=level) for shot in range(len(run.light))]
-
-
-@fault(0.01, 0.05, 0.2)
-def gloss(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Height of a smooth field over the sensor that multiplies all light."""
-    rows, columns = (grid / size for grid, size in zip(_grid(run), run.camera.pixels, strict=True))
+def gloss(run: Run, level: float, rng: np.random.Generator) -> Light:
+    rows, columns = run.rows / run.camera.pixels[0], run.columns / run.camera.pixels[1]
     row, column = rng.uniform(0.2, 0.8, 2)
     bump = 1 + level * np.exp(-(np.square(rows - row) + np.square(columns - column)) / 0.08)
-    run.light = [light * bump for light in run.light]
+    return lambda light, shot: light * bump
 
 
-@fault(0.05, 0.25, 1.0)
-def another_mask(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Part of the mask's features that are drawn anew."""
-    run.light = [run.light_of(shot, flipped=level) for shot in range(len(run.light))]
+def leak(run: Run, level: float, rng: np.random.Generator, shot: int) -> dict[str, Any]:
+    lamp = run.lamp(shot)
+    return {"lamp": lamp + level * (1 - lamp)}
 
 
-@fault(0.002, 0.01, 0.03)
-def mask_distance(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Relative change of the mask's distance since the calibration."""
-    run.light = [run.light_of(shot, mask=level) for shot in range(len(run.light))]
+def level_of(run: Run, level: float, rng: np.random.Generator) -> dict[str, float]:
+    step = max(level * run.peak_dn, 0.5) * rng.choice([-1, 1])
+    return {"black": max(run.camera.black + step, 0.0)}
 
 
-@fault(0.1, 0.3, 1.0)
-def old_calibration(run: Run, level: float, rng: np.random.Generator) -> None:
-    """Sensor pixels that the mask moved since the calibration."""
-    run.light = [run.light_of(shot, moved=level) for shot in range(len(run.light))]
+def nearer(run: Run, level: float, rng: np.random.Generator) -> Fault:
+    moved = level * rng.choice([-1, 1])
+    return seen(lambda run, level, rng, shot: {"nearer": moved})
+
+
+TURNS = {"left-right": (1, -1), "up-down": (-1, 1), "half turn": (-1, -1)}
+TRANSPOSED = {"transposed": (1, 1), "quarter turn": (-1, 1), "other diagonal": (-1, -1)}
+FAULTS: dict[str, tuple[tuple[Any, ...], Fault, str]] = {
+    # True gain and read noise over the stated ones; error of the black level, part of the peak.
+    "gain": ((0.5, 2.0, 4.0), stated(lambda run, level, rng: {"gain": run.camera.gain / level}), ""),
+    "black_level": ((0.003, 0.02, 0.1), stated(level_of), ""),
+    "read_noise": ((0.3, 2.0, 5.0), stated(lambda run, level, rng: {"read": run.camera.read / level}), ""),
+    # Single frames: part of another scene, pixels of a roll, frames saved again or black, rows lost, light.
+    "foreign": ((0.2, 0.5, 1.0), single(other_scene), "time"),
+    "rolled": ((1, 2, 6), single(lambda run, level, rng, light, shot: np.roll(light, level, rng.integers(2))), "time"),
+    "repeated": ((1, 2, 4), repeated, "frames"),
+    "black_frame": ((1, 2, 4), single(lambda run, level, rng, light, shot: 0 * light, many=True), "time"),
+    "half_lost": ((0.1, 0.3, 0.6), single(
+        lambda run, level, rng, light, shot: light * (run.rows < (1 - level) * run.camera.pixels[0])), "time"),
+    "dimmed": ((0.97, 0.9, 0.5), single(lambda run, level, rng, light, shot: light * level), "time"),
+    "hand_in_three": ((0.1, 0.2, 0.35), hand(3), "time"),
+    "hand_in_one": ((0.1, 0.2, 0.35), hand(1), "time"),
+    # Time: deviation of the power, its loss, sensor pixels of motion midway or even, quarters of scene pixels, order.
+    "flicker": ((0.01, 0.03, 0.1), every(
+        lambda run, level, rng: lambda light, shot: light * (1 + level * rng.standard_normal())), "time"),
+    "drift": ((0.02, 0.05, 0.1), every(
+        lambda run, level, rng: lambda light, shot: light * (1 - level * run.time(shot))), "time"),
+    "camera_moved": ((0.1, 0.5, 1.0), seen(
+        lambda run, level, rng, shot: {"moved": level * (2 * shot >= len(run.light))}), "time"),
+    "camera_creeps": ((0.1, 0.5, 1.0), seen(
+        lambda run, level, rng, shot: {"moved": level * (8 * shot // len(run.light)) / 7}), "time"),
+    "scene_moved": ((1, 2, 4), seen(
+        lambda run, level, rng, shot: {"steps": (level * (2 * shot >= len(run.light)), 0)}), "time"),
+    "swapped": ((1, 5, 0), order(swapped), "frames"),
+    "lag": ((0.01, 0.05, 0.2), lag, "frames"),
+    "order": (("column-major", "reversed", "sequency or halves"), order(other_order), "frames"),
+    "late": ((1, 2, -1), order(
+        lambda run, level, rng: ([(k - level) % len(run.light) for k in range(len(run.light))], set())), "frames"),
+    # Sensor: light taken by dust and a hair, hot pixels and columns, dead rows, moved regions, lost lines, bands.
+    "dust": ((0.05, 0.2, 0.6), every(dust), ""),
+    "hair": ((0.1, 0.4, 0.9), every(hair), ""),
+    "hot_pixels": ((3, 20, 100), every(hot_pixels), ""),
+    "hot_column": ((0.02, 0.1, 0.5), every(hot_column), "time"),
+    "dead_row": ((1, 2, 4), every(lambda run, level, rng: (lambda dead: lambda light, shot: light * ~dead)(
+        np.isin(run.rows, rng.choice(run.camera.pixels[0], level, replace=False)))), ""),
+    "region": ((0.15, 0.3, 0.5), numbers(region), ""),
+    "dropped_line": (("one", "half", "all"), dropped_line, ""),
+    "bands": ((0.002, 0.01, 0.05), bands, ""),
+    "row_flicker": ((0.01, 0.05, 0.2), every(row_flicker), ""),
+    # Numbers: clipped from a part of the peak, smoothed, by a tone curve, of other bits, packed, smeared, turned.
+    "clipped": ((0.8, 0.65, 0.5), numbers(lambda run, level, rng: lambda frame: np.minimum(
+        frame, np.rint(run.camera.black + level * run.peak_dn + run.camera.gain * run.camera.dark))), ""),
+    "denoised": ((0.3, 0.7, 1.0), numbers(lambda run, level, rng: lambda frame: np.rint(
+        (1 - level) * frame + level * median_filter(frame, 3))), ""),
+    "blurred": ((0.4, 0.7, 1.5), numbers(
+        lambda run, level, rng: lambda frame: np.rint(gaussian_filter(frame, level))), ""),
+    "gamma": ((0.95, 0.8, 1 / 2.2), numbers(gamma), ""),
+    "nonlinear": ((0.02, 0.1, 0.3), every(
+        lambda run, level, rng: lambda light, shot: light * (1 - level * light / run.peak)), ""),
+    "bits": ((10, 8, 6), numbers(lambda run, level, rng: lambda frame: np.floor(
+        frame / 2 ** (run.camera.bits - level)) * 2 ** (run.camera.bits - level)), ""),
+    "aligned": ((2, 4, 8), numbers(
+        lambda run, level, rng: lambda frame: np.minimum(frame * level, 65535 // level * level)), ""),
+    "jpeg": ((95, 75, 40), jpeg, ""),
+    "smear": ((0.005, 0.02, 0.1), every(
+        lambda run, level, rng: lambda light, shot: light + level * light.mean(axis=0)), ""),
+    "turned": ((*TURNS,), every(
+        lambda run, level, rng: lambda light, shot: light[:: TURNS[level][0], :: TURNS[level][1]].copy()), ""),
+    "transposed": ((*TRANSPOSED,), every(lambda run, level, rng: lambda light, shot: light.T[
+        :: TRANSPOSED[level][0], :: TRANSPOSED[level][1]].copy()), "square"),
+    # Light and optics: ambient light by the peak, even, growing and tilted; glare; dark pixels that leak; depth; gloss.
+    "ambient": ((0.02, 0.1, 0.3), every(lambda run, level, rng: lambda light, shot: light + level * run.peak), ""),
+    "ambient_growing": ((0.01, 0.05, 0.2), every(
+        lambda run, level, rng: lambda light, shot: light + level * run.peak * run.time(shot)), "time"),
+    "ambient_tilted": ((0.01, 0.05, 0.2), every(lambda run, level, rng: lambda light, shot: light
+        + level * run.peak * run.columns / run.camera.pixels[1]), ""),
+    "glare": ((0.02, 0.1, 0.3), every(lambda run, level, rng: lambda light, shot: light + level * light.mean()), ""),
+    "leak": ((0.01, 0.05, 0.2), seen(leak), "frames"),
+    "depth": ((0.01, 0.03, 0.1), lambda run, level, rng: nearer(run, level, rng)(run, level, rng), ""),
+    "gloss": ((0.01, 0.05, 0.2), every(gloss), ""),
+    # The mask since the calibration: features drawn anew, its distance, sensor pixels that it moved.
+    "another_mask": ((0.05, 0.25, 1.0), seen(lambda run, level, rng, shot: {"flipped": level}), ""),
+    "mask_distance": ((0.002, 0.01, 0.03), seen(lambda run, level, rng, shot: {"mask": level}), ""),
+    "old_calibration": ((0.1, 0.3, 1.0), seen(lambda run, level, rng, shot: {"moved": level}), ""),
+}  # fmt: skip
+"""Levels of the three severities, the fault, and what it needs: "frames" that differ, "time", "square" or nothing."""
 
 
 # ---- Frames handed to mitsim -----------------------------------------------------------------------------------------
@@ -848,7 +712,8 @@ class Judge:
         run = Run(*case)
         wrong = lay(run, levels[severity], np.random.default_rng([self.seed, kind_number, severity, number]))
         found, twin = self.report(run), self.twin(*case)
-        letter, closed = verdict(found, twin), None
+        beyond, added = is_harmed(found, twin)
+        letter, closed = "F" if found["flagged"] else "." if not beyond else "S" if added else "T", None
         if letter in "ST" and found.get("limits"):
             closed = self.report(run, closing_frame(run, kind, levels[severity]))
             letter = "L" if letter == "S" and closed["flagged"] else letter
@@ -861,7 +726,7 @@ class Judge:
             **found,
             "wrong": sorted(wrong or ()),
             "twin": {key: twin.get(key) for key in ("flagged", "misfit", "stated", "error", "inside", "chi_square")},
-            "harmful": all(is_harmed(found, twin)),
+            "harmful": beyond and added,
             "verdict": letter,
             "with_closing_frame": closed,
             "seconds": time.perf_counter() - begun,
@@ -904,135 +769,73 @@ def is_harmed(found: dict[str, Any], twin: dict[str, Any]) -> tuple[bool, bool]:
     return bool(found["error"] > 2 * limit), bool(found["error"] > ADDED * alone)
 
 
-def verdict(found: dict[str, Any], twin: dict[str, Any]) -> str:
-    """Letter of a run in the table."""
-    if found["flagged"]:
-        return "F"
-    beyond, added = is_harmed(found, twin)
-    if not beyond:
-        return "."
-    return "S" if added else "T"
-
-
 # ---- Table -----------------------------------------------------------------------------------------------------------
 
 
-def key_of(one: dict[str, Any]) -> tuple[Any, ...]:
-    """What names a run across results."""
-    return one["kind"], one["severity"], one["family"], one["run"], one["seed"], one["peak"]
-
-
-def table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> Iterator[str]:
-    """Lines of the table, of the silent runs, and of the good runs."""
+def print_table(rows: list[dict[str, Any]], good: list[dict[str, Any]]) -> None:
+    """Print letters by kind and family, counts by family, the silent runs, and the good runs."""
     families = list(dict.fromkeys(one["family"] for one in rows))
-    if rows:
-        yield (
-            f"{'kind':16s}"
-            + "".join(f"{name:>14s}" for name in families)
-            + f"{'flagged':>12s}{'limit':>7s}{'silent':>8s}{'named':>9s}"
-        )
-    for kind in (name for name in FAULTS if any(one["kind"] == name for one in rows)):
-        own = [one for one in rows if one["kind"] == kind]
-        letters = []
-        for name in families:
-            runs = sorted((one for one in own if one["family"] == name), key=lambda one: (one["severity"], one["run"]))
-            letters.append("".join(one["verdict"] for one in runs) or "-")
-        flagged, limited, silent = (sum(one["verdict"] == letter for one in own) for letter in "FLS")
+    print(f"{'kind':16s}", *(f"{name:>13s}" for name in families))
+    for kind in dict.fromkeys(one["kind"] for one in rows):
+        own = sorted((one for one in rows if one["kind"] == kind), key=lambda one: (one["severity"], one["run"]))
+        letters = ["".join(one["verdict"] for one in own if one["family"] == name) or "-" for name in families]
         framed = [one for one in own if one["wrong"] and one["flagged"] and not one["refused"]]
         named = sum(set(one["wrong"]) <= set(one["named"]) for one in framed)
-        yield (
-            f"{kind:16s}"
-            + "".join(f"{each:>14s}" for each in letters)
-            + f"{flagged:>6d} of {len(own):<3d}{limited:>6d}{silent:>8d}"
-            + (f"{named:>6d}/{len(framed)}" if framed else "")
-        )
+        counts = [f"{sum(one['verdict'] == letter for one in own)} {letter}" for letter in "FLS"]
+        print(f"{kind:16s}", *(f"{each:>13s}" for each in letters), *counts, f"{named} of {len(framed)} named")
     for name in (*families, "all"):
         own = [one for one in rows if name in (one["family"], "all")]
-        count = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.LST"}
-        if own:
-            harmful = [one for one in own if one["harmful"]]
-            yield (
-                f"{name:16s} {len(own)} runs: {count['F']} flagged ({count['F'] / len(own):.1%}), {count['.']} not "
-                f"flagged and within twice the stated error, {count['L']} within a stated limit that the closing "
-                f"frame decides, {count['S']} silent, {count['T']} off like their twins; "
-                f"{sum(one['flagged'] for one in harmful)} of {len(harmful)} harmful ones are flagged"
-            )
+        harmful = [one for one in own if one["harmful"]]
+        counted: dict[str, Any] = {letter: sum(one["verdict"] == letter for one in own) for letter in "F.LST"}
+        show(name, {"runs": len(own), **counted, "harmful": len(harmful), "flagged of these": sum(
+            one["flagged"] for one in harmful)})  # fmt: skip
+    shown = ("level", "run", "error", "stated", "extrapolated", "chi_square", "seed", "peak", "picture", "camera")
     for one in (one for one in rows if one["verdict"] in "LST"):
-        stated = "none" if one["stated"] is None else f"{one['stated']:.2g}"
-        yield (
-            f"{one['verdict']} {one['kind']} {one['level']} {case_text(one)} run {one['run']}: error {one['error']:.2g}"
-            f", stated {stated}{' (extrapolated)' if one['extrapolated'] else ''}, without the fault "
-            f"{one['twin']['error'] or np.nan:.2g}, chi-square {one['chi_square'] or np.nan:.3f}"
-        )
+        row = {name: one[name] for name in shown}
+        show(f"{one['verdict']} {one['kind']} {one['family']}", {**row, "without the fault": one["twin"]["error"]})
     if good:
-        alarms = [one for one in good if one["misfit"]]
-        others = sum(one["flagged"] and not one["misfit"] for one in good)
         solved = [one for one in good if not one["refused"] and one["stated"]]
-        ratios = np.array([one["error"] / one["stated"] for one in solved])
-        least, median, most = np.quantile(ratios, [0.05, 0.5, 0.95])
-        yield (
-            f"good runs: {len(alarms)} false alarms of {len(good)}; {others} flagged for other reasons; error over "
-            f"stated {least:.2f} {median:.2f} {most:.2f} {ratios.max():.2f} (5 %, median, 95 %, most)"
-        )
-        for one in alarms:
-            yield f"alarm {case_text(one)}: {one['words'][:300]}"
+        show("good runs", {
+            "runs": len(good), "false alarms": sum(one["misfit"] for one in good),
+            "flagged for other reasons": sum(one["flagged"] and not one["misfit"] for one in good),
+            **ratios([one["error"] / one["stated"] for one in solved]),
+        })  # fmt: skip
         for one in (one for one in solved if one["error"] > 2 * one["stated"]):
-            yield f"beyond twice the stated error: {case_text(one)}: {one['error']:.2g}, stated {one['stated']:.2g}" + (
-                " (extrapolated)" if one["extrapolated"] else ""
-            )
-
-
-def case_text(one: dict[str, Any]) -> str:
-    """Name the case of a run."""
-    return f"{one['family']} {one['picture']} camera {one['camera']} peak {one['peak']:g} seed {one['seed']}"
-
-
-def compared(rows: list[dict[str, Any]], old: Path) -> Iterator[str]:
-    """Lines on runs that an ``old`` result flagged and that are not flagged now."""
-    before = {key_of(one): one for one in json.loads(old.read_text())["rows"]}
-    pairs = [(one, before[key_of(one)]) for one in rows if key_of(one) in before]
-    lost = [one for one, earlier in pairs if earlier["flagged"] and not one["flagged"]]
-    yield f"flagged in {old.name} and not now: {len(lost)} of {sum(earlier['flagged'] for _, earlier in pairs)}"
-    for one in lost:
-        within = "within" if one["verdict"] == "." else "beyond"
-        yield f"  {one['kind']} {one['level']} {one['family']} run {one['run']}: error {within} twice the stated one"
+            show(f"beyond twice the stated error {one['family']}", {name: one[name] for name in shown[2:]})
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("result", type=Path)
+    parser = arguments(__doc__, seed=True, required=True)
     parser.add_argument("--kinds", nargs="*", default=list(FAULTS), choices=list(FAULTS), metavar="KIND")
     parser.add_argument("--families", nargs="+", default=FAMILIES)
     parser.add_argument("--severities", nargs="+", type=int, default=(0, 1, 2))
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--good", type=int, default=0, help="runs without a fault")
-    parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
     parser.add_argument("--peaks", nargs="+", type=float, default=PEAKS, help="photoelectrons of the brightest pixel")
-    parser.add_argument("--old", type=Path, help="earlier RESULT.json to compare with")
+    parser.add_argument("--old", type=Path, help="earlier file to compare with")
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     good: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         judge = Judge(Path(folder), options.seed, options.peaks)
         for kind in options.kinds:
-            for name in options.families:
-                for severity in options.severities:
-                    for number in range(options.runs):
-                        if one := judge.judged(kind, severity, name, number):
-                            rows.append(one)
-                            if one["verdict"] in "ST":
-                                print(json.dumps(one), flush=True)
-            options.result.write_text(json.dumps({"rows": rows, "good": good}, indent=1), encoding="utf-8")
+            for name, severity, number in product(options.families, options.severities, range(options.runs)):
+                if one := judge.judged(kind, severity, name, number):
+                    rows.append(one)
+                    if one["verdict"] in "ST":
+                        show(one["verdict"], one)
+            write(options.json, {"rows": rows, "good": good})
         for number in range(options.good):
             name = options.families[number % len(options.families)]
             case = judge.case(number // len(options.families), name, options.seed + 500 + number)
             good.append({**described(case), **judge.report(Run(*case))})
             if good[-1]["misfit"]:
-                print(json.dumps(good[-1]), flush=True)
-    options.result.write_text(json.dumps({"rows": rows, "good": good}, indent=1), encoding="utf-8")
-    print("\n".join(table(rows, good)))
+                show("alarm", good[-1])
+    write(options.json, {"rows": rows, "good": good})
+    print_table(rows, good)
     if options.old:
-        print("\n".join(compared(rows, options.old)))
+        names = ("kind", "severity", "family", "run", "seed", "peak")
+        lost(rows, options.old, lambda one: tuple(one[name] for name in names))
 
 
 if __name__ == "__main__":

@@ -9,14 +9,15 @@ mirror, instances, bumps under a blend. FOLDER/NAME/NAME.xml stands beside the f
 
 from __future__ import annotations
 
-import argparse
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
+from harness import ROOT
 from skimage import io
 
-BENCH = Path(__file__).parent.parent / "scenes" / "photograph"
+BENCH = ROOT / "scenes" / "photograph"
 
 
 def twosided(bsdf: str) -> str:
@@ -132,12 +133,5 @@ def write(folder: Path) -> dict[str, Path]:
     return found
 
 
-def main() -> None:
-    """Write the scenes."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    write(parser.parse_args().folder)
-
-
 if __name__ == "__main__":
-    main()
+    write(Path(sys.argv[1]))

@@ -1,6 +1,6 @@
 """Count how often faulty frames are flagged, with the true frames among those named, and how often good runs are.
 
-    python benchmarks/frame_faults.py RESULT.json [--rounds 4] [--fitting 240] [--seed 0] [--sizes 64 128] [--peaks ...]
+    python benchmarks/frame_faults.py --json FILE [--rounds 4] [--fitting 240] [--seed 0] [--sizes 64 128] [--peaks ...]
         [--old OLD.json]
 
 The runs are of the ideal cameras of the tests (tests/ideal_sessions.py): frames of the paper's model with drawn noise,
@@ -17,16 +17,13 @@ is judged by its outcome, not by the name of a cause:
 
 Faults that change nothing, for example an exchange of two frames that are alike, are no runs. Good runs have no fault.
 A false alarm is a good run that is flagged because of its frames; of glossy scenes, whose misfit may be flagged, one
-that lists frames or pixels, or another reading of its frames. RESULT.json holds all runs, the runs that went wrong and
-the rates with their 95 % intervals (Wilson). ``--old`` lists the runs that an earlier RESULT.json has as flagged and
+that lists frames or pixels, or another reading of its frames. FILE holds all runs, the runs that went wrong and
+the rates with their 95 % intervals (Wilson). ``--old`` lists the runs that an earlier file has as flagged and
 that are not flagged now. 4 rounds and 240 good runs take 25 minutes on a core.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -36,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import ROOT, arguments, interval, lost, show, write
 from skimage import io, transform
 
 from mitsim.core.errors import MitsimError
@@ -45,10 +43,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
-
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))
-from tests.ideal_sessions import BLACK, CODES, DARK, GAIN, READ, Bench  # noqa: E402
+from tests.ideal_sessions import BLACK, CODES, DARK, GAIN, READ, Bench
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8", "uniform"
 PEAKS = 2e4, 4e3, 800.0
@@ -235,8 +230,6 @@ FAULTS: dict[str, Any] = {
 }
 IN_FRAMES = "black", "dim", "half_lost", "shifted", "clipped", "repeated", "swapped"
 """Faults of single frames, which have to be named."""
-RIGHT = "flagged", "named"
-"""Outcomes of runs whose fault is reported."""
 
 
 def changed(shots: Capture, frames: Frames, codes: float = CODES) -> Capture:
@@ -253,7 +246,7 @@ def verdict(shots: Capture, factors: Factors, true: np.ndarray) -> dict[str, Any
     try:
         found = reconstruct(shots, factors)
     except MitsimError as error:
-        return {"refused": str(error), "flagged": True, "named": []}
+        return {"refused": str(error), "flagged": True, "named": [], "pixels": False, "readings": False}
     misfit = found.misfit.summary() if found.misfit else {}
     faults = misfit.get("faults") or []
     return {
@@ -268,16 +261,6 @@ def verdict(shots: Capture, factors: Factors, true: np.ndarray) -> dict[str, Any
         "words": f"{found.status} {'; '.join(found.trust)}",
         "error": float(np.linalg.norm(found.image - true) / np.linalg.norm(true)),
     }
-
-
-def outcome(fault: str, numbers: set[int], reported: dict[str, Any]) -> str:
-    """Return ``flagged``, ``named`` (flagged, with the frames of these ``numbers``), or an empty text."""
-    if not (reported["flagged"] or (fault == "dead" and reported["pixels"])):
-        return ""
-    # Of two frames that are one, it need not be clear which is the other.
-    if fault in IN_FRAMES and numbers <= set(reported["named"]):
-        return "named"
-    return "flagged"
 
 
 def faulty(
@@ -296,8 +279,10 @@ def faulty(
         factors = replace(camera(mask, n, other=True)).calibrated(seed)
     true = scene(name, n, seed)
     reported = verdict(changed(shots, laid, CODES * 16 if fault == "scale" else CODES), factors, true)
-    found = outcome(fault, numbers, reported)
-    if not found:
+    reported["flagged"] |= fault == "dead" and reported["pixels"]
+    if reported["flagged"]:
+        found = "named" if fault in IN_FRAMES and numbers <= set(reported["named"]) else "flagged"
+    else:
         reported["harm"] = reported["error"] / verdict(shots, factors, true).get("error", np.inf)
         found = "harmless" if reported["harm"] < HARMLESS else "missed"
     return found, {**reported, "laid": sorted(numbers)}
@@ -319,89 +304,58 @@ def _is_still(frames: Frames, laid: Frames) -> bool:
     return bool(np.square(differences).mean() < noise * (1 + 10 * np.sqrt(2 / len(differences))))
 
 
-def interval(right: int, of: int) -> list[float]:
-    """Return a rate and its 95 % interval after Wilson (1927)."""
-    z, rate = 1.96, right / of
-    middle, half = rate + z * z / 2 / of, z * np.sqrt(rate * (1 - rate) / of + z * z / 4 / of**2)
-    return [float(value) for value in (rate, (middle - half) / (1 + z * z / of), (middle + half) / (1 + z * z / of))]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("result", type=Path)
+    parser = arguments(__doc__, seed=True, required=True)
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--fitting", type=int, default=240, help="runs without a fault")
     parser.add_argument("--sizes", nargs="+", type=int, default=tuple(PIXELS))
     parser.add_argument("--peaks", nargs="+", type=float, default=PEAKS)
-    parser.add_argument("--seed", type=int, default=0, help="another draws other runs")
     parser.add_argument("--faults", nargs="+", default=tuple(FAULTS))
     parser.add_argument("--families", nargs="+", default=FAMILIES)
-    parser.add_argument("--old", type=Path, help="earlier RESULT.json to compare with")
+    parser.add_argument("--old", type=Path, help="earlier file to compare with")
     options = parser.parse_args()
-    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-    runs: list[dict[str, Any]] = []
+    counts: dict[str, list[bool]] = defaultdict(list)
+    rows: list[dict[str, Any]] = []
 
-    def count(key: str, right: bool) -> None:
-        counts[key][0] += right
-        counts[key][1] += 1
+    def note(fault: str | None, case: tuple[Any, ...], verdict: str, reported: dict[str, Any]) -> None:
+        rows.append({"fault": fault, "case": [*case], "verdict": verdict, **reported})
+        if verdict in ("missed", "alarm"):
+            show(f"{verdict} {fault} {case}", reported)
 
     plain = [name for name in SCENES if name not in GLOSSY]
     cases = product(range(options.rounds), options.sizes, options.peaks, options.families, options.faults)
     for number, (turn, n, peak, family, fault) in enumerate(cases):
         if family == "uniform" and fault in SINGLE:
             continue
-        mask, name, seed = (
-            MASKS[(turn + number) % len(MASKS)],
-            plain[number % len(plain)],
-            options.seed + 100 * turn + number % 97,
-        )
-        judged = faulty(fault, mask, name, family, n, peak, seed)
+        mask, name = MASKS[(turn + number) % len(MASKS)], plain[number % len(plain)]
+        case = mask, name, family, n, peak, options.seed + 100 * turn + number % 97
+        judged = faulty(fault, *case)
         if judged is None:
             continue
         found, reported = judged
-        runs.append({"fault": fault, "case": [mask, name, family, n, peak, seed], "outcome": found, **reported})
-        count("harmless", found == "harmless")
-        if found == "harmless":
-            continue
-        for key in (f"fault {fault}", f"family {family}", f"pixels {n}", f"peak {peak:g}", "all"):
-            count(f"{key} flagged", found != "missed")
-        if fault in IN_FRAMES and found != "missed" and "refused" not in reported:
-            count(f"fault {fault} named", found == "named")
-            count("all named", found == "named")
-        if found == "missed":
-            print(json.dumps(runs[-1]), flush=True)
+        note(fault, case, found, reported)
+        counts["harmless"].append(found == "harmless")
+        if found != "harmless":
+            for key in (f"fault {fault}", f"family {family}", f"pixels {n}", f"peak {peak:g}", "all"):
+                counts[f"{key} flagged"].append(found != "missed")
+            if fault in IN_FRAMES and found != "missed" and "refused" not in reported:
+                for key in (f"fault {fault}", "all"):
+                    counts[f"{key} named"].append(found == "named")
     for number in range(options.fitting):
-        family, name = options.families[number % len(options.families)], SCENES[number % len(SCENES)]
-        seed = options.seed + 5000 + number
-        mask, n = MASKS[number // 5 % len(MASKS)], options.sizes[number // 7 % len(options.sizes)]
-        peak = options.peaks[number // 3 % len(options.peaks)]
-        reported = verdict(*run_of(mask, name, family, n, peak, seed), scene(name, n, seed))
+        name, family = SCENES[number % len(SCENES)], options.families[number % len(options.families)]
+        n, peak = options.sizes[number // 7 % len(options.sizes)], options.peaks[number // 3 % len(options.peaks)]
+        case = MASKS[number // 5 % len(MASKS)], name, family, n, peak, options.seed + 5000 + number
+        reported = verdict(*run_of(*case), scene(name, n, case[-1]))
         alarm = "refused" in reported or bool(reported["named"] or reported["pixels"] or reported["readings"])
         alarm |= bool(reported.get("misfit")) and name not in GLOSSY
-        count("false alarms", alarm)
-        outcome_of_good = "alarm" if alarm else "good"
-        runs.append(
-            {"fault": None, "case": [mask, name, family, n, peak, seed], "outcome": outcome_of_good, **reported}
-        )
-        if alarm:
-            print(json.dumps(runs[-1]), flush=True)
-    rates: dict[str, dict[str, Any]] = {
-        key: {"right": right, "of": of, "rate": interval(right, of)} for key, (right, of) in sorted(counts.items())
-    }
-    wrong = [run for run in runs if run["outcome"] in ("missed", "alarm")]
-    result = {"rates": rates, "wrong": wrong, "runs": runs}
-    options.result.write_text(json.dumps(result, indent=1), encoding="utf-8")
-    for key, one in rates.items():
-        rate, low, high = one["rate"]
-        print(f"{key:28s} {one['right']:4d} of {one['of']:4d}: {rate:.1%} ({low:.1%} to {high:.1%})", flush=True)
+        counts["false alarms"].append(alarm)
+        note(None, case, "alarm" if alarm else "good", reported)
+    rates = {key: interval(sum(each), len(each)) for key, each in sorted(counts.items())}
+    write(options.json, {"rates": rates, "rows": rows})
+    for key, (rate, low, high) in rates.items():
+        print(f"{key:28s} {sum(counts[key]):4d} of {len(counts[key]):4d}: {rate:.1%} ({low:.1%} to {high:.1%})")
     if options.old:
-        before = {(run["fault"], *run["case"]): run for run in json.loads(options.old.read_text())["runs"]}
-        pairs = [(run, before.get((run["fault"], *run["case"]))) for run in runs if run["fault"]]
-        known = [(run, old) for run, old in pairs if old]
-        lost = [run for run, old in known if old["outcome"] in RIGHT and run["outcome"] not in RIGHT]
-        print(f"flagged before and not now: {len(lost)} of {sum(old['outcome'] in RIGHT for _, old in known)}")
-        for run in lost:
-            print(f"  {run['outcome']}: {run['fault']} {run['case']}")
+        lost([row for row in rows if row["fault"]], options.old, lambda row: (row["fault"], *row["case"]))
 
 
 if __name__ == "__main__":

@@ -13,10 +13,8 @@ the same seed and the same code.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import importlib
-import json
 import os
 import pkgutil
 import random
@@ -31,26 +29,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
+import hostile_texts as texts
 import psutil
+from harness import arguments, held, show, write
 from hostile_files import Good, Make, arrays, changed, hdf5, matlab, openexr, pictures, saved
-from hostile_texts import (
-    arguments,
-    cameras,
-    changed_scenes,
-    devices,
-    manifests,
-    masks,
-    places,
-    repeats,
-    resumed,
-    runs,
-    scenes,
-    sessions,
-    steps,
-    studies,
-)
 
 import mitsim.cli
 from mitsim.core.errors import MitsimError
@@ -78,19 +60,7 @@ class Outcome:
     said: str = ""
 
 
-BEFOREHAND = (
-    "core",
-    "devices",
-    "sensor",
-    "scene",
-    "bench",
-    "acquire",
-    "reconstruct",
-    "report",
-    "studies",
-    "exchange",
-    "sessions",
-)
+BEFOREHAND = "core devices sensor scene bench acquire reconstruct report studies exchange sessions".split()
 """Rooms whose modules commands import where they use them: all before the first input, which then takes no second."""
 KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
     "pictures": (11, [pictures]),
@@ -103,20 +73,18 @@ KINDS: dict[str, tuple[int, list[Callable[[Good], Make]]]] = {
     "MATLAB": (7, [matlab]),
     "MATLAB, bytes": (3, [changed("run.mat")]),
     "images of sense": (4, [changed("light.npy"), changed("light.exr")]),
-    "studies": (5, [studies]),
-    "runs": (5, [runs]),
-    "manifests": (8, [manifests]),
-    "sessions": (6, [sessions]),
-    "folders that are repeated": (6, [repeats]),
-    "sessions that go on": (6, [resumed]),
-    "sessions with a bad step": (6, [steps]),
-    "cameras": (4, [cameras]),
-    "devices": (8, [devices]),
-    "masks": (2, [masks]),
-    "places": (7, [places]),
-    "arguments": (4, [arguments]),
-    "scenes": (4, [scenes]),
-    "scenes, changed": (7, [changed_scenes]),
+    "studies": (5, [texts.studies]),
+    "manifests": (13, [texts.manifests]),
+    "sessions": (6, [texts.sessions]),
+    "folders that are repeated": (6, [texts.repeats]),
+    "sessions that go on": (6, [texts.resumed]),
+    "sessions with a bad step": (6, [texts.steps]),
+    "devices": (12, [texts.devices]),
+    "masks": (2, [texts.masks]),
+    "places": (7, [texts.places]),
+    "arguments": (4, [texts.arguments]),
+    "scenes": (4, [texts.scenes]),
+    "scenes, changed": (7, [texts.changed_scenes]),
 }
 """Share of all inputs, and what makes them."""
 
@@ -245,35 +213,6 @@ def table(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     return rows
 
 
-class Results:
-    """All outcomes, in a file that is written as they come."""
-
-    def __init__(self, path: Path | None, seed: int) -> None:
-        self.path, self.outcomes = path, list[Outcome]()
-        self.about = {"seed": seed, "code": code()}
-        if path is not None and path.is_file():
-            kept = json.loads(path.read_text())
-            if {name: kept.get(name) for name in self.about} == self.about:
-                self.outcomes = [Outcome(**row) for row in kept["outcomes"]]
-
-    def add(self, outcome: Outcome) -> None:
-        self.outcomes.append(outcome)
-        if outcome.broken:
-            reported = f"{outcome.kind} {outcome.seed}: {'; '.join(outcome.broken)}: {outcome.said.strip()[-300:]!r}"
-            sys.stdout.write(f"{reported}\n  {outcome.command}\n")
-            sys.stdout.flush()
-        if len(self.outcomes) % 20 == 0:
-            self.write()
-
-    def write(self) -> None:
-        if self.path is None:
-            return
-        reported = {**self.about, "inputs": len(self.outcomes), "kinds": table(self.outcomes)}
-        part = self.path.with_suffix(".part")
-        part.write_text(json.dumps({**reported, "outcomes": [asdict(each) for each in self.outcomes]}, indent=1) + "\n")
-        part.replace(self.path)
-
-
 def code() -> str:
     """SHA-256 of mitsim's source and of these inputs."""
     digest = hashlib.sha256()
@@ -282,21 +221,25 @@ def code() -> str:
     return digest.hexdigest()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Run them all, print and write the table; 1 where a rule was broken."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path)
+    parser = arguments(__doc__, seed=True)
     parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", nargs="*", choices=KINDS, default=[*KINDS])
-    asked = parser.parse_args(arguments)
-    whole = sum(KINDS[kind][0] for kind in asked.kind)
+    asked = parser.parse_args()
     for room in BEFOREHAND:
         package = importlib.import_module(f"mitsim.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
-    results = Results(asked.json, asked.seed)
-    done = {(each.kind, each.seed) for each in results.outcomes}
+    about = {"seed": asked.seed, "code": code()}
+    kept = held(asked.json, {})
+    outcomes = [Outcome(**row) for row in kept["outcomes"]] if about.items() <= kept.items() else list[Outcome]()
+    done, whole = {(each.kind, each.seed) for each in outcomes}, sum(KINDS[kind][0] for kind in asked.kind)
+
+    def save() -> None:
+        table_and_rows = {"kinds": table(outcomes), "outcomes": [asdict(each) for each in outcomes]}
+        write(asked.json, {**about, "inputs": len(outcomes), **table_and_rows})
+
     with tempfile.TemporaryDirectory(prefix="mitsim-good-") as folder:
         good = Good(Path(folder) / "good")
         for kind in asked.kind:
@@ -304,13 +247,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             makes = [maker(good) for maker in makers]
             for number in range(max(round(asked.count * share / whole), 1)):
                 if (kind, asked.seed + number) not in done:
-                    results.add(tried(kind, asked.seed + number, makes[number % len(makes)]))
-            rows = [row for row in table(results.outcomes) if row["kind"] == kind]
-            sys.stdout.write("".join(json.dumps(row) + "\n" for row in rows))
-            sys.stdout.flush()
-    results.write()
-    broken = sum(bool(each.broken) for each in results.outcomes)
-    sys.stdout.write(f"{len(results.outcomes)} inputs, {broken} broke a rule\n")
+                    one = tried(kind, asked.seed + number, makes[number % len(makes)])
+                    outcomes.append(one)
+                    if one.broken:
+                        said = one.said.strip()[-300:]
+                        print(f"{kind} {one.seed}: {'; '.join(one.broken)}: {said!r}\n  {one.command}", flush=True)
+                    if number % 20 == 0:
+                        save()
+            for row in table([each for each in outcomes if each.kind == kind]):
+                show(kind, row)
+    save()
+    broken = sum(bool(each.broken) for each in outcomes)
+    print(f"{len(outcomes)} inputs, {broken} broke a rule")
     return int(bool(broken))
 
 

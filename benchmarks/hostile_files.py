@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import OpenEXR
 import scipy.io
+from harness import ROOT
 from PIL import Image, ImageCms
 
 from mitsim.core.environment import versions
@@ -31,7 +32,6 @@ from tests.exchanged import made
 from tests.hard.fuzz import bytes_changed
 from tests.real_session import RealSession
 
-ROOT = Path(__file__).parents[1]
 FRAMES = ("--camera", "imx249", "--patterns", "uniform", "--exposure", "0.1", "--projector-pixels", "4")
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".webp", ".bmp", ".gif", ".PNG", ".Tif", ".npy", ".exr")
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr", "LAB", "I", "I;16", "I;16B", "F")
@@ -98,9 +98,6 @@ def _read(path: Path) -> Sequence[str]:
 def pictures(good: Good) -> Make:
     """Pictures that claim, hide, turn or repeat."""
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     def png(width: int, height: int, more: bytes = b"", bits: int = 8, lines: int | None = None) -> bytes:
         size = (width * bits // 8 + 1) * (height if lines is None else lines)
         rows = zlib.compress(bytes(min(size, 1 << 20)))
@@ -121,9 +118,7 @@ def pictures(good: Good) -> Make:
             (folder / "a.png").write_bytes(png(min(many, 2**31 - 1), chance.choice((1, 8, 65535)), lines=4))
             return _read(folder / "a.png")
         if which == 1:
-            kind = chance.choice(
-                (b"acTL", b"eXIf", b"tRNS", b"iCCP", b"zTXt", b"tEXt", b"gAMA", b"sBIT", b"fcTL", b"qqqq")
-            )
+            kind = chance.choice(b"acTL eXIf tRNS iCCP zTXt tEXt gAMA sBIT fcTL qqqq".split())
             content = chance.randbytes(chance.choice((0, 1, 8, 26, 5000)))
             if kind in (b"iCCP", b"zTXt"):
                 content = b"a\0\0" + zlib.compress(bytes(1 << 24))
@@ -162,25 +157,16 @@ def pictures(good: Good) -> Make:
             (folder / "a.raw").write_bytes(bytes(chance.choice((0, 63, 64, 128, 129))))
             if chance.random() < 0.4:
                 os.truncate(folder / "a.raw", chance.choice((1 << 30, 1 << 40)))
-            pixels, bits = (
-                chance.choice(("8x8", "16384x16384", "0x4", "99999x1", "axb")),
-                chance.choice(("8", "16", "0")),
-            )
-            return (
-                "import",
-                str(folder / "a.raw"),
-                *FRAMES,
-                "-o",
-                str(folder / "out"),
+            form = (
                 "--shape",
-                pixels,
+                chance.choice("8x8 16384x16384 0x4 99999x1 axb".split()),
                 "--bits",
-                bits,
+                chance.choice("8 16 0".split()),
             )
+            return ("import", str(folder / "a.raw"), *FRAMES, "-o", str(folder / "out"), *form)
         name = chance.choice(("a.png", "a.tif", "a.npy", "a.exr", "a.raw", "a.h5", "a.mat"))
-        (folder / name).write_bytes(
-            chance.choice((b"", b"\0" * 100, b"hello", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MATLAB 5.0"))
-        )
+        starts = (b"", b"\0" * 100, b"hello", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MATLAB 5.0")
+        (folder / name).write_bytes(chance.choice(starts))
         return _read(folder / name)
 
     return make

@@ -27,19 +27,8 @@ def studies(good: Good) -> Make:
         part = folder / "part"
         shutil.copytree(good.folder / "part", part)
         head = json.loads((part / "patterns.json").read_text())
-        names: tuple[Any, ...] = (
-            "os.path",
-            "patterns",
-            "all",
-            "..a",
-            "a.b\x1b[2J",
-            None,
-            [],
-            "antigravity",
-            "this.that",
-            "sweep",
-            "x" * 9999,
-        )
+        names: list[Any] = ["a.b\x1b[2J", None, [], "x" * 9999]
+        names += "os.path patterns all ..a antigravity this.that sweep".split()
         if chance.random() < 0.7:
             head["study"] = chance.choice(names)
         head = json_changed(head, chance) if chance.random() < 0.6 else head
@@ -61,149 +50,28 @@ def studies(good: Good) -> Make:
     return make
 
 
-def runs(good: Good) -> Make:
-    """RUN and CAL folders with one file changed, reconstructed or exported."""
-
-    def make(chance: random.Random, folder: Path) -> Sequence[str]:
-        shutil.copytree(good.bench.run, folder / "run")
-        shutil.copytree(good.bench.calibration, folder / "cal")
-        place = folder / chance.choice(("run", "cal"))
-        path = chance.choice(sorted(place.iterdir()))
-        if path.suffix == ".json" and chance.random() < 0.8:
-            path.write_text(json.dumps(json_changed(json.loads(path.read_text()), chance)))
-        elif chance.random() < 0.2:
-            path.unlink()
-            chance.choice((lambda: path.mkdir(), lambda: os.mkfifo(path), lambda: path.symlink_to("/dev/zero")))()
-        else:
-            path.write_bytes(bytes_changed(path.read_bytes(), chance))
-        out, cal = str(folder / "out"), str(folder / "cal")
-        if chance.random() < 0.5:
-            return ("reconstruct", str(folder / "run"), "--calibration", cal, "-o", out)
-        kind, ending = chance.choice((("hdf5", ".h5"), ("mat", ".mat")))
-        return ("export", str(folder / "run"), "--format", kind, "--calibration", cal, "-o", out + ending)
-
-    return make
-
-
-def cameras(good: Good) -> Make:
-    """Camera files with a line changed, behind which an image is put."""
-    lines = (good.folder / "camera.toml").read_text().splitlines()
-    keys = [number for number, line in enumerate(lines) if " = " in line]
-    odd = (
-        "0",
-        "-1",
-        "1e308",
-        "1e-308",
-        "nan",
-        "inf",
-        '"x"',
-        "[]",
-        "{}",
-        "true",
-        "1" * 400,
-        "[[" * 500,
-        '"\\u0000"',
-        "1_0",
-        "",
-    )
-
-    def make(chance: random.Random, folder: Path) -> Sequence[str]:
-        text = [*lines]
-        number = chance.choice(keys)
-        name = text[number].partition(" = ")[0]
-        text[number] = chance.choice(
-            (f"{name} = {chance.choice(odd)}", f"{name}{name} = 1", "", f"[{name}]", "[mask]\nkind = 3")
-        )
-        content = "\n".join(text).encode()
-        (folder / "camera.toml").write_bytes(bytes_changed(content, chance) if chance.random() < 0.2 else content)
-        camera = str(folder / "camera.toml")
-        return ("sense", str(good.folder / "light.npy"), "--camera", camera, "-o", str(folder / "out.npy"))
-
-    return make
-
-
 def arguments(good: Good) -> Make:
     """Words that no argument can have."""
-    odd = (
-        "",
-        "0",
-        "-1",
-        "nan",
-        "inf",
-        "1e99",
-        "x",
-        "dots:",
-        "dots:4096",
-        "hadamard:4096",
-        "random:4096",
-        "dots:1x4096",
-        "\x1b[2J",
-    )
+    odd = ["", *"0 -1 nan inf 1e99 x dots: dots:4096 hadamard:4096 random:4096 dots:1x4096 \x1b[2J".split()]
 
     def make(chance: random.Random, folder: Path) -> Sequence[str]:
         out, word = str(folder / "out"), chance.choice(odd)
         light = str(good.folder / "light.npy")
-        return chance.choice(
-            (
-                ("patterns", word, "-o", out, "--projector-pixels", chance.choice(("4", "128", "4096", "0", "x"))),
-                ("patterns", "stripes", "-o", out, "--camera", "imx249", "--exposure", word, "--projector-pixels", "2"),
-                (
-                    "sense",
-                    light,
-                    "--camera",
-                    "imx249",
-                    "-o",
-                    out + ".png",
-                    chance.choice(("--scale", "--exposure", "--f-number")),
-                    word,
-                ),
-                (
-                    "import",
-                    str(good.folder / "a.png"),
-                    *FRAMES[:4],
-                    "--exposure",
-                    word,
-                    "--projector-pixels",
-                    "4",
-                    "-o",
-                    out,
-                ),
-                (
-                    "export",
-                    str(good.bench.run),
-                    "--format",
-                    chance.choice(("png", "hdf5", word)),
-                    "--projector",
-                    word,
-                    "-o",
-                    out,
-                ),
-                (
-                    "reconstruct",
-                    str(good.bench.run),
-                    "--calibration",
-                    str(good.bench.calibration),
-                    "--lambda",
-                    word,
-                    "-o",
-                    out,
-                ),
-                (
-                    "plan",
-                    "photograph",
-                    chance.choice(("--patterns", "--accuracy", "--seconds", "--effects", "-D")),
-                    word,
-                ),
-                (
-                    "characterise",
-                    "imx249",
-                    "-o",
-                    out,
-                    chance.choice(("--pixels", "--steps", "--frames", "--wavelength")),
-                    "-" + word,
-                ),
-            )
+        run, cal = str(good.bench.run), str(good.bench.calibration)
+        few = ("--projector-pixels", chance.choice(("4", "128", "4096", "0", "x")))
+        sensing = ("sense", light, "--camera", "imx249", "-o", out + ".png")
+        imported = ("import", str(good.folder / "a.png"), *FRAMES[:4], "--projector-pixels", "4", "-o", out)
+        commands = (
+            ("patterns", word, "-o", out, *few),
+            ("patterns", "stripes", "-o", out, "--camera", "imx249", "--exposure", word, "--projector-pixels", "2"),
+            (*sensing, chance.choice(("--scale", "--exposure", "--f-number")), word),
+            (*imported, "--exposure", word),
+            ("export", run, "--format", chance.choice(("png", "hdf5", word)), "--projector", word, "-o", out),
+            ("reconstruct", run, "--calibration", cal, "--lambda", word, "-o", out),
+            ("plan", "photograph", chance.choice("--patterns --accuracy --seconds --effects -D".split()), word),
+            ("characterise", "imx249", "-o", out, chance.choice("--pixels --steps --frames".split()), "-" + word),
         )
+        return chance.choice(commands)
 
     return make
 
@@ -223,18 +91,7 @@ def scenes(good: Good) -> Make:
 def changed_scenes(good: Good) -> Make:
     """Scenes with values, objects and bytes changed; with bitmaps and meshes of other kinds, in other places and under
     odd names; includes that come back; odd values of parameters."""
-    odd = (
-        "a\nb.png",
-        "\x1b[2J.png",
-        "-o.png",
-        "../a.png",
-        "/etc/passwd",
-        "a\\b.png",
-        "é.png",
-        "%s.png",
-        "$albedo",
-        " ",
-    )
+    odd = ["a\nb.png", " ", *"\x1b[2J.png -o.png ../a.png /etc/passwd a\\b.png é.png %s.png $albedo".split()]
 
     def make(chance: random.Random, folder: Path) -> Sequence[str]:
         place = folder / "scene"
@@ -266,59 +123,20 @@ def changed_scenes(good: Good) -> Make:
         scene, out = str(place / "scene.xml"), str(folder / "out")
         words = ("albedo=", "albedo=nan", "albedo=2", "nope=1", "=1", "albedo=$x", "albedo=0.5\n", "albedo=<a/>")
         define = ("-D", chance.choice(words)) if chance.random() < 0.2 else ()
-        return (
-            *chance.choice(
-                (
-                    ("plan", scene, "--patterns", "uniform"),
-                    ("capture", scene, "-o", out, "--patterns", "uniform"),
-                    ("calibrate", scene, "-o", out),
-                    ("render", scene, "-o", out + ".exr"),
-                    ("transport", scene, "-o", out + ".h5"),
-                )
-            ),
-            *define,
-        )
+        verbs = (("plan", scene), ("capture", scene, "-o", out), ("calibrate", scene, "-o", out))
+        more = (("render", scene, "-o", out + ".exr"), ("transport", scene, "-o", out + ".h5"))
+        command = chance.choice(verbs + more)
+        uniform = ("--patterns", "uniform") if command[0] in ("plan", "capture") else ()
+        return (*command, *uniform, *define)
 
     return make
 
 
-NUMBERS = (
-    *(
-        "0",
-        "-0.0",
-        "-1",
-        "1e300",
-        "-1e300",
-        "1e-300",
-        "5e-324",
-        "1e400",
-        "nan",
-        "-inf",
-        "1" * 400,
-        "0x7fffffffffffffff",
-    ),
-    *(
-        "1_000",
-        "true",
-        '"1"',
-        '"nan"',
-        '"\\u0000"',
-        '"\\u202e\\u001b[2J"',
-        "[]",
-        "[[1]]",
-        "{}",
-        "{a = 1}",
-        "2020-01-01",
-    ),
-    *(
-        '""',
-        "'''x'''",
-        '"' + "x" * 60_000 + '"',
-        "[" + "1, " * 20_000 + "]",
-        "[" * 900 + "]" * 900,
-        "9223372036854775808",
-    ),
-)
+NUMBERS = [
+    *"0 -0.0 -1 1e300 -1e300 1e-300 5e-324 1e400 nan -inf 0x7fffffffffffffff 1_000 true [] [[1]] {} 2020-01-01".split(),
+    *('"1"', '"nan"', '"\\u0000"', '"\\u202e\\u001b[2J"', "{a = 1}", '""', "'''x'''", "9223372036854775808", "1" * 400),
+    *('"' + "x" * 60_000 + '"', "[" + "1, " * 20_000 + "]", "[" * 900 + "]" * 900),
+]
 """Values that a field of a TOML file may be given."""
 
 
@@ -329,20 +147,15 @@ def toml_changed(text: str, chance: random.Random) -> bytes:
     for _ in range(chance.choice((1, 1, 2))):
         number = chance.choice(keys)
         name = lines[number].partition(" = ")[0]
-        lines[number] = chance.choice(
-            (
-                *(f"{name} = {chance.choice(NUMBERS)}" for _ in range(6)),
-                *(
-                    "",
-                    f"{name} = 1\n{name} = 1",
-                    f'"{name}\\n" = 1',
-                    f"{name}.a.b = 1",
-                    f"[{name}]\na = 1",
-                    f"[[{name}]]",
-                ),
-                *(f"{name} = 1\n" + "a." * 150 + "b = 1", f"ключ = 1\n{lines[number]}", f"{lines[number]}\r", "= 1"),
-            )
-        )
+        value = f"{name} = {chance.choice(NUMBERS)}"
+        broken = ["", f"{name} = 1\n{name} = 1", f'"{name}\\n" = 1', f"{name}.a.b = 1", f"[{name}]\na = 1", "= 1"]
+        broken += [
+            f"[[{name}]]",
+            f"{name} = 1\n" + "a." * 150 + "b = 1",
+            f"ключ = 1\n{lines[number]}",
+            f"{lines[number]}\r",
+        ]
+        lines[number] = value if chance.random() < 0.4 else chance.choice(broken)
     data = "\n".join(lines).encode()
     which = chance.randrange(12)
     if which == 0:
@@ -359,15 +172,13 @@ def json_text_changed(text: str, chance: random.Random) -> bytes:
     if which == 0:
         return text[: chance.randrange(len(text))].encode()
     if which == 1:
-        return chance.choice(
-            (b"[" * 100_000, b'{"a":' * 100_000, b"[]" * 9, b"", b"null", b'"x"', b"NaN", b"[" + text.encode() + b"]")
-        )
+        odd = (b"[" * 100_000, b'{"a":' * 100_000, b"[]" * 9, b"", b"null", b'"x"', b"NaN", b"[" + text.encode() + b"]")
+        return chance.choice(odd)
     if which == 2:
         return text.encode(chance.choice(("utf-8-sig", "utf-16", "utf-32")))
     if which == 3:
-        return text.replace(
-            '": ', chance.choice(('": 1, "kind": ', '" : -', '": "', '": \ud800', '": Infinity + ')), 1
-        ).encode(errors="surrogatepass")
+        after = chance.choice(('": 1, "kind": ', '" : -', '": "', '": \ud800', '": Infinity + '))
+        return text.replace('": ', after, 1).encode(errors="surrogatepass")
     value = json.loads(text)
     if which in (4, 5):
         return json.dumps(_as_texts(value, chance)).encode()
@@ -390,9 +201,7 @@ def _as_texts(value: Any, chance: random.Random) -> Any:
 
 def devices(good: Good) -> Make:
     """Cameras, projectors and recipes of sessions with numbers that no device has, and drawn masks of any file."""
-    texts = {
-        name: (good.folder / f"{name}.toml").read_text(encoding="utf-8") for name in ("camera", "projector", "recipe")
-    }
+    texts = {name: (good.folder / f"{name}.toml").read_text("utf-8") for name in ("camera", "projector", "recipe")}
     mask = (
         "\n[mask]\nkind = {!r}\nfeature_mm = 0.06\nfeatures = 101\nopen_part = 0.5\nseed = 3\nfile = 'a.png'\n"
         "over_etch_um = 1.0\nedge_blur_um = 1.0\nopaque_transmission = 0.1\nrotation_deg = 1.0\ntilt_row_mrad = 1.0\n"
@@ -414,15 +223,14 @@ def devices(good: Good) -> Make:
         if which != "camera":
             return plan
         light, camera = str(good.folder / "light.npy"), ("--camera", str(path))
-        return chance.choice(
-            (
-                plan,
-                ("sense", light, *camera, "-o", out + chance.choice((".npy", ".png", ".exr"))),
-                ("characterise", str(path), "-o", out, "--pixels", "32", "--steps", "20", "--frames", "2"),
-                ("import", str(good.folder / "a.png"), *camera, *FRAMES[2:], "-o", out),
-                ("patterns", "stripes", *camera, "--exposure", "0.1", "--projector-pixels", "2", "-o", out),
-            )
+        commands = (
+            plan,
+            ("sense", light, *camera, "-o", out + chance.choice((".npy", ".png", ".exr"))),
+            ("characterise", str(path), "-o", out, "--pixels", "32", "--steps", "20", "--frames", "2"),
+            ("import", str(good.folder / "a.png"), *camera, *FRAMES[2:], "-o", out),
+            ("patterns", "stripes", *camera, "--exposure", "0.1", "--projector-pixels", "2", "-o", out),
         )
+        return chance.choice(commands)
 
     return make
 
@@ -438,9 +246,7 @@ def masks(good: Good) -> Make:
         fields = {"kind": f'"{kind}"', "feature_mm": chance.choice(("0.06", "1e-6", "1e3", "0.01"))}
         if kind in ("drawing", "psf"):
             fields["file"] = '"m.png"'
-            sides = chance.choice(
-                ((1, 1), (4095, 1), (4096, 1), (1, 4096), (4097, 2), (3000, 2999), (300, 20), (8192, 8192))
-            )
+            sides = chance.choice(((1, 1), (4095, 1), (1, 4096), (4097, 2), (3000, 2999), (300, 20), (8192, 8192)))
             Image.new(chance.choice(("1", "L", "I;16")), sides, chance.choice((0, 1, 255))).save(folder / "m.png")
             if kind == "psf":
                 fields |= {"psf_distance_mm": chance.choice(("400.0", "1e-3", "1e10")), "aperture_mm2": "4.0"}
@@ -491,9 +297,7 @@ def sessions(good: Good) -> Make:
             (frames / "session.json").write_bytes(json_text_changed(listed, chance))
         elif which == 2:
             whole = {"side": "horizontal", "index": 0, "sign": 1}
-            odd = chance.choice(
-                ({"file": "../a.png"}, {"file": "session.json"}, {"file": "a\nb.png"}, {"index": 2**63}, {})
-            )
+            odd: dict[str, Any] = chance.choice(({"file": "../a.png"}, {"file": "a\nb.png"}, {"index": 2**63}, {}))
             entries = [{"file": each.name, **whole, **odd} for each in sorted(frames.glob("*.png"))]
             dark = chance.choice(([], [{"file": path.name}], [{"file": path.name, "exposure": 1}]))
             (frames / "session.json").write_text(json.dumps({**fields, "frames": entries, "dark": dark}))
@@ -514,14 +318,15 @@ def manifests(good: Good) -> Make:
         run, cal, out = str(folder / "run"), str(folder / "cal"), str(folder / "out")
         path = folder / chance.choice(("run", "run", "cal")) / "manifest.json"
         text = path.read_text(encoding="utf-8")
-        if chance.random() < 0.15:
+        which = chance.random()
+        if which < 0.4:  # any file of the folder
+            other = chance.choice(sorted(path.parent.iterdir()))
+            misplace(other, chance) if which < 0.1 else other.write_bytes(bytes_changed(other.read_bytes(), chance))
+        elif which < 0.5:
             odd = chance.choice(("99.0.0", "0.0.1", "x", 4, None, "\x1b[2J"))
             value = json.loads(text)
-            path.write_text(
-                json.dumps(
-                    {**value, "versions": {"mitsim": odd}, "layout": odd, "kind": chance.choice((odd, value["kind"]))}
-                )
-            )
+            kind = chance.choice((odd, value["kind"]))
+            path.write_text(json.dumps({**value, "versions": {"mitsim": odd}, "layout": odd, "kind": kind}))
         else:
             path.write_bytes(json_text_changed(text, chance))
         formats = (("hdf5", ".h5"), ("mat", ".mat"), ("torch", ".pt"))
@@ -529,15 +334,14 @@ def manifests(good: Good) -> Make:
         listed, png = folder / "patterns.json", str(good.folder / "a.png")
         listed.write_bytes(json_text_changed(shown, chance))
         of_file = ("--patterns", str(listed), *FRAMES[4:6], "--projector-pixels", "14")
-        return chance.choice(
-            (
-                ("reconstruct", run, "--calibration", cal, "-o", out, "--lambda", "0.1"),
-                ("export", run, "--format", kind, "--calibration", cal, "-o", out + ending),
-                ("export", run, "--format", "png", "--projector", "mp_cl1", "-o", out),
-                ("import", png, *FRAMES[:2], *of_file, "-o", out),
-                ("import", png, *FRAMES[:6], "--calibration", cal, "-o", out),
-            )
+        commands = (
+            ("reconstruct", run, "--calibration", cal, "-o", out, "--lambda", "0.1"),
+            ("export", run, "--format", kind, "--calibration", cal, "-o", out + ending),
+            ("export", run, "--format", "png", "--projector", "mp_cl1", "-o", out),
+            ("import", png, *FRAMES[:2], *of_file, "-o", out),
+            ("import", png, *FRAMES[:6], "--calibration", cal, "-o", out),
         )
+        return chance.choice(commands)
 
     return make
 
@@ -577,30 +381,12 @@ def misplace(path: Path, chance: random.Random) -> None:
 
 def places(good: Good) -> Make:
     """Inputs and outputs in places where they cannot be, under names that nobody gives."""
-    names = (
-        "a\nb",
-        "\x1b[2Ja",
-        "-o",
-        "--help",
-        "a" * 255,
-        "a" * 256,
-        "\udcff",
-        " ",
-        "é\u202e",
-        "a/../b",
-        "con",
-        "%s{0}",
-        "~",
-        "*",
-    )
+    names = ["a\nb", " ", "a" * 255, "a" * 256, *"\x1b[2Ja -o --help \udcff é\u202e a/../b con %s{0} ~ *".split()]
 
     def make(chance: random.Random, folder: Path) -> Sequence[str]:
-        for name, source in (
-            ("run", good.bench.run),
-            ("cal", good.bench.calibration),
-            ("session", good.folder / "session"),
-        ):
-            shutil.copytree(source, folder / name)
+        shutil.copytree(good.bench.run, folder / "run")
+        shutil.copytree(good.bench.calibration, folder / "cal")
+        shutil.copytree(good.folder / "session", folder / "session")
         for name in ("run.h5", "run.mat", "a.png", "light.exr", "camera.toml"):
             shutil.copy(good.folder / name, folder / name)
         target = chance.choice([*folder.iterdir(), *(folder / "run").iterdir(), *(folder / "cal").iterdir()])
@@ -622,54 +408,31 @@ def places(good: Good) -> Make:
         except OSError:
             pass
         at = {each: str(folder / each) for each in ("run", "cal", "session", "run.h5", "run.mat", "a.png", "light.exr")}
-        to = str(out)
-        return chance.choice(
-            (
-                ("reconstruct", at["run"], "--calibration", at["cal"], "-o", to),
-                ("export", at["run"], "--format", "hdf5", "-o", to),
-                ("export", at["run"], "--format", "png", "--projector", "mp_cl1", "-o", to),
-                ("export", at["run"], "--format", "mat", "--calibration", at["cal"], "-o", to + ".mat"),
-                ("import", at["run.h5"], "-o", to, "--calibration-output", to + "2"),
-                ("import", at["run.mat"], "-o", to),
-                ("import", at["a.png"], *FRAMES, "-o", to),
-                ("calibrate", "--frames", at["session"], "-o", to),
-                ("sense", at["light.exr"], "--camera", str(folder / "camera.toml"), "-o", to + ".png"),
-                ("sense", at["light.exr"], "--camera", str(folder / "camera.toml"), "-o", to),
-                ("patterns", "dots:2", "--projector-pixels", "4", "-o", to),
-                (
-                    "characterise",
-                    str(folder / "camera.toml"),
-                    "-o",
-                    to,
-                    "--pixels",
-                    "8",
-                    "--steps",
-                    "20",
-                    "--frames",
-                    "2",
-                ),
-            )
+        to, camera = str(out), str(folder / "camera.toml")
+        commands = (
+            ("reconstruct", at["run"], "--calibration", at["cal"], "-o", to),
+            ("export", at["run"], "--format", "hdf5", "-o", to),
+            ("export", at["run"], "--format", "png", "--projector", "mp_cl1", "-o", to),
+            ("export", at["run"], "--format", "mat", "--calibration", at["cal"], "-o", to + ".mat"),
+            ("import", at["run.h5"], "-o", to, "--calibration-output", to + "2"),
+            ("import", at["run.mat"], "-o", to),
+            ("import", at["a.png"], *FRAMES, "-o", to),
+            ("calibrate", "--frames", at["session"], "-o", to),
+            ("sense", at["light.exr"], "--camera", camera, "-o", to + chance.choice(("", ".png"))),
+            ("patterns", "dots:2", "--projector-pixels", "4", "-o", to),
+            ("characterise", camera, "-o", to, "--pixels", "8", "--steps", "20", "--frames", "2"),
         )
+        return chance.choice(commands)
 
     return make
 
 
 SIMULATED = {
-    "scene": "photograph",
-    "scene_sha256": "0",
-    "scene_files": {"a.png": "0"},
-    "defines": {"sheet_z": "390", "albedo": "x"},
-    "variant": "llvm_ad_mono",
-    "patterns": "dots:4",
-    "accuracy": 0.01,
-    "seed": 0,
-    "effects": {"diffraction": False},
-    "light": {"patterns": "dots:4", "seed": 0},
-    "recipe": {"board_reflectance": 0.5},
-    "sensor": {"bits": 12},
-    "projector_model": {},
-    "versions": {"mitsim": "0"},
-}
+    "scene": "photograph", "scene_sha256": "0", "scene_files": {"a.png": "0"}, "variant": "llvm_ad_mono",
+    "defines": {"sheet_z": "390", "albedo": "x"}, "patterns": "dots:4", "accuracy": 0.01, "seed": 0,
+    "effects": {"diffraction": False}, "light": {"patterns": "dots:4", "seed": 0}, "projector_model": {},
+    "recipe": {"board_reflectance": 0.5}, "sensor": {"bits": 12}, "versions": {"mitsim": "0"},
+}  # fmt: skip
 """What the configuration of a simulated run and of its calibration states."""
 SMUGGLED = (
     "\n[export]\nformat = 'hdf5'\n",
@@ -780,11 +543,8 @@ def steps(good: Good) -> Make:
             "chart": chance.choice(("nosuch", "colour_chart")),
         }
         name = chance.choice(sorted(odd))
-        table = (
-            "export"
-            if name in ("format", "projector") or (name in ("run", "output") and chance.random() < 0.5)
-            else "reconstruct"
-        )
+        either = name in ("run", "output") and chance.random() < 0.5
+        table = "export" if name in ("format", "projector") or either else "reconstruct"
         last = {**(export if table == "export" else image), "output": "last", name: odd[name]}
         if chance.random() < 0.3:
             misplace(chance.choice(sorted((folder / chance.choice(("run", "cal"))).iterdir())), chance)

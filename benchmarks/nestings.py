@@ -13,17 +13,13 @@ reference out: three seconds.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the judge lives with the tests
+from harness import arguments, held, show, write
 
 import mitsim as ms
 from tests.physics import nestings
@@ -58,26 +54,21 @@ def row(case: tuple[str, str, str, bool], spp: int, both: bool) -> dict[str, obj
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, required=True)
+    parser = arguments(__doc__, required=True)
     parser.add_argument("--spp", type=int, default=8192)
     parser.add_argument("--only", default="", help="rows whose name holds this text")
     parser.add_argument("--factored", action="store_true", help="leave the reference out")
     options = parser.parse_args()
-    rows = json.loads(options.json.read_text()) if options.json.exists() else {}
+    rows = held(options.json, {})
     for case in nestings.all_nestings():
         name = "{}({}({})){}".format(*case[:3], " textured" if case[3] else "")
         if name in rows or options.only not in name:
             continue
         begun = time.perf_counter()
         rows[name] = row(case, options.spp, not options.factored)
-        options.json.write_text(json.dumps(rows, indent=1))
-        told = [
-            f"{which} true {rows[name][which]['true']:+.4f} stated {rows[name][which]['stated']:.4f}"
-            for which in ("factored", "reference")
-            if which in rows[name]
-        ]
-        print(name, *told, rows[name].get("refused", ""), f"{time.perf_counter() - begun:.0f} s", sep="; ", flush=True)
+        rows[name]["seconds"] = time.perf_counter() - begun
+        write(options.json, rows)
+        show(name, rows[name])
     for which in ("factored", "reference"):
         of = [each[which] for each in rows.values() if which in each]
         largest = max((abs(each["true"]) for each in of), default=0.0)

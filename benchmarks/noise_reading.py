@@ -17,13 +17,12 @@ brightness of the images, the reading that is nearest to all four bands, and how
 
 from __future__ import annotations
 
-import argparse
-import json
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from harness import arguments, show, write
 from solver import dots
 
 from mitsim.devices.camera import CameraGeometry, centred_edges
@@ -143,8 +142,7 @@ def nearest(cases: dict[tuple[float, int], Case], convention: str, rule: str) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="write all readings to this file")
+    parser = arguments(__doc__)
     parser.add_argument("--distance", type=float, choices=[2.0, 0.75], help="of the mask [mm]; both if not given")
     options = parser.parse_args()
     bands = [key for key in BANDS if options.distance in (None, key[0])]
@@ -152,24 +150,11 @@ def main() -> None:
     for brightness in BRIGHTNESS:
         shown = images(brightness)
         cases = {(distance, k): case(factors[distance], k, shown) for distance, k in bands}
-        for convention in CONVENTIONS:
-            for rule in RULES:
-                row: dict[str, Any] = {
-                    "images": brightness,
-                    "convention": convention,
-                    "lambda": rule,
-                    **nearest(cases, convention, rule),
-                }
-                rows.append(row)
-                reported = ", ".join(f"{name} {psnr:.1f}" for name, psnr in row["psnr_db"].items())
-                print(
-                    f"{brightness:12} {convention:12} {rule:26} {row['outside_db']:.1f} dB outside at "
-                    f"{row['electrons']:.3g} e, read noise {row['read_noise_e']:.3g} e: {reported}",
-                    flush=True,
-                )
-    if options.json:
-        with open(options.json, "w", encoding="utf-8") as file:
-            json.dump(rows, file, indent=1)
+        for convention, rule in itertools.product(CONVENTIONS, RULES):
+            found = nearest(cases, convention, rule)
+            rows.append({"images": brightness, "convention": convention, "lambda": rule, **found})
+            show(f"{brightness}, {convention}, {rule}", found)
+    write(options.json, rows)
 
 
 if __name__ == "__main__":

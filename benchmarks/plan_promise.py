@@ -1,6 +1,6 @@
 """What `mitsim calibrate --plan` promises against what sessions by its recipe come to.
 
-    python benchmarks/plan_promise.py [-o promise.json] [--scenes NAME[:PATTERNS] ...] [--psnr DB ...] [--seeds N]
+    python benchmarks/plan_promise.py [--json promise.json] [--scenes NAME[:PATTERNS] ...] [--psnr DB ...] [--seeds N]
     python benchmarks/plan_promise.py --scenes resolution_target:dots:5 --psnr 35
     python benchmarks/plan_promise.py --scenes photograph:uniform --psnr 25
 
@@ -17,8 +17,6 @@ all of them). Needs an idle machine.
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from dataclasses import replace
@@ -27,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from accuracy import small
+from harness import arguments, write
 
 import mitsim as ms
 from mitsim.calibrate.board_session import Session
@@ -89,8 +88,7 @@ def transport(scene: str, side: int | None, projector: str | None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path)
+    parser = arguments(__doc__)
     parser.add_argument("--scenes", nargs="+", default=["photograph", "colour_chart", "resolution_target:dots:5"])
     parser.add_argument("--psnr", nargs="+", type=float, default=[30.0, 40.0])
     parser.add_argument("--seeds", type=int, default=6)
@@ -117,8 +115,7 @@ def main() -> None:
             seeds = range(first, first + asked.seeds)
             found = session_psnrs(bench, patterns, plan.recipe, seeds) if plan.reached else []
             rows.append({**plan.payload(), "scene": scene, "found": found, "seeds": list(seeds)})
-            if asked.output:
-                asked.output.write_text(json.dumps(rows, indent=1, default=str), encoding="utf-8")
+            write(asked.json, rows)
             print(_row(scene, plan, found), flush=True)
 
 

@@ -1,6 +1,6 @@
 """Outcome of calibration sessions with planted faults: right, refused or wrong.
 
-    python benchmarks/session_faults.py RESULT.json [--sessions 9] [--clean 200] [--kinds ...] [--seed 0] [--n 32 64]
+    python benchmarks/session_faults.py --json FILE [--sessions 9] [--clean 200] [--kinds ...] [--seed 0] [--n 32 64]
 
 Simulates sessions in numpy (geometric shadow of a mask, falloff, keystone, rotation, blur as by diffraction, Poisson
 and read noise, rounding), writes them as files, and calibrates with
@@ -9,13 +9,12 @@ and read noise, rounding), writes them as files, and calibrates with
 A session is *right* if the relative error of both factors, in quadrature, is at most 1.5 times the stated one. It is
 *refused* if the calibration raises MitsimError and names frames of the fault, or "all frames"; *misnamed* if it names
 other frames. It is *wrong* otherwise. The true factors are those of the same session without noise and fault.
-RESULT.json has the outcome of each session, and counts by kind. With ``--uniform`` patterns are shown against one
+FILE has the outcome of each session, and counts by kind. With ``--uniform`` patterns are shown against one
 uniform frame instead of in pairs.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import tempfile
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import arguments, ratios, show, write
 
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
@@ -441,46 +441,46 @@ def _lamp(
     return plant
 
 
-def _hot(session: Session) -> None:
-    columns = session.rng.choice(session.camera.traits["shape"][1], 3, replace=False)
-    height, start = session.rng.uniform(0.05, 0.3), session.rng.uniform(0.3, 0.7)
-
-    def optics(light: np.ndarray, half: Half, time: float) -> np.ndarray:
-        found = light.copy()
-        found[:, columns] += height * (time > start)
-        return found
-
-    session.optics, session.wrong = optics, None
-
-
-def _light(make: Callable[[Session], Callable[[np.ndarray], np.ndarray]]) -> Callable[[Session], None]:
-    """The light of all frames is changed alike."""
+def _every(make: Callable[[Session], Callable[[np.ndarray, float], np.ndarray]]) -> Callable[[Session], None]:
+    """The light of all frames is changed, by place in time."""
 
     def plant(session: Session) -> None:
         change = make(session)
-        session.optics, session.wrong = lambda light, half, time: change(light), None
+        session.optics, session.wrong = lambda light, half, time: change(light, time), None
 
     return plant
 
 
-def _clipping(session: Session) -> Callable[[np.ndarray], np.ndarray]:
+def _hot(session: Session) -> Callable[[np.ndarray, float], np.ndarray]:
+    columns = session.rng.choice(session.camera.traits["shape"][1], 3, replace=False)
+    height, start = session.rng.uniform(0.05, 0.3), session.rng.uniform(0.3, 0.7)
+
+    def change(light: np.ndarray, time: float) -> np.ndarray:
+        found = light.copy()
+        found[:, columns] += height * (time > start)
+        return found
+
+    return change
+
+
+def _clipping(session: Session) -> Callable[[np.ndarray, float], np.ndarray]:
     most = session.rng.uniform(0.5, 0.9)
-    return lambda light: np.minimum(light, most)
+    return lambda light, time: np.minimum(light, most)
 
 
-def _gamma(session: Session) -> Callable[[np.ndarray], np.ndarray]:
+def _gamma(session: Session) -> Callable[[np.ndarray, float], np.ndarray]:
     power = float(session.rng.choice([0.8, 0.9, 0.95, 1.05, 1.1, 1.2]))
-    return lambda light: np.power(np.maximum(light, 0), power)
+    return lambda light, time: np.power(np.maximum(light, 0), power)
 
 
-def _banding(session: Session) -> None:
+def _banding(session: Session) -> Callable[[np.ndarray, float], np.ndarray]:
     size, period, rng = session.rng.uniform(0.01, 0.05), session.rng.uniform(10, 60), session.rng
 
-    def optics(light: np.ndarray, half: Half, time: float) -> np.ndarray:
+    def change(light: np.ndarray, time: float) -> np.ndarray:
         bands = 1 + size * np.sin(2 * np.pi * (np.arange(len(light)) / period + rng.random()))
         return light * bands[:, None]
 
-    session.optics, session.wrong = optics, None
+    return change
 
 
 def _lag(session: Session) -> None:
@@ -525,13 +525,12 @@ def _black_level(session: Session) -> None:
     session.numbers, session.wrong = lambda read, half, time: read + by * time, None
 
 
-def _dust(session: Session) -> None:
+def _dust(session: Session) -> Callable[[np.ndarray, float], np.ndarray]:
     rows, columns = session.camera.traits["shape"]
     y, x = np.mgrid[:rows, :columns]
     at, size = session.rng.random(2) * (rows, columns), session.rng.uniform(5, 30)
     shade = 1 - 0.3 * np.exp(-(np.square(y - at[0]) + np.square(x - at[1])) / (2 * size**2))
-    session.optics = lambda light, half, time: light * shade if time > 0.5 else light
-    session.wrong = None
+    return lambda light, time: light * shade if time > 0.5 else light
 
 
 KINDS: dict[str, Callable[[Session], None]] = {
@@ -577,10 +576,10 @@ KINDS: dict[str, Callable[[Session], None]] = {
     "flicker 0.5 %": _lamp(flicker=0.005),
     "flicker 3 %": _lamp(flicker=0.03),
     "power steps by 5 %": _lamp(step=0.05),
-    "hot columns midway": _hot,
-    "gamma": _light(_gamma),
-    "clipping": _light(_clipping),
-    "banding": _banding,
+    "hot columns midway": _every(_hot),
+    "gamma": _every(_gamma),
+    "clipping": _every(_clipping),
+    "banding": _every(_banding),
     "lag": _lag,
     "6 bits": _six_bits,
     "motion 0.02": _motion(0.02),
@@ -588,7 +587,7 @@ KINDS: dict[str, Callable[[Session], None]] = {
     "motion 0.5": _motion(0.5),
     "slow motion 0.3": _motion(0.3, slow=True),
     "black level drifts": _black_level,
-    "dust midway": _dust,
+    "dust midway": _every(_dust),
 }
 PAIRED = ("all pairs of a side exchanged", "all pairs exchanged", "pattern 0 exchanged", "both patterns 0 exchanged")
 """Kinds that sessions against a uniform frame do not have."""
@@ -629,24 +628,22 @@ def outcome(seed: int, n: int, kind: str | None, uniform: bool) -> dict[str, Any
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Counts of outcomes of one kind, of sessions with warnings, and quantiles of error over stated error."""
-    ratios = [row["error"] / row["stated"] for row in rows if "error" in row]
+    over = [row["error"] / row["stated"] for row in rows if "error" in row]
     return {
         **Counter(row["outcome"] for row in rows),
         "flagged": sum(bool(row.get("warnings")) for row in rows),
         "silent": sum(row["outcome"] == "wrong" and not row["warnings"] for row in rows),
-        "error_over_stated": np.quantile(ratios, [0.05, 0.5, 1.0]).round(2).tolist() if ratios else None,
-        "stated": float(np.median([row["stated"] for row in rows if "stated" in row])) if ratios else None,
+        **(ratios(over) if over else {}),
+        "stated": float(np.median([row["stated"] for row in rows if "stated" in row])) if over else None,
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("result", type=Path)
+    parser = arguments(__doc__, seed=True, required=True)
     parser.add_argument("--sessions", type=int, default=9, help="sessions of each kind of fault")
     parser.add_argument("--clean", type=int, default=200, help="sessions without a fault")
     parser.add_argument("--kinds", nargs="*", default=[*KINDS])
     parser.add_argument("--n", nargs="+", type=int, default=(32, 64, 128))
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--uniform", action="store_true", help="patterns against one uniform frame, no pairs")
     options = parser.parse_args()
     found: dict[str, list[dict[str, Any]]] = {}
@@ -658,13 +655,12 @@ def main() -> None:
             n = options.n[number % len(options.n)]
             rows.append(outcome(options.seed + number, n, None if kind == "clean" else kind, options.uniform))
         if rows:
-            print(f"{kind:32}", json.dumps(summary(rows)), flush=True)
+            show(kind, summary(rows))
         total = Counter(row["outcome"] for name, each in found.items() if name != "clean" for row in each)
         facts = {"noise": NOISE, "seed": options.seed, "uniform": options.uniform, "versions": versions()}
         counts = {name: summary(each) for name, each in found.items() if each}
-        text = {**facts, "faulty": total, "summary": counts, "sessions": found}
-        options.result.write_text(json.dumps(text, indent=1) + "\n")
-    print("faulty sessions:", dict(total))
+        write(options.json, {**facts, "faulty": total, "summary": counts, "sessions": found})
+    show("faulty sessions", total)
 
 
 if __name__ == "__main__":

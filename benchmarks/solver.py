@@ -16,24 +16,17 @@ and seconds in double and single precision, at three lambdas.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import statistics
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 
 import mpmath
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
+from harness import arguments, median_seconds, show, write
 
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import Accumulator, Prepared, prepare
-from tests.exact_solver import SolverRow, dots, paper_factor, time_solver
+from tests.exact_solver import dots, paper_factor, time_solver
+from tests.ideal_sessions import Bench, picture
 
 N, K = 128, 7
 EPS = float(np.finfo(np.float64).eps)
@@ -53,17 +46,6 @@ def summed(prepared: Prepared, frames: Frames) -> Accumulator:
     for key, frame in frames.items():
         sums.add(frame, *key)
     return sums
-
-
-def median_seconds(work: Callable[[], object], repeat: int) -> float:
-    """Median time of warm calls [s]."""
-    work()
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def speed(factor: np.ndarray, repeat: int, rng: np.random.Generator) -> dict[str, float]:
@@ -152,9 +134,6 @@ def rounding(rng: np.random.Generator) -> list[dict[str, float]]:
 
 def trust(factor: np.ndarray, repeat: int, seed: int) -> dict[str, float]:
     """Best seconds by stage and family, and the uncertainty's part of adding up and solving."""
-    sys.path.insert(0, str(Path(__file__).parent.parent))
-    from tests.ideal_sessions import Bench, picture
-
     camera, result = Bench(factor, factor), {}
     for family in ("uniform", "dots:4", "dots:7"):
         shots, factors = camera.run(family, picture(seed, N), seed), camera.calibrated(seed)
@@ -165,29 +144,18 @@ def trust(factor: np.ndarray, repeat: int, seed: int) -> dict[str, float]:
     return result
 
 
-def print_forms(rows: tuple[SolverRow, ...]) -> None:
-    """Print all forms by lambda and time; a star marks those that no other form beats in both time and error."""
-    for row in sorted(rows, key=lambda row: (-row.lambda_rel, row.seconds)):
-        others = [each for each in rows if each.lambda_rel == row.lambda_rel and each is not row]
-        beaten = any(each.seconds <= row.seconds and each.error <= row.error for each in others)
-        print(
-            f"lambda {row.lambda_rel:.0e} {row.precision:<16} {row.seconds:7.3f} s "
-            f"(to {row.most_s:.3f}, {row.repeats} runs)  error {row.error:.1e}{'' if beaten else '  *'}"
-        )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="write the figures to this file")
+    parser = arguments(__doc__, seed=True)
     parser.add_argument("--repeat", type=int, default=15)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--forms", action="store_true", help="error and seconds of every form of the solver")
     options = parser.parse_args()
     if options.forms:
         rows = time_solver(options.seed, lambda stage, part: None)
-        print_forms(rows)
-        if options.json:
-            Path(options.json).write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
+        for row in sorted(rows, key=lambda row: (-row.lambda_rel, row.seconds)):
+            others = [each for each in rows if each.lambda_rel == row.lambda_rel and each is not row]
+            beaten = any(each.seconds <= row.seconds and each.error <= row.error for each in others)
+            show("beaten in time and error" if beaten else "not beaten", asdict(row))
+        write(options.json, [asdict(row) for row in rows])
         return
     factor = paper_factor()
     report = {
@@ -200,14 +168,10 @@ def main() -> None:
         "rounding": rounding(np.random.default_rng(options.seed)),
     }
     for section in ("speed", "recovery", "trust"):
-        for name, value in report[section].items():
-            print(f"{name:36s} {value:.3g}")
-    print(" ".join(f"{name:>21s}" for name in report["rounding"][0]))
-    for row in report["rounding"]:
-        print(" ".join(f"{value:21.2e}" for value in row.values()))
-    if options.json:
-        with open(options.json, "w", encoding="utf-8") as file:
-            json.dump(report, file, indent=1)
+        show(section, report[section])
+    for each in report["rounding"]:
+        show("rounding", each)
+    write(options.json, report)
 
 
 if __name__ == "__main__":

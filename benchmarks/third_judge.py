@@ -18,8 +18,6 @@ scene, and what it holds is not done again.
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import sys
 import tempfile
@@ -29,8 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the judge lives with the tests
+from harness import arguments, held, show, write
 
 import mitsim as ms
 from mitsim.api.bench import open_bench
@@ -112,8 +109,7 @@ def row(name: str, accuracy: float) -> dict[str, Any]:
 
 def main() -> None:
     """Judge the scenes; exit status 1 where one disagrees."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, required=True)
+    parser = arguments(__doc__, required=True)
     parser.add_argument("--scenes", nargs="+", metavar="NAME", help="all, if not given")
     parser.add_argument("--accuracy", type=float, default=1e-2)
     parser.add_argument("--reference", type=int, metavar="SPP", help="judge the reference")
@@ -123,7 +119,7 @@ def main() -> None:
     unknown = set(options.scenes or ()) - set(scenes)
     if unknown:
         parser.error(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(scenes)}")
-    rows = json.loads(options.json.read_text(encoding="utf-8")) if options.json.exists() else []
+    rows = held(options.json, [])
     known = {each["scene"] for each in rows}
     for name in options.scenes or scenes:
         if name not in known:
@@ -132,8 +128,8 @@ def main() -> None:
                 rows.append(of_hidden(name, seeds, options.accuracy))
             else:
                 rows.append(of_reference(name, spp) if spp else row(name, options.accuracy))
-            options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-            print(json.dumps(rows[-1]), flush=True)
+            write(options.json, rows)
+            show(name, rows[-1])
     agreeing = sum(each.get("agrees", False) for each in rows)
     print(f"{agreeing} of {len(rows)} agree")
     sys.exit(agreeing < len(rows))

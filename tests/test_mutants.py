@@ -60,10 +60,11 @@ a < 2 -> a >= 2
 
 @pytest.fixture(scope="module")
 def mutations() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mutations", BENCHMARKS / "mutations.py")
+    spec = importlib.util.spec_from_file_location("benchmark_mutants", BENCHMARKS / "mutants.py")
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:  # dataclasses look their module up by name
-        patch.setitem(sys.modules, "mutations", module)
+        patch.syspath_prepend(str(BENCHMARKS))
+        patch.setitem(sys.modules, spec.name, module)
         spec.loader.exec_module(module)
     return module
 
@@ -92,16 +93,11 @@ def test_an_edit_moves_only_the_mutants_of_its_own_lines(mutations: ModuleType) 
 def test_a_constant_is_met_by_all_files_that_run_its_module(mutations: ModuleType) -> None:
     """Its line is run by whichever test imports the module first, which may say nothing of it. (Planted: that file
     alone.)"""
-    spec = importlib.util.spec_from_file_location("benchmark_mutants", BENCHMARKS / "mutants.py")
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "mutations", mutations)
-        spec.loader.exec_module(module)
     found = {mutant.key.partition(": ")[0]: mutant for mutant in mutations.mutants("a.py", SOURCE)}
     lines = {"first.py": {"a.py:3", "a.py:6"}, "own.py": {"a.py:8"}, "other.py": {"b.py:3"}}
-    assert module.telling(found["a.py module"], lines) == ("first.py", "own.py")
+    assert mutations.telling(found["a.py module"], lines) == ("first.py", "own.py")
     in_function = next(one for one in mutations.mutants("a.py", SOURCE) if one.line == 8)
-    assert module.telling(in_function, lines) == ("own.py",)
+    assert mutations.telling(in_function, lines) == ("own.py",)
 
 
 def test_the_list_names_modules_and_tests_that_are_there() -> None:

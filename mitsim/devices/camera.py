@@ -27,7 +27,7 @@ from mitsim.devices.session import MaskMotion
 
 _NODES_PER_PIXEL = 14
 """Nodes of a tilted mask for each pixel that its shadow is moved by: 2 more leave 4e-5 of frames of dots:7, 2 to 20
-mrad at the paper's geometry (benchmarks/masks.py)."""
+mrad at the paper's geometry."""
 _MOST_TILTED_TERMS = 64
 """Separable terms that a tilted mask is formed of: 0.8 GB at 512 pixels and as many cells a side."""
 _NOT_KNOWN_BEFORE = (

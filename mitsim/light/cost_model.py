@@ -108,13 +108,13 @@ FIXED = UnitCosts(
 
 
 _MANY_ENTRIES = 1.2
-"""An entry of a geometric shadow of many terms over one of a wave-optical one (benchmarks/masks.py)."""
+"""An entry of a geometric shadow of many terms over one of a wave-optical one."""
 _CELL_S = 5e-8
 """A cell of a raster of light on which waves are squared, beyond these: it is sharpened, and its largest terms are
 looked for (a disc at 512 pixels, 6 to 12 cells a pixel)."""
 _FURTHER_LINE = 0.2
 """What tracing takes more for each further line: 0.15 of a mono capture's seconds, 0.3 of one line's (three lines of
-photograph, benchmarks/colour_lines.py)."""
+photograph)."""
 _PASSED = 0.4
 """A place of an accumulator, which is emptied and looked through, over an entry of light that is accumulated (corner in
 three lines: 4e-9 s)."""

@@ -99,7 +99,7 @@ def path_sample_bytes(settings: Settings) -> float:
 # -------- Drawing a mask's shadow on a raster
 
 _MEANS_S, _TURNED_S = 8e-8, 5e-7
-"""Time of a cell of a shadow without diffraction, of a straight and of a turned mask (benchmarks/masks.py)."""
+"""Time of a cell of a shadow without diffraction, of a straight and of a turned mask."""
 _POINT_S, _TERM_S = 9e-9, 8e-11
 _AROUND = 2.0
 _HELD, _AT_WORK, _BLOCK_BYTES = 10, 14, 1.2e8

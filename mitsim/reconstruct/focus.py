@@ -13,7 +13,7 @@ columns is fitted to all of them.
 
 *Margin.* A wall beside the window scatters light of directions that no projector pixel has. Cells beyond the window
 cast the shadow of the window's edge, moved along the sensor, so that no calibration needs to light them. They count as
-lit in every pattern, which keeps the model separable (benchmarks/margin.py).
+lit in every pattern, which keeps the model separable.
 
 *Global light* is the same in all frames under shifting dots (Nayar, Krishnan, Grossberg and Raskar 2006). With P_ij the
 patterns,

@@ -521,7 +521,7 @@ def _pass(state: _State, steps: int) -> tuple[Array, Array, float]:
 
 RIDGE, _WEIGHT = 50.0, 1.2
 """Automatic lambda over the mean square of a scene pixel's light, by a frame's relative error; and automatic weight of
-TV in units of the error of the data term's gradient. Chosen on photographs (benchmarks/iterative_losses.py)."""
+TV in units of the error of the data term's gradient. Chosen on photographs."""
 _CLEARLY = 2.0
 """Ratio of the error by held-out pixels to the measured noise above which the model is wrong."""
 _SIDE, _STEPS = 128, 60

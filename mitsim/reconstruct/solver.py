@@ -65,7 +65,7 @@ RISK_POWER = 0.5
 (docs/decisions/0002-automatic-lambda.md)."""
 MISFIT_RATIO = 1.2
 """Limit of noise outside the model's range over noise inside it. Flat prints have 0.92 to 1.02, and scenes with depth
-and gloss 1.4 and more (benchmarks/lambda_losses.py)."""
+and gloss 1.4 and more."""
 _TAKEN, _TAKEN_RISE = 30.0, 4
 """Limit of the energy that lambda removes within the range, over the noise outside, and the power of the noise ratio
 that raises the limit (docs/decisions/0004-lambda-by-halves.md)."""
