@@ -37,7 +37,7 @@ from mitsim.acquire.spectral import SpectralBench, plan_request
 from mitsim.api.bench import Bench, open_bench
 from mitsim.bench.request import Request, SessionRequest, Task
 from mitsim.calibrate.calibrate import calibrate_lines
-from mitsim.core import spectral_manifests
+from mitsim.core import manifests as spectral_manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import CAMERA, load_model, locate
 from mitsim.core.errors import MitsimError
