@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from mitsim.cli import screen
-from mitsim.core import progress
+from mitsim.core import job as progress
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Clock, Cost, Job
 from mitsim.light.plan import Plan, PlanRow, State
