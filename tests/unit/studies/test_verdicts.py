@@ -171,7 +171,7 @@ def fallen(lost: float = 5.0, gained: float = 5.0) -> list[Row]:
                     last, "with_db", jitter=model == "calibrated", absolute=False, model=model, way=way, effect=effect
                 )
                 found += [
-                    {**row, "without_db": 40 + offset, "change_db": -1.0}
+                    {**row, "ideal_db": 40 + offset, "change_db": -1.0}
                     for row, offset in zip(shown, PRINTS_DB, strict=True)
                 ]
     return found

@@ -15,7 +15,6 @@ from mitsim.light.simulation import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.report.pages import Mean, Table
 from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
 from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Results, Scope, Setup
@@ -25,21 +24,17 @@ from mitsim.studies.waterfall_study import (
     ASSUMED,
     CALIBRATED,
     EFFECTS,
-    EXPERIMENT,
     IN_ORDER,
     LEFT_OUT,
     MODELS,
     QUANTISATION,
     SATURATION,
-    Fall,
+    STUDY,
     Levels,
     Sessions,
-    Step,
     ends,
-    fall,
     fills_well,
     sensor_without,
-    waterfall,
 )
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "draft_figures")
@@ -168,12 +163,12 @@ def test_quantisation_costs_a_twelfth_of_its_step(studio: Studio, setup: Setup, 
 def test_steps_add_up_to_the_whole(studio: Studio, setup: Setup) -> None:
     """In order, of a real scene; what it does not call for changes nothing at all."""
     scope = Scope(setup, (None,), seeds=(3,), quick=True)
-    points = [point for point in EXPERIMENT.points(scope) if point["way"] == IN_ORDER]
+    points = [point for point in STUDY.points(scope) if point["way"] == IN_ORDER]
     assert [point["effect"] for point in points] == list(EFFECTS)
-    rows = [row for point in points for row in EXPERIMENT.measure(studio, point).rows]
+    rows = [row for point in points for row in STUDY.measure(studio, point).rows]
     for model in MODELS:
-        found = fall(Table(tuple(rows)), model)
-        assert found.levels[-1] == pytest.approx(found.last.value, abs=1e-9)
+        own = [row for row in rows if row["model"] == model]
+        assert own[0]["ideal_db"] + sum(row["change_db"] for row in own) == pytest.approx(own[-1]["with_db"], abs=1e-9)
         quiet = [row["change_db"] for row in rows if row["model"] == model and not row["called_for"]]
         assert len(quiet) > 5 and not any(quiet)
     assert all(row["flagged"] == bool(row["reason"]) for row in rows)
@@ -214,32 +209,12 @@ def test_saturation_is_called_for_where_light_can_reach_the_end() -> None:
     assert fills_well(short, 0.0)
 
 
-def test_the_figure_has_a_bar_for_each_effect_that_shows() -> None:
-    """Bars begin where the one before ended; an effect without any change has no row, and is named below."""
-
-    def mean(value: float) -> Mean:
-        return Mean(value, 0.1, 3)
-
-    steps = [Step("one", mean(-3), mean(-4), mean(-2)), Step("quiet", mean(0.05), mean(0)), Step("two", mean(1.5))]
-    drawn = waterfall({"a": Fall(mean(40), tuple(steps), mean(38.55))}, seen=0.2)
-    (axes,) = drawn.axes
-    labels = [label.get_text() for label in axes.get_yticklabels()]
-    one = "one, alone \N{MINUS SIGN}4.0 ± 0.1, left out \N{MINUS SIGN}2.0 ± 0.1"
-    assert labels == ["idealised", one, "two", "others", "rendered"]
-    bars = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
-    assert bars[1] == pytest.approx((40, -3)) and bars[2] == pytest.approx((37, 1.5))
-    assert bars[3] == pytest.approx((38.5, 0.05))
-    texts = {text.get_text() for text in axes.texts}
-    assert {"\N{MINUS SIGN}3.0 ± 0.1", "+1.5 ± 0.1", "40.0 ± 0.1 dB"} <= texts
-    assert "quiet" in drawn.get_supxlabel()
-
-
-def test_claims_tell_the_two_ends() -> None:
+def invented() -> Results:
+    """An effect costs 1 dB in any way; the scene does not call for the last one."""
     rows = [
         {
             "point": f"{way}{effect}{model}{seed}", "picture": None, "way": way, "effect": effect, "model": model,
-            "seed": seed,
-            "without_db": 50.0 - (EFFECTS.index(effect) if way == IN_ORDER else 0),
+            "seed": seed, "called_for": effect != EFFECTS[-1], "ideal_db": 50.0,
             "with_db": 49.0 - (EFFECTS.index(effect) if way == IN_ORDER else 0), "change_db": -1.0,
         }
         for seed in (0, 1)
@@ -247,6 +222,22 @@ def test_claims_tell_the_two_ends() -> None:
         for effect in EFFECTS
         for model in MODELS
     ]  # fmt: skip
-    first, second = EXPERIMENT.claims(Results(Table(tuple(rows))))
+    return Results(rows, {(f"{IN_ORDER}{EFFECTS[-1]}{CALIBRATED}0", name): np.full((2, 2), 0.5)
+                          for name in ("truth", "idealised", ASSUMED, CALIBRATED)})  # fmt: skip
+
+
+def test_the_figures_have_a_bar_for_each_effect_that_is_called_for() -> None:
+    """And images of both ends. (Planted: all effects.)"""
+    drawn = STUDY.draw(invented())
+    assert set(drawn) == {"waterfall_assumed.png", "waterfall_calibrated.png", "images.png"}
+    axes = drawn["waterfall_assumed.png"].axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()][::-1] == list(EFFECTS[:-1])
+    assert {bar.get_width() for bar in axes.patches} == {-1.0} and len(axes.patches) == 2 * (len(EFFECTS) - 1)
+    captions = [axes.get_xlabel() for axes in drawn["images.png"].axes]
+    assert captions == ["", "50.0 dB", "", "33.0 dB"]
+
+
+def test_claims_tell_the_two_ends() -> None:
+    first, second = STUDY.judge(invented())
     assert first.verdict == "not confirmed" and first.idealised.startswith("50.0") and first.rendered.startswith("33.0")
     assert second.verdict == UNDECIDED, "both models lose alike"
