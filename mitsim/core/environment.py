@@ -77,7 +77,7 @@ class Check:
 
 
 def load_variant(name: str) -> ModuleType:
-    """Mitsuba with the variant ``name`` set, after choosing an LLVM that works for the llvm_ variants.
+    """Return Mitsuba with the variant ``name`` set, after choosing an LLVM that works for the llvm_ variants.
 
     Setting a variant is Mitsuba's own process-wide state; nothing in mitsim does so except by this call.
     Raises MitsimError for an unknown variant, a Mitsuba that cannot be imported, a missing LLVM, or a missing GPU.
@@ -86,28 +86,24 @@ def load_variant(name: str) -> ModuleType:
     if name.startswith("llvm_"):
         select_llvm()
     with held_back():
-        return _set_variant(name)
+        try:
+            import mitsuba
+        except ImportError as error:
+            raise MitsimError(f"mitsuba: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
+        variants = mitsuba.variants()
+        if name not in variants:
+            raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(variants)}; choose one of these")
+        if name.startswith("cuda_") and not has_gpu():
+            raise _without_gpu(name)
+        try:
+            mitsuba.set_variant(name)
+        except ImportError as error:
+            raise MitsimError(f"variant {name}: cannot be loaded ({reason_of(error)}); run: mitsim doctor") from error
+        import drjit
 
-
-def _set_variant(name: str) -> ModuleType:
-    try:
-        import mitsuba
-    except ImportError as error:
-        raise MitsimError(f"mitsuba: cannot be imported ({error}); run: {_reinstall('mitsuba')}") from error
-    variants = mitsuba.variants()
-    if name not in variants:
-        raise MitsimError(f"variant: got {name!r}; this Mitsuba has {', '.join(variants)}; choose one of these")
-    if name.startswith("cuda_") and not has_gpu():
-        raise _without_gpu(name)
-    try:
-        mitsuba.set_variant(name)
-    except ImportError as error:
-        raise MitsimError(f"variant {name}: cannot be loaded ({reason_of(error)}); run: mitsim doctor") from error
-    import drjit
-
-    drjit.set_flag(drjit.JitFlag.KernelHistory, True)  # for core.job.compiled_kernels; it costs 3 ms a run
-    if drjit.thread_count() < _FEWEST_THREADS:
-        drjit.set_thread_count(_FEWEST_THREADS)
+        drjit.set_flag(drjit.JitFlag.KernelHistory, True)  # for core.job.compiled_kernels; it costs 3 ms a run
+        if drjit.thread_count() < _FEWEST_THREADS:
+            drjit.set_thread_count(_FEWEST_THREADS)
     module: ModuleType = mitsuba
     return module
 
@@ -154,19 +150,15 @@ def check_variant(variant: str) -> None:
 
 
 def check_driver(variant: str) -> None:
-    """MitsimError for a cuda_ ``variant`` where no NVIDIA driver is that Dr.Jit, which is not imported, could find."""
-    if variant.startswith("cuda_") and not _has_driver():
-        raise _without_gpu(variant)
-
-
-def _has_driver() -> bool:
-    if os.environ.get("DRJIT_LIBCUDA_PATH") or not sys.platform.startswith("linux"):
-        return True  # Dr.Jit knows
+    """Raise MitsimError for a cuda_ ``variant`` without an NVIDIA driver that Dr.Jit, which is not imported, finds."""
+    if not variant.startswith("cuda_") or os.environ.get("DRJIT_LIBCUDA_PATH") or not sys.platform.startswith("linux"):
+        return  # Dr.Jit knows
     for name in _DRIVERS:
         with suppress(OSError):
             ctypes.CDLL(name)
-            return True
-    return any(any(Path("/usr/lib", folder).glob("libcuda.so.*")) for folder in _DRIVER_FOLDERS)
+            return
+    if not any(any(Path("/usr/lib", folder).glob("libcuda.so.*")) for folder in _DRIVER_FOLDERS):
+        raise _without_gpu(variant)
 
 
 def _without_gpu(variant: str) -> MitsimError:
@@ -185,13 +177,51 @@ def has_gpu() -> bool:
 
 
 def doctor() -> list[Check]:
-    """All checks in order. What can crash or hang runs in child processes; takes some ten seconds."""
-    checks = [_python(), _llvm(), _child("mitsuba", "import mitsuba", "imports", _reinstall("mitsuba"))]
-    remedy = _reinstall("mitsuba") if checks[1].ok else checks[1].remedy
-    checks += [_child(f"render {name}", _RENDER.format(name=name), "renders a test image", remedy) for name in VARIANTS]
-    checks += [_openexr(), _kernel_cache()]
-    checks.append(_child("matplotlib", _FIGURE, "draws without a display", _reinstall("matplotlib")))
-    return checks
+    """Return all checks in order. What can crash or hang runs in child processes; they take some ten seconds."""
+
+    def check_openexr() -> str:
+        # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
+        import numpy as np
+
+        from mitsim.core.exr import read_frame, write_frame
+
+        values = np.arange(6, dtype=np.uint32).reshape(2, 3)
+        with tempfile.TemporaryDirectory() as folder:
+            write_frame(Path(folder) / "frame.exr", {"DN": values}, {"seed": 2**40})
+            channels, metadata = read_frame(Path(folder) / "frame.exr")
+        if not np.array_equal(channels["DN"], values) or metadata != {"seed": 2**40}:
+            raise MitsimError("a frame read back differs from the one written")
+        return "writes a frame and reads it back"
+
+    def check_llvm() -> str:
+        path = find_llvm()
+        return f"LLVM {version(path) or 'of unknown version'} at {path} compiles and runs"
+
+    def check_cache() -> str:
+        folder = Path(os.environ.get(_CACHE) or Path.home() / ".drjit")
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return f"{folder} is writable: compiled kernels are kept"
+
+    def child(name: str, program: str, success: str, remedy: str) -> Check:
+        result = run_child(program, _CHILD_SECONDS)
+        return Check(name, True, success) if result.ok else Check(name, False, result.detail, remedy)
+
+    python = f"Python {platform.python_version()} at {sys.executable}"
+    mend = f"unset {VARIABLE}" if os.environ.get(VARIABLE) else install_command()
+    llvm, mitsuba = _attempt("llvm", check_llvm, mend), _reinstall("mitsuba")
+    return [
+        Check("python", new := sys.version_info >= (3, 10), python, "" if new else "apt-get install -y python3.11"),
+        llvm,
+        child("mitsuba", "import mitsuba", "imports", mitsuba),
+        *(
+            child(f"render {name}", _RENDER.format(name=name), "renders a test image", llvm.remedy or mitsuba)
+            for name in VARIANTS
+        ),
+        _attempt("openexr", check_openexr, _reinstall("OpenEXR")),
+        _attempt("kernel cache", check_cache, "export HOME=$(mktemp -d)"),
+        child("matplotlib", _FIGURE, "draws without a display", _reinstall("matplotlib")),
+    ]
 
 
 USUAL_SCENES = "cookie_bag", "gift_card", "metal_blade", "lamp_bench", "cards", "photograph"
@@ -231,60 +261,11 @@ def warm_up(variant: str = DEFAULT_VARIANT, scenes: Sequence[str] = USUAL_SCENES
     return _attempt("kernels", look, "mitsim doctor")
 
 
-def _python() -> Check:
-    detail = f"Python {platform.python_version()} at {sys.executable}"
-    new_enough = sys.version_info >= (3, 10)
-    return Check("python", new_enough, detail, "" if new_enough else "apt-get install -y python3.11")
-
-
-def _llvm() -> Check:
-    def look() -> str:
-        path = find_llvm()
-        return f"LLVM {version(path) or 'of unknown version'} at {path} compiles and runs"
-
-    remedy = f"unset {VARIABLE}" if os.environ.get(VARIABLE) else install_command()
-    return _attempt("llvm", look, remedy)
-
-
-def _openexr() -> Check:
-    def look() -> str:
-        # Imported here: a broken OpenEXR must be a finding, not the end of the doctor.
-        import numpy as np
-
-        from mitsim.core.exr import read_frame, write_frame
-
-        values = np.arange(6, dtype=np.uint32).reshape(2, 3)
-        with tempfile.TemporaryDirectory() as folder:
-            write_frame(Path(folder) / "frame.exr", {"DN": values}, {"seed": 2**40})
-            channels, metadata = read_frame(Path(folder) / "frame.exr")
-        if not np.array_equal(channels["DN"], values) or metadata != {"seed": 2**40}:
-            raise MitsimError("a frame read back differs from the one written")
-        return "writes a frame and reads it back"
-
-    return _attempt("openexr", look, _reinstall("OpenEXR"))
-
-
-def _kernel_cache() -> Check:
-    folder = Path(os.environ.get(_CACHE) or Path.home() / ".drjit")
-
-    def look() -> str:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return f"{folder} is writable: compiled kernels are kept"
-
-    return _attempt("kernel cache", look, "export HOME=$(mktemp -d)")
-
-
 def _attempt(name: str, look: Callable[[], str], remedy: str) -> Check:
     try:
         return Check(name, True, look())
     except (MitsimError, OSError, ImportError, subprocess.TimeoutExpired) as error:
         return Check(name, False, reason_of(error), remedy)
-
-
-def _child(name: str, program: str, success: str, remedy: str) -> Check:
-    result = run_child(program, _CHILD_SECONDS)
-    return Check(name, True, success) if result.ok else Check(name, False, result.detail, remedy)
 
 
 def _reinstall(package: str) -> str:
@@ -362,14 +343,8 @@ def run_child(program: str, seconds: float, variables: Mapping[str, str] | None 
         environment variables beside this process's own.
     """
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, **(variables or {})},
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=seconds,
-        )
+        own, command = {**os.environ, **(variables or {})}, [sys.executable, "-c", program]
+        done = subprocess.run(command, env=own, capture_output=True, text=True, errors="replace", timeout=seconds)
     except subprocess.TimeoutExpired:
         return Probe(False, f"gives no answer within {seconds:g} s")
     if done.returncode == 0:
@@ -389,19 +364,23 @@ def probe(path: Path | str) -> Probe:
 
 
 def find_llvm() -> Path:
-    """The first library that works: the one DRJIT_LIBLLVM_PATH names, else the newest on this machine.
+    """Return the first library that works: the one DRJIT_LIBLLVM_PATH names, else the newest on this machine.
 
     Raises MitsimError if the named one is too old or does not work, or if none is found.
     """
-    named = os.environ.get(VARIABLE)
-    if named:
-        return _check_named(Path(named))
     tried = []
-    for path in candidates():
-        result = _cached_probe(path)
+    named = os.environ.get(VARIABLE)
+    for path in [Path(named)] if named else candidates():
+        major, result = version(path), Probe(False, "does not exist")
+        if named and major is not None and major < OLDEST:
+            result = Probe(False, f"is LLVM {major}, but Dr.Jit needs {OLDEST} or newer")
+        elif path.exists():
+            result = _cached_probe(path)
         if result.ok:
             return path
         tried.append(f"{path} {result.detail}")
+    if named:
+        raise MitsimError(f"{VARIABLE}: {tried[0]}; run: unset {VARIABLE}")
     failures = "; ".join(tried) or "none found"
     raise MitsimError(f"LLVM: no usable library of version {OLDEST} or newer ({failures}); run: {install_command()}")
 
@@ -413,20 +392,6 @@ def select_llvm() -> Path:
     """
     path = find_llvm()
     os.environ[VARIABLE] = str(path)
-    return path
-
-
-def _check_named(path: Path) -> Path:
-    major = version(path)
-    if major is not None and major < OLDEST:
-        raise MitsimError(
-            f"{VARIABLE}: {path} is LLVM {major}, but Dr.Jit needs {OLDEST} or newer; run: unset {VARIABLE}"
-        )
-    if not path.exists():
-        raise MitsimError(f"{VARIABLE}: {path} does not exist; run: unset {VARIABLE}")
-    result = _cached_probe(path)
-    if not result.ok:
-        raise MitsimError(f"{VARIABLE}: {path} {result.detail}; run: unset {VARIABLE}")
     return path
 
 
@@ -473,20 +438,9 @@ DECIDING = ("mitsim", "mitsuba", "drjit", "numpy", "scipy")
 _PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image", "OpenEXR")
 
 
-def versions() -> dict[str, str]:
-    """Versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
-    return dict(_read_versions())
-
-
-def deciding_versions() -> dict[str, str]:
-    """Of :func:`versions` those of the packages that decide frames: a manifest's configuration holds them."""
-    return {name: version for name, version in versions().items() if name in DECIDING}
-
-
 @cache
-def _read_versions() -> tuple[tuple[str, str], ...]:
-    """Read once: it takes 8 ms, and a coloured run states them nine times."""
-    import importlib.metadata
+def _versions() -> dict[str, str]:
+    import importlib.metadata  # read once: it takes 8 ms, and a coloured run states them nine times
 
     by_name = {"mitsim": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
@@ -494,4 +448,14 @@ def _read_versions() -> tuple[tuple[str, str], ...]:
             by_name[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             by_name[name] = "not installed"
-    return tuple(by_name.items())
+    return by_name
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of mitsim, Python and the packages that decide the numbers, by name; imports none of them."""
+    return dict(_versions())
+
+
+def deciding_versions() -> dict[str, str]:
+    """Return those :func:`versions` that decide frames, which a manifest's configuration holds."""
+    return {name: version for name, version in versions().items() if name in DECIDING}

@@ -81,7 +81,6 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 100
 _LONGEST_PATH, _LONGEST_NAME = 4095, 255
 """Bytes of a path, and of a name in it, that Linux takes."""
-_SEVERAL = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 Kind = tuple[str, Callable[[object], bool]]
 """What an annotation allows, in words and as a test."""
 _KINDS: dict[str, Kind] = {
@@ -103,25 +102,22 @@ _KINDS: dict[str, Kind] = {
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Make a public ``function`` refuse arguments of another kind than it is annotated with, by ArgumentError.
 
-    Numbers of NumPy are passed on as Python's. Further keywords are checked by what the function makes of them.
+    Numbers of NumPy are passed on as Python's. Further keywords are checked by the function's own models.
     """
     signature = inspect.signature(function)
-    several = {name for name, each in signature.parameters.items() if each.kind in _SEVERAL}
-    kinds = {
-        name: _kinds(each.annotation, function)
-        if isinstance(each.annotation, str) and not each.annotation.startswith("Unpack")
-        else []
-        for name, each in signature.parameters.items()
-    }
+    kinds = {name: _kinds(each.annotation, function) for name, each in signature.parameters.items()}
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
         for name, bound in signature.bind(*arguments, **named).arguments.items():
-            allowed, keywords = kinds[name], name in several and isinstance(bound, dict)
-            given = bound.items() if keywords else [(name, each) for each in (bound if name in several else (bound,))]
+            given, several = [(name, bound)], signature.parameters[name].kind
+            if several == inspect.Parameter.VAR_KEYWORD:
+                given = [*bound.items()]
+            elif several == inspect.Parameter.VAR_POSITIONAL:
+                given = [(name, each) for each in bound]
             for told, value in given:
-                if allowed and not any(allows(value) for _, allows in allowed):
-                    words = " or ".join(dict.fromkeys(words for words, _ in allowed))
+                if kinds[name] and not any(allows(value) for _, allows in kinds[name]):
+                    words = " or ".join(dict.fromkeys(words for words, _ in kinds[name]))
                     raise ArgumentError(told, f"{short_text(value)}: give {words}")
         plain = {name: plain_number(value) for name, value in named.items()}
         return function(*map(plain_number, arguments), **plain)  # type: ignore[arg-type]
@@ -143,38 +139,38 @@ def checked_fields(made: C) -> C:
     return made
 
 
-def _kinds(annotation: str, function: Callable[..., object]) -> list[Kind]:
-    """What an ``annotation`` of a ``function`` allows, such as ``float | Literal["auto"] | None``; empty: anything."""
+def _kinds(annotation: object, function: Callable[..., object]) -> list[Kind]:
+    """Return what an ``annotation`` such as ``float | Literal["auto"] | None`` allows; empty: anything."""
+    if not isinstance(annotation, str) or annotation.startswith("Unpack"):
+        return []
     found: list[Kind] = []
-    terms = _terms(ast.parse(annotation, mode="eval").body)
-    for term in terms:
+    terms: list[ast.expr] = [ast.parse(annotation, mode="eval").body]
+    while terms:
+        term = terms.pop()
+        if isinstance(term, ast.BinOp):
+            terms += [term.right, term.left]
+            continue
         name = ast.unparse(term.value if isinstance(term, ast.Subscript) else term)
         if name == "Literal" and isinstance(term, ast.Subscript):
-            values = term.slice.elts if isinstance(term.slice, ast.Tuple) else [term.slice]
-            found += [_literal(ast.literal_eval(value)) for value in values]
+            for each in term.slice.elts if isinstance(term.slice, ast.Tuple) else [term.slice]:
+                word = ast.literal_eval(each)
+                found.append((repr(word), functools.partial(_is_word, word)))
         elif name in _KINDS:
             found.append(_KINDS[name])
-        elif isinstance(getattr(function, "__globals__", {}).get(name, type), type) and name not in _ANY:
-            found.append(_of_class(name))
+        elif name not in _ANY and isinstance(getattr(function, "__globals__", {}).get(name, type), type):
+            found.append((f"a {name}", functools.partial(_is_a, name)))
         else:
             return []  # another name for several types
     # Text is a path there.
     return [kind for kind in found if not (_KINDS["Path"] in found and kind == _KINDS["str"])]
 
 
-def _terms(node: ast.expr) -> list[ast.expr]:
-    """Alternatives of an annotation."""
-    if isinstance(node, ast.BinOp):
-        return [*_terms(node.left), *_terms(node.right)]
-    return [node]
+def _is_word(word: object, value: object) -> bool:
+    return isinstance(value, str) and value == word
 
 
-def _literal(allowed: object) -> Kind:
-    return repr(allowed), lambda value: isinstance(value, str) and value == allowed
-
-
-def _of_class(name: str) -> Kind:
-    return f"a {name}", lambda value: name in (each.__name__ for each in type(value).__mro__)
+def _is_a(name: str, value: object) -> bool:
+    return name in (each.__name__ for each in type(value).__mro__)
 
 
 def _is_number(value: object) -> bool:
@@ -194,7 +190,7 @@ def _is_real_array(value: object) -> bool:
 
 def is_masked(value: object) -> bool:
     """Return True if a ``value`` is a masked array of NumPy, which is not imported."""
-    return "MaskedArray" in (each.__name__ for each in type(value).__mro__)
+    return _is_a("MaskedArray", value)
 
 
 def short_text(value: object, length: int = 60) -> str:

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import FrameType
@@ -294,29 +294,20 @@ def within(seconds: float) -> Iterator[None]:
     ):
         yield
         return
-    before = signal.signal(signal.SIGALRM, _ring)
+
+    def ring(_: int, __: FrameType | None) -> None:
+        # Stopped by a signal, whose interrupt was lost: see mitsim.core.worker.
+        raise KeyboardInterrupt if is_stopped() else OutOfTime
+
+    before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN_S)
     try:
         yield
     finally:
-        _silence(before)
-
-
-def _ring(_: int, __: FrameType | None) -> None:
-    if is_stopped():  # by a signal, whose interrupt was lost: see mitsim.core.worker
-        raise KeyboardInterrupt
-    raise OutOfTime
-
-
-def _silence(before: object) -> None:
-    """Take the alarm back, also where it rings meanwhile."""
-    while True:
-        try:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)  # type: ignore[arg-type]
-            return
-        except OutOfTime:
-            continue
+        while signal.getsignal(signal.SIGALRM) is ring:
+            with suppress(OutOfTime):  # it may ring while it is taken back
+                signal.setitimer(signal.ITIMER_REAL, 0)
+                signal.signal(signal.SIGALRM, before)
 
 
 # ---- What this machine has left, and what this process has taken ----
@@ -411,19 +402,12 @@ _REFRESHES = 5
 """Times a second that rows are written: 2.7 ms of a processor each, eight of them, 1.3 % of one."""
 _BAR = 24
 """Characters of a bar: with a stage's name and two times it fits into a terminal of 80."""
-_CELL_WIDTH = 80
-"""Characters of a line below a cell of a notebook: those of a terminal."""
-_CELL_PAGE = '<pre style="font-family:monospace;line-height:1.3">{code}</pre>'
-"""What rows are put into there, as rich fills it."""
-
-
-# ---- A job that is watched -------------------------------------------------------------------------------------------
 
 
 @check_arguments
 @contextmanager
 def progress(limits: Limits | None = None, hidden: bool = False, start: float = 0.0) -> Iterator[Job]:
-    """A job that shows how far it is while the context lasts: rows on a terminal and in a notebook, else a line a
+    """Make a job that shows how far it is while the context lasts: rows on a terminal and in a notebook, else a line a
     minute on standard error.
 
     Parameters
@@ -446,37 +430,19 @@ def progress(limits: Limits | None = None, hidden: bool = False, start: float = 
     >>> with ms.progress(ms.Limits(seconds=600)) as job:  # doctest: +SKIP
     ...     shots = ms.open_bench("photograph").capture("dots:7", job=job)
     """
-    with _watch(hidden, start) as watch:
-        yield Job(Clock(start, watch), watch.report, limits or Limits())
-
-
-@contextmanager
-def _watch(hidden: bool, start: float) -> Iterator[Watch]:
-    """Who is told, and shows it."""
-    if hidden:
-        yield Watch()
-    elif in_notebook():
-        cell = _Cell(start)
-        try:
-            yield cell
-        finally:
-            cell.show()
-    elif not has_rows():
-        yield _Log()
-    else:
-        from rich.console import Console
-        from rich.live import Live
-
-        rows = _Rows(start)
-        with Live(rows, console=Console(stderr=True), transient=True, refresh_per_second=_REFRESHES):
-            yield rows
-
-
-def in_notebook() -> bool:
-    """Whether this process is the kernel of a notebook, whose cells can show something anew."""
     interactive = sys.modules.get("IPython")
-    shell = interactive and interactive.get_ipython()
-    return getattr(shell, "kernel", None) is not None
+    in_notebook = getattr(interactive and interactive.get_ipython(), "kernel", None) is not None
+    with ExitStack() as stack:
+        watch: Watch = Watch() if hidden else _Cell(start) if in_notebook else _Rows(start) if has_rows() else _Log()
+        if isinstance(watch, _Cell):
+            stack.callback(watch.show)
+        elif isinstance(watch, _Rows):
+            from rich.console import Console
+            from rich.live import Live
+
+            live = Live(watch, console=Console(stderr=True), transient=True, refresh_per_second=_REFRESHES)
+            stack.enter_context(live)
+        yield Job(Clock(start, watch), watch.report, limits or Limits())
 
 
 class _Log(Watch):
@@ -486,7 +452,7 @@ class _Log(Watch):
         self._written = time.monotonic()
 
     def report(self, stage: str, fraction: float) -> None:
-        """Write ``stage``, its finished ``fraction``, if the last line is old enough."""
+        """Write ``stage`` and its finished ``fraction`` if the last line is old enough."""
         if time.monotonic() - self._written >= SECONDS_A_LINE:
             self._written = time.monotonic()
             sys.stderr.write(f"mitsim: {printable(stage)} ({fraction:.0%})\n")
@@ -495,189 +461,116 @@ class _Log(Watch):
 
 @dataclass
 class _Row:
-    """What a terminal shows of one stage.
-
-    Attributes
-    ----------
-    words
-        its name, or what was reported of it last.
-    spent, begun
-        its seconds in earlier turns, and when the present turn began; None between turns.
-    last
-        when its last turn began; None before the first.
-    origin
-        its seconds when the loop that it is in began.
-    part
-        that is finished; None where nobody says.
-    ends
-        its seconds at its end, as its own rate says, or the plan; None where neither does.
-    """
+    """One stage on a terminal: its name or last report, the seconds of earlier turns, the begin of the present turn,
+    the seconds and the part that its rate counts from, and its seconds at its end by its rate or by the plan."""
 
     words: str
     spent: float = 0.0
     begun: float | None = None
-    last: float | None = None
-    origin: float = 0.0
-    part: float | None = None
+    origin: tuple[float, float] = (0.0, 0.0)
     ends: float | None = None
 
     def seconds(self, now: float) -> float:
-        """Its seconds until ``now``."""
+        """Return the seconds of all turns until ``now``."""
         return self.spent + (0.0 if self.begun is None else now - self.begun)
 
-    def begin(self, now: float) -> None:
-        """A turn begins ``now``."""
-        self.begun = self.last = now
-
-    def reach(self, part: float, now: float) -> None:
-        """So much is finished ``now``; what is left takes as long as that did."""
-        self.part, taken = part, self.seconds(now) - self.origin
-        if part > 0 and taken > 0:
-            self.ends = self.origin + taken / part
-
-    def part_at(self, now: float) -> float | None:
-        """Part that is finished, by time as far as it is known; None where nothing tells it."""
-        if self.last is None:
-            return 0.0
-        if left := self.rest(now):
-            return 1 - left / (left + self.seconds(now) - self.origin)
-        return self.part
-
     def rest(self, now: float) -> float:
-        """Seconds that it goes on; 0 where nothing tells them, as once it takes longer than was predicted."""
+        """Return the seconds that are left; 0 where they are unknown, as once it takes longer than predicted."""
         return 0.0 if self.ends is None else max(self.ends - self.seconds(now), 0.0)
 
 
 class _Rows(Watch):
     """Progress as rows of a terminal: a stage's bar, its seconds, and those that are left by its own rate or the plan.
 
-    A loop over several stages, such as the frames that are formed, exposed and written in turns, reports under a name
-    of its own: it has a row too, and stages that have had a turn in it are as far as it is.
+    A loop over several stages, such as frames that are formed, exposed and written in turns, reports under a name of
+    its own, of which no stage runs. It has a row too, and its rate says how long all goes on.
     """
 
     def __init__(self, start: float) -> None:
         self._rows: dict[str, _Row] = {}
         self._loop: _Row | None = None
-        self._first = 0.0
         self._started = time.monotonic() - start
 
     def begin(self, stage: str) -> None:
-        """A turn of ``stage`` begins."""
-        row = self._row(stage)
+        """Begin a turn of ``stage``."""
+        row = self._rows.setdefault(stage, _Row(stage))
         if row is self._loop:
             self._loop = None
-        if self._loop is None:
-            row.origin, row.part = row.spent, None
-        row.begin(time.monotonic())
+        row.begun, row.origin = time.monotonic(), (row.spent, 0.0)
+        self._show_again()
 
     def end(self, stage: str, seconds: float) -> None:
-        """A turn of ``stage`` ends, after ``seconds`` in all turns."""
-        row, now = self._row(stage), time.monotonic()
-        row.spent, row.begun, row.last = seconds, None, now if row.last is None else row.last
+        """End a turn of ``stage`` after ``seconds`` in all turns."""
+        row = self._rows.setdefault(stage, _Row(stage))
+        row.spent, row.begun = seconds, None
+        self._show_again()
 
     def predict(self, seconds: Mapping[str, float]) -> None:
-        """Rows of stages to come, with the ``seconds`` that they are predicted to take."""
+        """Add rows of stages to come, with the ``seconds`` that they are predicted to take."""
         for stage, own in seconds.items():
-            row = self._row(stage)
+            row = self._rows.setdefault(stage, _Row(stage))
             row.ends = row.spent + own
 
     def report(self, stage: str, fraction: float) -> None:
-        """A ``fraction`` of a stage, or of a loop, is finished."""
+        """Show that a ``fraction`` of a stage or of a loop is finished; the rest takes as long as that did."""
         name, now = stage.partition(":")[0], time.monotonic()
-        row = self._row(name)
+        row = self._rows.setdefault(name, _Row(name))
         row.words = stage.partition(",")[0]
-        if row.begun is None:
+        if row.begun is None:  # a loop, which may go on from where an earlier run left it
             self._end_loop(now)
-            row.begin(now)
-            self._loop, self._first = row, min(fraction, 0.999)  # a loop that is over when it begins
-            for each in self._rows.values():
-                each.origin = each.seconds(now)
-        if row is self._loop:  # which may go on from where an earlier run left it
-            done = max(fraction - self._first, 0.0) / (1 - self._first)
-            for each in self._in_loop():
-                each.reach(done, now)
-        else:
-            row.reach(fraction, now)
+            self._loop, row.begun, row.origin = row, now, (row.spent, min(fraction, 0.999))
+        seconds, first = row.origin
+        done, taken = (fraction - first) / (1 - first), row.seconds(now) - seconds
+        if done > 0 and taken > 0:
+            row.ends = seconds + taken / done
         if row is self._loop and fraction >= 1:
             self._end_loop(now)
+        self._show_again()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
 
-        now, table = time.monotonic(), Table.grid(padding=(0, 2))
+        now, table, loop = time.monotonic(), Table.grid(padding=(0, 2)), self._loop
         table.add_column(no_wrap=True, overflow="ellipsis", min_width=18)
         for _ in range(3):
             table.add_column(no_wrap=True, justify="right")
-        rows = [row for row in list(self._rows.values()) if self._is_shown(row, now)]
-        most = console.size.height - 2  # the last one and the cursor's
-        if len(rows) > most:
-            rows = [row for row in rows if not self._is_over(row)][:most]
+
+        def left(seconds: float) -> str:
+            return f"{_text(seconds)} left" if seconds >= _SHORTEST_S else ""
+
+        known = list(self._rows.values())  # which another thread may add to
+        rests = {id(row): row.rest(now) for row in known if row.begun is not None or not row.spent or loop}
+        rows = [row for row in known if row.begun is not None or max(row.spent, rests.get(id(row), 0)) >= _SHORTEST_S]
+        if len(rows) > (most := console.size.height - 2):  # the last one and the cursor's
+            rows = [row for row in rows if id(row) in rests][:most]
         for row in rows:
-            over = self._is_over(row)
-            part = 1.0 if over else row.part_at(now)
+            rest, elapsed = rests.get(id(row)), row.seconds(now)
+            part = 1.0 if rest is None else elapsed / (elapsed + rest) if rest else None if elapsed else 0.0
             # With 16 colours rich's own for what is finished is that of what is not begun.
             bar = ProgressBar(1.0, part or 0.0, _BAR, pulse=part is None, finished_style="green")
-            elapsed, left = row.seconds(now), 0.0 if over else row.rest(now)
-            table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", _rest_text(left))
-        table.add_row("total", "", _text(now - self._started), _rest_text(self._rest(now)))
+            table.add_row(Text(printable(row.words)), bar, _text(elapsed) if elapsed else "", left(rest or 0.0))
+        # The end is unknown where a stage goes on for an unknown time.
+        unknown = any(row.begun is not None and not rests[id(row)] for row in known)
+        rest = loop.rest(now) if loop else 0.0 if unknown else sum(rests.values())
+        table.add_row("total", "", _text(now - self._started), left(rest))
         yield table
-
-    def _row(self, stage: str) -> _Row:
-        return self._rows.setdefault(stage, _Row(stage))
-
-    def _in_loop(self) -> list[_Row]:
-        """The loop and the stages that have had a turn in it."""
-        loop = self._loop
-        if loop is None or loop.last is None:
-            return []
-        return [row for row in list(self._rows.values()) if row.last is not None and row.last >= loop.last]
 
     def _end_loop(self, now: float) -> None:
         if self._loop is not None:
             self._loop.spent, self._loop.begun, self._loop = self._loop.seconds(now), None, None
 
-    def _is_over(self, row: _Row) -> bool:
-        return row.last is not None and row.begun is None and not any(row is each for each in self._in_loop())
-
-    def _is_shown(self, row: _Row, now: float) -> bool:
-        length = row.seconds(now) if row.last is not None else row.rest(now)
-        return row.begun is not None or length >= _SHORTEST_S
-
-    def _rest(self, now: float) -> float:
-        """Seconds that are left of everything: of all stages, or of a loop where nothing is known of these; 0 where one
-        goes on for nobody knows how long."""
-        loop = self._loop
-        rows = [row for row in list(self._rows.values()) if not self._is_over(row)]
-        if any(row.begun is not None and row is not loop and not row.rest(now) for row in rows):
-            rows = []
-        return sum(row.rest(now) for row in rows if row is not loop) or (loop.rest(now) if loop else 0.0)
+    def _show_again(self) -> None:
+        """Do nothing, because a terminal's rows are written again by rich."""
 
 
 class _Cell(_Rows):
     """The same rows below a cell of a notebook, written anew at most :data:`_REFRESHES` times a second; the last ones
     stay."""
 
-    def __init__(self, start: float) -> None:
-        super().__init__(start)
-        self._handle: Any = None
-        self._written = 0.0
-
-    def begin(self, stage: str) -> None:
-        """A turn of ``stage`` begins."""
-        super().begin(stage)
-        self._show_again()
-
-    def end(self, stage: str, seconds: float) -> None:
-        """A turn of ``stage`` ends, after ``seconds`` in all turns."""
-        super().end(stage, seconds)
-        self._show_again()
-
-    def report(self, stage: str, fraction: float) -> None:
-        """A ``fraction`` of a stage, or of a loop, is finished."""
-        super().report(stage, fraction)
-        self._show_again()
+    _handle: Any = None
+    _written = 0.0
 
     def _show_again(self) -> None:
         if time.monotonic() - self._written >= 1 / _REFRESHES:
@@ -689,23 +582,18 @@ class _Cell(_Rows):
         from IPython.display import HTML, display
         from rich.console import Console
 
-        console = Console(
-            file=io.StringIO(), record=True, width=_CELL_WIDTH, force_jupyter=False, color_system="truecolor"
-        )
+        console = Console(file=io.StringIO(), record=True, width=80, force_jupyter=False, color_system="truecolor")
         console.print(self)
-        page = HTML(console.export_html(inline_styles=True, code_format=_CELL_PAGE))
+        page = '<pre style="font-family:monospace;line-height:1.3">{code}</pre>'
+        html = HTML(console.export_html(inline_styles=True, code_format=page))
         if self._handle is None:
-            self._handle = display(page, display_id=True)
+            self._handle = display(html, display_id=True)
         else:
-            self._handle.update(page)
-
-
-def _rest_text(seconds: float) -> str:
-    return f"{_text(seconds)} left" if seconds >= _SHORTEST_S else ""
+            self._handle.update(html)
 
 
 def _text(seconds: float) -> str:
-    """Seconds as a clock shows them."""
+    """Return seconds as a clock shows them."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(int(seconds), 60)

@@ -255,6 +255,15 @@ def test_a_stack_of_many_pages_is_read_page_after_page(tmp_path: Path, monkeypat
     assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, dn)
 
 
+def test_a_stack_in_another_order_is_read_by_its_pages(tmp_path: Path) -> None:
+    """(Seen: page after page, whatever the order.)"""
+    bench = made(tmp_path)
+    dn = ms.load_run(bench.run).dn
+    tifffile.imwrite(tmp_path / "stack.tif", dn[::-1].astype(np.uint16))
+    import_capture(tmp_path / "stack.tif", tmp_path / "run 2", known(bench, order="reversed"))
+    assert np.array_equal(ms.load_run(tmp_path / "run 2").dn, dn)
+
+
 def test_frames_are_counted_by_their_headers(tmp_path: Path) -> None:
     """A sparse array of 4096 frames of 64 megapixels is refused at once. (Planted: counted as they are read.)"""
     bench = made(tmp_path)
