@@ -58,7 +58,7 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, Settings
 from mitsim.light.truth import Truth
 from mitsim.optics.frames import ExpectedFrames
-from mitsim.planner.explain import known_losses
+from mitsim.planner.planner import known_losses
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

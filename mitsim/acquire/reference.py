@@ -25,8 +25,7 @@ from mitsim.devices.patterns import Lighting
 from mitsim.light.light import Sampling, trace_light
 from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.optics.frames import monte_carlo_bound
-from mitsim.planner.explain import unseen_lamps
-from mitsim.planner.planner import make_plan
+from mitsim.planner.planner import make_plan, unseen_lamps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

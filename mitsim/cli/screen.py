@@ -229,7 +229,7 @@ def _table(heading: str, words: str, rows: Sequence[PlanRow], room: int) -> tupl
     """Return the lines of the ``rows`` for which there is ``room`` under two headings, and the other rows."""
     indent, lines = " " * len(_HEAD.format("", "", "", "")), [_HEAD.format(heading, "error if off", "seconds", words)]
     for number, row in enumerate(rows):
-        text = wrap_text(_row_text(row, row.gist), indent)
+        text = wrap_text(_row_text(row, row.reason or row.state), indent)
         if len(lines) + len(text) > room:
             return lines, [*rows[number:]]
         lines += text

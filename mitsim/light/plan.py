@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -28,9 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 State = Literal["exact", "approximate", "off"]
-LEFT_OUT, WITHOUT, NO_TIME, ONE = "left out, the frames change by", "without it the error", "it takes no time", ", one"
-"""How what a row's reason says of its error begins."""
-_REPEATED = re.compile(f"(^|; )({LEFT_OUT}|{WITHOUT}|{NO_TIME})[^;]*|{ONE} (less than )?[0-9.e+-]+$")
 _REPORTED = (
     "effects", "accuracy", "predicted_seconds", "predicted", "settings", "warnings", "predicted_range",
     "sampling_target", "systematic_error", "systematic_bound", "asked_seconds", "colour", "notes",
@@ -59,11 +55,6 @@ class PlanRow:
     reason: str
     error_if_off: float | None
     seconds: float
-
-    @property
-    def gist(self) -> str:
-        """The reason without what :attr:`error_if_off` says, or the state where nothing else is said."""
-        return _REPEATED.sub("", self.reason).removeprefix("; ") or self.state
 
 
 @dataclass(frozen=True)

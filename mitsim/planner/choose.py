@@ -7,11 +7,10 @@ combination that fits is chosen.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain, combinations, product
 
 import numpy as np
@@ -100,73 +99,77 @@ class Candidate:
         return Estimate(*(math.hypot(error, self.noise) for error in self.systematic))
 
 
-def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
-    """Return the choice of least work that keeps ``accuracy``, or of least error if none does.
-
-    Errors that no choice avoids are ignored. ``sure`` is the number of standard errors added to each estimate.
-    """
-    return Candidates(pilot_result, switches).choice(accuracy, sure)
-
-
 class Candidates:
     """All combinations that a pilot result permits. Their errors are added up once, for any accuracy."""
 
     def __init__(self, pilot_result: PilotResult, switches: Mapping[str, bool]) -> None:
         self.pilot_result, self.switches = pilot_result, switches
         self._chosen: dict[tuple[float, float], Candidate] = {}
-        counts = [_choices(pilot_result, name, switches) for name in COUNTED]
+        counts = []
+        for name in COUNTED:
+            ladder = list(pilot_result.ladders[name])
+            free = name not in switches or len(ladder) == 1
+            counts.append(ladder if free else [count for count in ladder if (count > 1) == switches[name]])
         rows = np.array(list(product(*counts, (0, 1))), dtype=np.float64)
         if pilot_result.occluded:
             # Light of one anchor is what the sensor's centre sees, of several what all of it does: all pixels, or none.
             rows = rows[(rows[:, 0] > 1) == (rows[:, 4] > 1)]
-        given = _omissions(switches)
+        takes_time, present, given = costly_effects(), frozenset(pilot_result.effects), _omissions(switches)
+        free_ones = [name for name in EFFECTS if name in takes_time & present and name not in switches]
+        always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
+        subsets = chain.from_iterable(combinations(free_ones, count) for count in range(len(free_ones) + 1))
         self._tables = [
-            _Table(math.nan, pilot_result, (effects, cells), rows, given)
-            for effects in _subsets(pilot_result, switches)
-            for cells in pilot_result.forms(in_waves(effects))
+            _Table(pilot_result, frozenset(always | set(several)), cells, rows, given)
+            for several in subsets
+            for cells in pilot_result.forms(in_waves(frozenset(always | set(several))))
         ]
 
-    def best(self, accuracy: float, sure: float = SURE) -> tuple[_Table, int]:
-        tables = [each.at(accuracy, sure) for each in self._tables]
+    def best(self, accuracy: float, sure: float = SURE) -> _Prediction:
         # Most leave out what no choice of numbers makes up for.
-        found = [(table, table.best) for table in tables if table.accurate.any()]
-        if not any(table.fits[index] for table, index in found):
-            found = [(table, table.best) for table in tables]
-        return min(found, key=lambda each: each[0].rank(each[1]))
+        accurate = [table for table in self._tables if table.accurate(accuracy, sure).any()]
+        found = [table.predict(accuracy, sure) for table in accurate]
+        if not any(each.fits[each.best] for each in found):
+            found = [table.predict(accuracy, sure) for table in self._tables]
+        return min(found, key=lambda each: each.rank)
 
     def choice(self, accuracy: float, sure: float = SURE) -> Candidate:
+        """Return the choice of least work that keeps ``accuracy``, or of least error if none does.
+
+        Errors that no choice avoids are ignored. ``sure`` is the number of standard errors added to each estimate.
+        """
         if (accuracy, sure) not in self._chosen:
-            table, index = self.best(accuracy, sure)
-            self._chosen[accuracy, sure] = table.alone(index).candidate
+            found = self.best(accuracy, sure)
+            table = found.table
+            alone = table.rows[[found.best]]
+            one = _Table(self.pilot_result, table.effects, table.raster_cells, alone, table.given)
+            self._chosen[accuracy, sure] = one.candidate(accuracy, sure)
         return self._chosen[accuracy, sure]
 
     def seconds(self, accuracy: float) -> tuple[float, bool]:
         """Return seconds of the choice and its truth, and True if it keeps ``accuracy``."""
-        table, index = self.best(accuracy)
-        truth = truth_seconds(self.pilot_result, table.settings(index), FIXED)
-        return float(table.work[index]) + truth, bool(table.fits[index])
+        found = self.best(accuracy)
+        truth = truth_seconds(self.pilot_result, found.settings, FIXED)
+        return float(found.work[found.best]) + truth, bool(found.fits[found.best])
 
 
 def predicted_candidate(
     accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]
 ) -> Candidate:
     """Predict the error and work of given ``settings``, with new sample counts for the rest of the budget."""
-    return _table_of(accuracy, pilot_result, settings, switches).candidate
+    return _table_of(pilot_result, settings, switches).candidate(accuracy, SURE)
 
 
-def _table_of(
-    accuracy: float, pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool], sure: float = SURE
-) -> _Table:
+def _table_of(pilot_result: PilotResult, settings: Settings, switches: Mapping[str, bool]) -> _Table:
     row = np.array([[*counts_of(settings), settings.coarse_layers]], dtype=np.float64)
     drawn = pilot_result.raster[in_waves(settings.effects)]
     cells = (settings.raster_cells or drawn.cells[0]) if settings.raster or drawn.needed else 0
-    return _Table(accuracy, pilot_result, (settings.effects, cells), row, _omissions(switches), sure)
+    return _Table(pilot_result, settings.effects, cells, row, _omissions(switches))
 
 
 def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, Approximation]:
     """Return the work that an exact pilot result could save, and the part with the largest uncertainty."""
     careful, hopeful = (candidates.choice(accuracy, sure) for sure in (SURE, 0.0))
-    unsure = _table_of(accuracy, candidates.pilot_result, hopeful.settings, candidates.switches, 0.0).unsure
+    unsure = _table_of(candidates.pilot_result, hopeful.settings, candidates.switches).unsure
     worst = max(sorted(unsure), key=lambda part: unsure[part], default=Approximation("cells", 1))
     if careful.fits:
         return careful.work - hopeful.work, worst
@@ -177,8 +180,50 @@ def value_of_refining(accuracy: float, candidates: Candidates) -> tuple[float, A
 # -------- Predictions of many candidates
 
 
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """Predictions (m,) of the rows of a table at an accuracy; ``needed`` and ``samples`` of a group are by pass.
+
+    ``needed`` may be below one; ``rank`` sorts the ``best`` rows of several tables.
+    """
+
+    table: _Table
+    target: FloatArray
+    needed: Mapping[str, FloatArray]
+    samples: Mapping[str, FloatArray]
+    fits: npt.NDArray[np.bool_]
+    work: FloatArray
+    best: int
+    rank: tuple[bool, float, float]
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the best row."""
+        table, result = self.table, self.table.pilot_result
+        numbers = (int(number) for number in table.rows[self.best])
+        anchors, layers, cells, followed, occluded, all_layers = numbers
+        return Settings(
+            depth=result.depth,
+            anchors=anchors,
+            layers=result.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=table.effects,
+            samples={name: float(count[self.best]) for name, count in self.needed.items()},
+            followed_anchors=followed,
+            coarse_layers=bool(all_layers),
+            shared=result.shared,
+            repeats=result.repeats,
+            reach=result.reach,
+            sharp=result.sharp,
+            occluded=result.occluded,
+            occluded_anchors=occluded,
+            raster=table.raster_cells > 0,
+            raster_cells=table.raster_cells,
+        )
+
+
 class _Table:
-    """Predictions of many choices with the same effects and raster cells (``form``).
+    """Choices with the same effects and raster cells.
 
     Each of the ``rows`` (m, 6) has the numbers of ``COUNTED``, and 1 if coarse light has all layers. The ``given``
     parts are left out in any choice.
@@ -186,96 +231,20 @@ class _Table:
 
     def __init__(
         self,
-        accuracy: float,
         pilot_result: PilotResult,
-        form: tuple[frozenset[str], int],
+        effects: frozenset[str],
+        raster_cells: int,
         rows: FloatArray,
         given: frozenset[Approximation],
-        sure: float = SURE,
     ) -> None:
-        self.effects, self.raster_cells = form
-        self.accuracy, self.pilot_result, self.rows = accuracy, pilot_result, rows
-        self.given, self.sure = given, sure
-        self.numbers = Numbers.of_counts([*rows.T], self.effects, len(pilot_result.occluded), self.raster_cells)
-
-    def at(self, accuracy: float, sure: float = SURE) -> _Table:
-        """Return the same combinations at another ``accuracy``, sharing all that does not depend on it."""
-        self._squares_of_given  # noqa: B018 - found once, and copied
-        again = copy.copy(self)
-        again.accuracy, again.sure = accuracy, sure
-        return again
-
-    def alone(self, index: int) -> _Table:
-        form = self.effects, self.raster_cells
-        return _Table(self.accuracy, self.pilot_result, form, self.rows[[index]], self.given, self.sure)
-
-    def rank(self, index: int) -> tuple[bool, float, float]:
-        """Return a key that sorts choices."""
-        if not self.fits[index]:
-            return True, float(self._avoidable[index]), 0.0
-        return False, float(self.work[index]), float(self._avoidable[index])
-
-    @cached_property
-    def best(self) -> int:
-        if self.fits.any():
-            chosen = self.fits
-        else:
-            error = np.where(self._entries <= max(_MOST_ENTRIES, self._entries.min()), self._avoidable, math.inf)
-            chosen = error <= _AS_GOOD * error.min()
-        return int(np.lexsort((self._avoidable, self.work, ~chosen))[0])
-
-    def settings(self, index: int) -> Settings:
-        numbers = (int(number) for number in self.rows[index])
-        anchors, layers, cells, followed, occluded, all_layers = numbers
-        return Settings(
-            depth=self.pilot_result.depth,
-            anchors=anchors,
-            layers=self.pilot_result.layers[layers] if layers > 1 else (),
-            subdivision=cells,
-            effects=self.effects,
-            samples={name: float(count[index]) for name, count in self.needed.items()},
-            followed_anchors=followed,
-            coarse_layers=bool(all_layers),
-            shared=self.pilot_result.shared,
-            repeats=self.pilot_result.repeats,
-            reach=self.pilot_result.reach,
-            sharp=self.pilot_result.sharp,
-            occluded=self.pilot_result.occluded,
-            occluded_anchors=occluded,
-            raster=self.raster_cells > 0,
-            raster_cells=self.raster_cells,
-        )
-
-    @property
-    def candidate(self) -> Candidate:
-        pilot_result = self.pilot_result
-        lacking = {
-            "light over sharp lobes": pilot_result.unresolved,
-            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": pilot_result.left_out,
-            "light over small mirrors alone (not resolved)": pilot_result.unresolved_specular,
-        }
-        missing = min(sum(lacking.values()), 1.0)
-        # Errors of the light that is there count for its part of all.
-        rest = [float(self._systematic(sure, frozenset())[0]) for sure in (0.0, SURE)]
-        if not math.isinf(self.pilot_result.hits):
-            one_hit = 1 / (self.pilot_result.hits * float(self.samples["direct"][0]))
-            rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
-        value, bound = (missing + (1 - missing) * error for error in rest)
-        return Candidate(
-            settings=self.settings(0),
-            systematic=Estimate(value, bound),
-            lacking=lacking,
-            target=float(self.target[0]),
-            noise=float(self.noise[0]),
-            fits=bool(self.fits[0]),
-            work=float(self.work[0]),
-        )
+        self.pilot_result, self.effects, self.raster_cells = pilot_result, effects, raster_cells
+        self.rows, self.given = rows, given
+        self.numbers = Numbers.of_counts([*rows.T], effects, len(pilot_result.occluded), raster_cells)
 
     # ---- errors
 
-    @cached_property
-    def _avoidable(self) -> FloatArray:
-        return self._systematic(self.sure, self.given)
+    def accurate(self, accuracy: float, sure: float) -> npt.NDArray[np.bool_]:
+        return self._systematic(sure, self.given) < _MARGIN * accuracy
 
     @property
     def unsure(self) -> dict[Approximation, float]:
@@ -285,13 +254,14 @@ class _Table:
         return {part: weights[part] ** 2 * (each.bound**2 - each.value**2) for part, each in errors.items()}
 
     def _systematic(self, sure: float, ignored: frozenset[Approximation]) -> FloatArray:
-        apart = self.pilot_result.apart
+        result, cells = self.pilot_result, self.raster_cells
         drawn = [
-            size**2 for name, size in apart.items() if name not in self.effects and Approximation(name) not in ignored
+            size**2
+            for name, size in result.apart.items()
+            if name not in self.effects and Approximation(name) not in ignored
         ]
-        drawn += [self.pilot_result.sharp.left**2] if self.pilot_result.sharp else []
-        cells = self.raster_cells
-        of_raster = self.pilot_result.raster[in_waves(self.effects)].error_left(cells) if cells else None
+        drawn += [result.sharp.left**2] if result.sharp else []
+        of_raster = result.raster[in_waves(self.effects)].error_left(cells) if cells else None
         drawn += [of_raster[sure > 0] ** 2] if of_raster else []
         squared, spread = self._squares_of_given if ignored == self.given else self._squares(ignored)
         return np.asarray(np.sqrt(np.maximum(np.maximum(squared, 0) + sure * spread, 0) + sum(drawn)))
@@ -302,9 +272,8 @@ class _Table:
 
     def _squares(self, ignored: frozenset[Approximation]) -> tuple[FloatArray, FloatArray]:
         changes = self.pilot_result.changes
-        return changes.squared_errors(
-            np.stack([self._weight(part) * (part not in ignored) for part in changes.parts], axis=1)
-        )
+        weights = [self._weight(part) * (part not in ignored) for part in changes.parts]
+        return changes.squared_errors(np.stack(weights, axis=1))
 
     def _weight(self, part: Approximation) -> FloatArray:
         """Return the (m,) fraction of a part's change that each row leaves."""
@@ -320,98 +289,100 @@ class _Table:
             return np.asarray((getattr(numbers, part.name) == part.count) * left, dtype=np.float64)
         row = PASSES[light]
         lit = row.connections(numbers) > 0 if row.anchors else numbers.indirect > 0
+        if what == "cells":
+            return np.asarray(lit * finer_cells)
         # Several layers leave as much of one layer's error as they do of direct light.
-        return np.asarray(lit * (finer_cells if what == "cells" else self._left_by_layers))
-
-    @cached_property
-    def _left_by_layers(self) -> FloatArray:
         ladder = self.pilot_result.ladders["layers"]
         parts = np.zeros(max(ladder) + 1)
         for count, error in ladder.items():
             parts[count] = min(error.bound / ladder[1].bound, 1.0) if ladder[1].bound else 0.0
-        return np.where(self.rows[:, 5] > 0, parts[self.rows[:, 1].astype(int)], 1.0)
+        return np.asarray(lit * np.where(self.rows[:, 5] > 0, parts[self.rows[:, 1].astype(int)], 1.0))
 
     # ---- samples and work
 
-    @cached_property
-    def accurate(self) -> npt.NDArray[np.bool_]:
-        return self._avoidable < _MARGIN * self.accuracy
+    def predict(self, accuracy: float, sure: float) -> _Prediction:
+        """Predict samples and work of all rows, so that their errors keep the accuracy."""
+        result, forming, numbers = self.pilot_result, self.pilot_result.forming, self.numbers
+        avoidable, none = self._systematic(sure, self.given), np.zeros(len(self.rows))
 
-    @cached_property
-    def fits(self) -> npt.NDArray[np.bool_]:
-        return self.accurate & (self._entries <= _MOST_ENTRIES)
-
-    @cached_property
-    def target(self) -> FloatArray:
-        """(m,) Monte Carlo error at which sampling may stop. Checks of all shots need no margin."""
-        forming, left = self.pilot_result.forming, np.square(_MARGIN * self.accuracy) - np.square(self._avoidable)
+        # ---- Monte Carlo error at which sampling may stop; checks of all shots need no margin
+        left = np.square(_MARGIN * accuracy) - np.square(avoidable)
         margin = _MARGIN if tells_all(forming.classes, forming.shots, forming.pixels) else 1.0
-        target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * self.accuracy)
-        return (
-            target
-            if math.isinf(self.pilot_result.hits)
-            else target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
-        )
+        target = np.where(left > 0, np.sqrt(np.maximum(left, 0)) / margin, _MARGIN * accuracy)
+        if not math.isinf(result.hits):
+            target = target * math.sqrt(1 - (_ONE_HIT * _OFF_BY_HITS.bound) ** 2)
 
-    @cached_property
-    def _work_of_sample(self) -> dict[str, Number]:
-        lines = traced_for(self.pilot_result.forming.lines, self.pilot_result.forming.parted)
-        return {
-            name: lines * GROUPS * FIXED.passes[name] * sample_cost.paths * PASSES[name].connections(self.numbers)
-            for name, sample_cost in sample_costs(self.pilot_result, self.effects).items()
+        # ---- Samples of a group: the least work for a sum of variances
+        lines = traced_for(forming.lines, forming.parted)
+        work_of_sample = {
+            name: lines * GROUPS * FIXED.passes[name] * cost.paths * PASSES[name].connections(numbers)
+            for name, cost in sample_costs(result, self.effects).items()
         }
-
-    @cached_property
-    def samples(self) -> dict[str, FloatArray]:
-        return {name: np.asarray(PASSES[name].whole(count)) for name, count in self.needed.items()}
-
-    @cached_property
-    def needed(self) -> dict[str, FloatArray]:
-        """(m,) samples of a group, by pass, possibly below one: the least work for a sum of variances."""
         parts = {
             name: np.sqrt(self._by_row(name, lambda cost: cost.variance) * price)
-            for name, price in self._work_of_sample.items()
+            for name, price in work_of_sample.items()
         }
-        every = sum(parts.values()) + np.zeros(len(self.rows))
-        single = self.target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
+        every, single = sum(parts.values()) + none, target * math.sqrt(GROUPS) / _BOUND_OVER_ERROR
         found = {}
         for name, part in parts.items():
             # Light without noise takes no share; a share of one keeps the division defined.
             share = np.sqrt(np.divide(part, every, out=np.ones(len(every)), where=part > 0))
-            needed = self._by_row(name, partial(_samples_for, target=single * share))
+            needed = self._by_row(name, _samples_for, single * share)
             if name == "direct":
-                needed = np.maximum(needed, 1 / (self.pilot_result.hits * _ONE_HIT * self.target))
+                needed = np.maximum(needed, 1 / (result.hits * _ONE_HIT * target))
             # What needs no whole sample does not take two when all others grow.
             found[name] = np.where(needed < 1, needed, PASSES[name].whole(needed))
-        return found
+        samples = {name: np.asarray(PASSES[name].whole(count)) for name, count in found.items()}
 
-    @cached_property
-    def noise(self) -> FloatArray:
-        total = np.zeros(len(self.rows))
-        for name, count in self.samples.items():
-            left = self._by_row(name, partial(_noise_after, samples=count))
-            total = total + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
-        return np.sqrt(total)
+        # ---- Work, and the best row
+        held = np.asarray(entries(result.sample_costs["direct"].paths, forming.classes, numbers, samples)) + none
+        tracing = sum(samples[name] * price for name, price in work_of_sample.items())
+        accumulating = accumulation_seconds(forming, numbers, held, FIXED)
+        shown = optics_seconds(forming, numbers, FIXED) + checking_seconds(forming, numbers, FIXED)
+        work = np.asarray(tracing + accumulating + shown)
+        fits = (avoidable < _MARGIN * accuracy) & (held <= _MOST_ENTRIES)
+        chosen = fits
+        if not fits.any():
+            error = np.where(held <= max(_MOST_ENTRIES, held.min()), avoidable, math.inf)
+            chosen = error <= _AS_GOOD * error.min()
+        best = int(np.lexsort((avoidable, work, ~chosen))[0])
+        least, seconds = float(avoidable[best]), float(work[best])
+        rank = (False, seconds, least) if fits[best] else (True, least, 0.0)
+        return _Prediction(self, target, found, samples, fits, work, best, rank)
 
-    def _by_row(self, name: str, of: Callable[[SampleCost], Number]) -> FloatArray:
-        found = of(sample_costs(self.pilot_result, self.effects)[name]) + np.zeros(len(self.rows))
+    def candidate(self, accuracy: float, sure: float) -> Candidate:
+        """Return the only row with its errors."""
+        result, found = self.pilot_result, self.predict(accuracy, sure)
+        noise = np.zeros(len(self.rows))
+        for name, count in found.samples.items():
+            left = self._by_row(name, lambda cost, own: cost.noise.error_left(own), count)
+            noise = noise + (PASSES[name].connections(self.numbers) > 0) * np.square(left) / GROUPS
+        lacking = {
+            "light over sharp lobes": result.unresolved,
+            "light over mirrors or curved glass both ways, or once and a sharp lobe (left out)": result.left_out,
+            "light over small mirrors alone (not resolved)": result.unresolved_specular,
+        }
+        missing = min(sum(lacking.values()), 1.0)
+        # Errors of the light that is there count for its part of all.
+        rest = [float(self._systematic(each, frozenset())[0]) for each in (0.0, SURE)]
+        if not math.isinf(result.hits):
+            one_hit = 1 / (result.hits * float(found.samples["direct"][0]))
+            rest = [math.hypot(error, hits * one_hit) for error, hits in zip(rest, _OFF_BY_HITS, strict=True)]
+        return Candidate(
+            settings=found.settings,
+            systematic=Estimate(*(missing + (1 - missing) * error for error in rest)),
+            lacking=lacking,
+            target=float(found.target[0]),
+            noise=float(np.sqrt(noise)[0]),
+            fits=bool(found.fits[0]),
+            work=float(found.work[0]),
+        )
+
+    def _by_row(self, name: str, of: Callable[..., Number], *by: Number) -> FloatArray:
+        found = of(sample_costs(self.pilot_result, self.effects)[name], *by) + np.zeros(len(self.rows))
         if name == "direct":
-            found = np.where(self.rows[:, 0] > 1, of(self.pilot_result.spread), found)
+            found = np.where(self.rows[:, 0] > 1, of(self.pilot_result.spread, *by), found)
         return np.asarray(found)
-
-    @cached_property
-    def _entries(self) -> FloatArray:
-        pixels, classes = self.pilot_result.sample_costs["direct"].paths, self.pilot_result.forming.classes
-        found = entries(pixels, classes, self.numbers, self.samples)
-        return np.asarray(found) + np.zeros(len(self.rows))
-
-    @cached_property
-    def work(self) -> FloatArray:
-        tracing = sum(self.samples[name] * price for name, price in self._work_of_sample.items())
-        forming = self.pilot_result.forming
-        accumulating = accumulation_seconds(forming, self.numbers, self._entries, FIXED)
-        shown = optics_seconds(forming, self.numbers, FIXED) + checking_seconds(forming, self.numbers, FIXED)
-        return np.asarray(tracing + accumulating + shown)
 
 
 def _samples_for(kind: SampleCost, target: Number) -> Number:
@@ -425,20 +396,9 @@ def _samples_for(kind: SampleCost, target: Number) -> Number:
     return needed
 
 
-def _noise_after(kind: SampleCost, samples: Number) -> Number:
-    return kind.noise.error_left(samples)
-
-
 def counts_of(settings: Settings) -> tuple[int, ...]:
     numbers = Numbers.of(settings)
     return tuple(int(getattr(numbers, name)) for name in COUNTED)
-
-
-def _choices(pilot_result: PilotResult, name: str, switches: Mapping[str, bool]) -> list[int]:
-    counts = list(pilot_result.ladders[name])
-    if name not in switches or len(counts) == 1:
-        return counts
-    return [count for count in counts if (count > 1) == switches[name]]
 
 
 def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
@@ -446,15 +406,6 @@ def _omissions(switches: Mapping[str, bool]) -> frozenset[Approximation]:
     if "anchors" in off:
         off.add("occluded_anchors")
     return frozenset(Approximation(name, int(name in COUNTED)) for name in off)
-
-
-def _subsets(pilot_result: PilotResult, switches: Mapping[str, bool]) -> Iterator[frozenset[str]]:
-    """Yield sets of effects that may be on together."""
-    takes_time, present = costly_effects(), frozenset(pilot_result.effects)
-    free = [name for name in EFFECTS if name in takes_time & present and name not in switches]
-    always = {name for name in EFFECTS if switches.get(name, name in present - takes_time)}
-    for several in chain.from_iterable(combinations(free, count) for count in range(len(free) + 1)):
-        yield frozenset(always | set(several))
 
 
 def costly_effects() -> frozenset[str]:

@@ -1,24 +1,54 @@
-"""Make the plan of a capture from a short pilot run, for a given accuracy or a given time."""
+"""Make the plan of a capture from a short pilot run, for a given accuracy or a given time.
+
+A plan is a table: a row for each effect and each number that is chosen. Accuracy is the relative rms error of the
+expected frames, ``||a - b|| / ||b||`` over all frames and pixels, from sampling, omissions and coarse numbers.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.effects import EFFECTS
 from mitsim.bench.request import check_accuracy
 from mitsim.core.arrays import Labels
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
 from mitsim.devices.patterns import Lighting
-from mitsim.light.cost_model import FIXED, ROUNDS, tracing_seconds
+from mitsim.light.cost_model import (
+    FIXED,
+    ROUNDS,
+    Numbers,
+    UnitCosts,
+    accumulation_seconds,
+    checking_seconds,
+    entries,
+    in_waves,
+    optics_seconds,
+    tracing_seconds,
+    truth_seconds,
+)
 from mitsim.light.memory import frame_seconds
-from mitsim.light.plan import Plan
-from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, PilotResult, SampleCost
+from mitsim.light.passes import FOLLOWED
+from mitsim.light.plan import Plan, PlanRow, State
+from mitsim.light.settings import (
+    COUNTED,
+    GROUPS,
+    MOST_PATHS,
+    REPLICATES,
+    WIDE,
+    Estimate,
+    PilotResult,
+    SampleCost,
+    Settings,
+)
 from mitsim.light.simulation import Simulation
 from mitsim.optics.diffraction import check_openings
 from mitsim.optics.fft_shadow import check_waves
@@ -28,12 +58,20 @@ from mitsim.planner.choose import (
     Candidate,
     Candidates,
     accuracy_for_time,
+    costly_effects,
+    counts_of,
     predicted_candidate,
     time_warnings,
     unit_costs_of,
     value_of_refining,
 )
-from mitsim.planner.explain import SceneFacts, explain_plan
+from mitsim.transport.connect import part_of_view, shines_in
+from mitsim.transport.missed import polished_shapes
+from mitsim.transport.plugins.base import turn_and_origin
+
+if TYPE_CHECKING:
+    from mitsim.scene.load import LoadedScene
+    from mitsim.scene.outline import Tag
 
 OPENING_S = 1.5
 """Seconds to start the program and open a scene (1.2 to 1.6 on two cores)."""
@@ -187,13 +225,9 @@ def _with_heavy_paths(
         asked = {name: seconds[name] / FIXED.passes[name] for name in heavier}
         few = any(sample_cost.noise.heavy < _FEW for sample_cost in heavier.values())
         if paths > (_MOST_HEAVY_PATHS if few else min(_MOST_HEAVY_PATHS, _OF_ALL * sum(asked.values()))):
-            return pilot_result, _limit_samples(planned, asked)
-
-
-def _limit_samples(chosen: Candidate, paths: Mapping[str, float]) -> Candidate:
-    samples = dict(chosen.settings.samples)
-    samples |= {name: MOST_PATHS / count * samples[name] for name, count in paths.items() if count > MOST_PATHS}
-    return replace(chosen, settings=replace(chosen.settings, samples=samples))
+            samples = dict(planned.settings.samples)
+            samples |= {name: MOST_PATHS / count * samples[name] for name, count in asked.items() if count > MOST_PATHS}
+            return pilot_result, replace(planned, settings=replace(planned.settings, samples=samples))
 
 
 def _range(pilot_result: PilotResult, plan: Plan) -> tuple[float, float] | None:
@@ -228,7 +262,8 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
         if timed and rest <= (1 - _MOSTLY) * sum(fixed.values()):
             break
         # A path of shared light counts for several.
-        paths = pilot_result.sample_costs[name].paths if name == "indirect" else _paths_of(simulation, name)
+        own_paths = simulation.passes[name].tracer.paths_per_sample
+        paths = pilot_result.sample_costs[name].paths if name == "indirect" else own_paths
         seconds, alone = _pace(simulation, name, labels, own)
         timed[name], ratios[name] = seconds / paths, seconds / paths / FIXED.passes[name]
         if name == "direct":
@@ -245,10 +280,6 @@ def _time_paths(pilot_result: PilotResult, simulation: Simulation, labels: Label
     }
     spread = replace(spread, seconds=ray or slower * FIXED.passes["direct"])
     return replace(pilot_result.with_sample_costs(found), spread=spread)
-
-
-def _paths_of(simulation: Simulation, name: str) -> int:
-    return simulation.passes[name].tracer.paths_per_sample
 
 
 def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple[float, float]:
@@ -275,3 +306,329 @@ def _pace(simulation: Simulation, name: str, labels: Labels, seed: int) -> tuple
     slope = min(max((longest - launch) / (samples - 1), _LEAST_SLOPE * least), least) if samples > 1 else launch
     launches = ROUNDS * math.ceil(planned / max(1, at_once // paths_per_sample))
     return slope + max(launch - slope, 0.0) * launches / planned, slope
+
+
+# -------- The table of a plan
+
+_FEW_WAVELENGTHS = 2
+"""Mean width of a mask's openings, in wavelengths, below which scalar diffraction is a guess."""
+_VAGUE = 2.0
+"""An error is reported as a bound if its bound is larger than this multiple of its estimate."""
+_FALLOFF = "falloff, gloss and parallax"
+_FOLLOWED = "light over several surfaces, in mirrors and of lamps"
+_CELLS = "{n}x{n} cells of even light a projector pixel"
+_HIDDEN = "{hidden} projector pixels are hidden from part of the sensor"
+# Separate anchors for hidden pixels save time: as many anchors for all pixels would take far more.
+_NUMBERS: Mapping[str, tuple[str, str, Mapping[str, Any]]] = {
+    "anchors": (f"{_FALLOFF} over the sensor: one anchor", f"{_FALLOFF}: {{n}}x{{n}} anchors",
+                {"anchors": 1, "occluded_anchors": 1}),
+    "layers": ("the light is seen at {depth:.1f} mm; one layer",
+               "the light is seen from {near:.0f} to {far:.0f} mm; {n} layers", {"layers": ()}),
+    "cells": (_CELLS, _CELLS, {}),
+    "followed_anchors": (f"{_FOLLOWED}: one point", f"{_FOLLOWED}: {{n}}x{{n}} in cells of {{width}}x{{width}} pixels",
+                         {"followed_anchors": 1}),
+    "occluded_anchors": (f"{_HIDDEN}: one anchor", f"{_HIDDEN}: {{n}}x{{n}} anchors", {}),
+}  # fmt: skip
+"""Numbers that a plan chooses: words for one and for several, and the settings with one."""
+
+
+def explain_plan(
+    accuracy: float,
+    pilot_result: PilotResult,
+    facts: SceneFacts,
+    switches: Mapping[str, bool] | None = None,
+    chosen: Candidate | None = None,
+) -> Plan:
+    """Choose effects, numbers and samples, and list them in a table; ``chosen`` is the choice if it is known."""
+    check_accuracy(accuracy)
+    switches = switches or {}
+    chosen = chosen or Candidates(pilot_result, switches).choice(accuracy)
+    stages = _stages(pilot_result, chosen.settings, unit_costs_of(pilot_result))
+    return Plan(
+        accuracy=accuracy,
+        effects=tuple(_rows(pilot_result, chosen.settings, facts, switches)),
+        predicted_seconds=sum(stages.values()),
+        settings=chosen.settings,
+        sampling_target=chosen.target,
+        systematic_error=chosen.systematic.value,
+        systematic_bound=chosen.systematic.bound,
+        warnings=(*facts.warnings, *_shortfall(accuracy, pilot_result, chosen, facts)),
+        predicted=stages,
+    )
+
+
+def _stages(pilot_result: PilotResult, settings: Settings, costs: UnitCosts) -> dict[str, float]:
+    forming, numbers = pilot_result.forming, Numbers.of(settings)
+    held = entries(pilot_result.sample_costs["direct"].paths, forming.classes, numbers, settings)
+    return {
+        "transport": sum(tracing_seconds(pilot_result, settings, costs).values())
+        + float(accumulation_seconds(forming, numbers, held, costs))
+        + float(checking_seconds(forming, numbers, costs)),
+        "truth": truth_seconds(pilot_result, settings, costs),
+        "optics": float(optics_seconds(forming, numbers, costs)),
+    }
+
+
+def _rows(
+    result: PilotResult, settings: Settings, facts: SceneFacts, switches: Mapping[str, bool]
+) -> Iterator[PlanRow]:
+    """Yield a row for each number, for how frames are formed, and for each effect."""
+    costs, costly, waves = unit_costs_of(result), costly_effects(), in_waves(settings.effects)
+    now = _stages(result, settings, costs)
+
+    def stages(**changes: Any) -> dict[str, float]:
+        return _stages(result, replace(settings, **changes), costs)
+
+    def saved(**changes: Any) -> float:
+        return max(sum(now.values()) - sum(stages(**changes).values()), 0.0)
+
+    for name, count in zip(COUNTED, counts_of(settings), strict=True):
+        one, several, with_one = _NUMBERS[name]
+        errors, row = result.ladders[name], name.replace("_", "-")
+        if name == "followed_anchors" and not settings.effects & FOLLOWED:
+            reason = "no light over several surfaces, in mirrors or of lamps is followed"
+            yield PlanRow(row, "off", reason, 0.0, 0.0)
+        elif name == "occluded_anchors" and not result.occluded:
+            yield PlanRow(row, "off", "few anchors serve all projector pixels", 0.0, 0.0)
+        else:
+            reason = (one if count == 1 else several).format(
+                n=count, depth=result.depth, near=settings.depths[-1], far=settings.depths[0],
+                width=settings.followed_width, hidden=len(result.occluded),
+            )  # fmt: skip
+            left = _words(errors[count])
+            if name == "cells":
+                worst = max(error.value for error in errors.values())
+                yield PlanRow(row, "approximate", f"{reason} leave {left}", worst, 0.0)
+            elif count == 1:
+                yield PlanRow(row, "off", f"{reason} leaves {left}", errors[1].value, 0.0)
+            else:
+                yield PlanRow(row, "approximate", f"{reason} leave {left}", errors[1].value, saved(**with_one))
+
+    drawn = result.raster[waves]
+    left_by_raster = drawn.error_left(settings.raster_cells)
+    if left_by_raster is not None:  # The mask has more than two separable terms.
+        fewest, terms = drawn.cells[0], f"{result.forming.geometric_terms:.0f} separable terms"
+        cells = settings.raster_cells or fewest
+        by_fft, with_fewest, sums = (
+            stages(raster=count > 0, raster_cells=count)["optics"] for count in (cells, fewest, 0)
+        )
+        formed = f"by FFT on a raster of {cells} cells a pixel, which leaves {_words(left_by_raster)}"
+        if drawn.needed:
+            yield PlanRow("mask-shadow", "approximate", formed, None, max(by_fft - with_fewest, 0.0))
+        elif settings.raster:
+            reason = f"{terms}: {formed}, in {by_fft:.2g} s; their sum takes {sums:.2g} s"
+            yield PlanRow("mask-shadow", "approximate", reason, 0.0, max(by_fft, 0.0))
+        else:
+            reason = f"{terms} are summed, in {sums:.2g} s; {formed}, in {by_fft:.2g} s"
+            yield PlanRow("mask-shadow", "exact", reason, left_by_raster.value, sums)
+
+    for name, effect in EFFECTS.items():
+        on, error = name in settings.effects, result.effects.get(name)
+        state: State = "exact" if on else "off"
+        if error is None:
+            yield PlanRow(name, state, effect.absent or "nothing in the scene calls for it", 0.0, 0.0)
+            continue
+        parts = [facts.notes.get(name, ""), "switched by the user" if name in switches else ""]
+        if error.bound >= _VAGUE * error.value and error.bound:
+            parts.append(f"left out, the frames change by {_words(error)}")
+        seconds = saved(effects=settings.effects - {name}) if on and name in costly else 0.0
+        yield PlanRow(name, state, "; ".join(filter(None, parts)), error.value, seconds)
+
+    square = PlanRow("keystone", "off", "the projector faces the aligned plane squarely", 0.0, 0.0)
+    off = f"the projector's window is {facts.keystone:.1f} of its pixels off a square; responses are not separable"
+    yield PlanRow("keystone", "exact", off, None, 0.0) if facts.keystone else square
+    yield facts.spectrum
+    noise = "Poisson, full well, read noise and quantisation of each frame"
+    yield PlanRow("sensor-noise", "exact", noise, None, 0.0)
+
+
+def _words(error: Estimate) -> str:
+    """Return an error as text, as a bound if it cannot be told from zero."""
+    if error.bound == 0:
+        return "0"
+    return f"{error.value:.1e}" if error.bound < _VAGUE * error.value else f"less than {error.bound:.1e}"
+
+
+def _shortfall(accuracy: float, result: PilotResult, chosen: Candidate, facts: SceneFacts) -> list[str]:
+    """Return why the choice does not keep the accuracy, and what helps; nothing if it does."""
+    if chosen.total.bound <= accuracy:
+        return []
+    settings, found = chosen.settings, list[str]()
+    parts = {
+        f"{name.replace('_', ' ')} ({count}{'' if name == 'layers' else f'x{count}'})": result.ladders[name][
+            count
+        ].bound
+        for name, count in zip(COUNTED, counts_of(settings), strict=True)
+    }
+    width, raster = settings.followed_width, result.raster[in_waves(settings.effects)].error_left(settings.raster_cells)
+    if width > 1:
+        parts[f"cells of their light ({width} pixels)"] = result.error(WIDE).bound / settings.coarse_cells**2
+    if raster and settings.raster:
+        parts["the mask's raster"] = raster.bound
+    if sharp := settings.sharp:
+        parts[f"anchors of sharp light ({sharp.anchors}x{sharp.anchors})"] = sharp.left
+    off = {f"{name} (off)": error.bound for name, error in result.effects.items() if name not in settings.effects}
+    parts |= {**chosen.lacking, **off}
+    largest = max(parts, key=lambda name: parts[name])
+    counts = min(accuracy, parts[largest])
+    if result.unresolved > accuracy:
+        found.append(
+            f"{result.unresolved:.0%} of the direct light comes over lobes too sharp to sample, and the frames "
+            "lack most of it; give those surfaces more roughness, or make them perfect mirrors (conductor)"
+        )
+    if result.mirror is not None and facts.shapes and result.left_out >= counts:
+        rule = (
+            f"{result.left_out:.2g} of the light comes over it and, besides, a mirror, curved glass or a sharp "
+            "lobe, where paths find it never or too seldom, so all or most of it is left out of the frames; "
+            "turn it away, make it rough, or give the projector a lens (aperture_radius_mm) with the effect "
+            "interreflection"
+        )
+        found.append(_refusal(facts.shapes[result.mirror], rule))
+    if facts.mirrors and result.unresolved_specular >= counts:
+        kinds = Counter(str(mirror.attributes.get("type", "shape")) for mirror in facts.mirrors)
+        among = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+        rule = (
+            f"{result.unresolved_specular:.2g} of the light comes over the scene's mirrors and curved glass "
+            f"alone ({among}; this is the first), in beams too fine to be placed on the sensor: it is left "
+            "out, or in the wrong pixels; use fewer or larger ones, move them apart, or make them rough"
+        )
+        found.append(_refusal(facts.mirrors[0], rule))
+    return found or [
+        f"the predicted total error, up to {chosen.total.bound:.1e}, exceeds the requested {accuracy:g}; "
+        f"largest: {largest}, {parts[largest]:.1e}"
+    ]
+
+
+def _refusal(tag: Tag, rule: str, place: str = "shape") -> str:
+    return str(tag.refusal(place, repr(tag.attributes.get("type", "")), rule))
+
+
+# -------- What a plan reports of a bench
+
+
+_GREY = "no surface differs by wavelength; the mask's shadow is the mean over all lines"
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """Facts about a bench that a plan reports.
+
+    ``keystone`` is the deviation of the projector's window from a square [projector pixels], ``mirrors`` are tags of
+    mirrors and curved glass, and ``spectrum`` is the row of colours.
+    """
+
+    notes: Mapping[str, str]
+    keystone: float
+    warnings: tuple[str, ...] = ()
+    shapes: tuple[Tag, ...] = ()
+    mirrors: tuple[Tag, ...] = ()
+    spectrum: PlanRow = field(default_factory=lambda: PlanRow("spectrum", "off", _GREY, 0.0, 0.0))
+
+    @classmethod
+    def of(cls, bench: Apparatus, switches: Mapping[str, bool] | None = None) -> SceneFacts:
+        """Collect the facts of ``bench``, without those of effects that the user's ``switches`` turn off."""
+        loaded, off = bench.loaded, {name for name, on in (switches or {}).items() if not on}
+        warnings = (*known_losses(loaded, switches or {}), *_limits(bench, off))
+        notes = {name: effect.note(bench) for name, effect in EFFECTS.items()}
+        polished = polished_shapes(loaded.scene) if loaded.mirrors and loaded.shapes else ()
+        mirrors = tuple(loaded.shapes[number] for number in polished)
+        spectrum = PlanRow("spectrum", "off", _GREY, 0.0, 0.0)
+        if bench.lines is not None:
+            nanometres = ", ".join(f"{wave:g}" for wave in bench.lines.wavelengths_nm)
+            spectrum = PlanRow("spectrum", "exact", f"all is simulated at {nanometres} nm", None, 0.0)
+        elif loaded.coloured:
+            may = f"{len(loaded.coloured)} of the scene's tags may have colours"
+            first = f"the first {loaded.coloured[0].path.name}:{loaded.coloured[0].line}"
+            reason = f"one panchromatic reflectance; {may}, {first}; what that leaves out: --colour auto"
+            spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
+        elif bench.sensor.quantum_efficiency_curve is not None:
+            reason = f"{_GREY}, but the camera does; what that leaves: --colour auto"
+            spectrum = PlanRow("spectrum", "off", reason, None, 0.0)
+        return cls(notes, loaded.pixels.keystone, warnings, loaded.shapes, mirrors, spectrum)
+
+
+def _limits(bench: Apparatus, off: Collection[str]) -> Iterator[str]:
+    geometry, waves = bench.geometry, "diffraction" not in off
+    if bench.projector.glare and bench.loaded.mirrors and not {"glare", "mirrors"} & set(off):
+        yield (
+            f"{bench.projector.glare:.2g} of the light over mirrors alone is to be scattered in the projector's lens "
+            "(ansi_contrast), and stays in its own pixels; --effects=-glare says that no scattering is meant"
+        )
+    lens = bench.projector.aperture_radius_mm
+    if lens and bench.loaded.in_view and not {"aperture", "mirrors"} & set(off):
+        camera = turn_and_origin(bench.loaded.camera.world_transform())[1]
+        blur = 2 * lens * geometry.mask_distance / math.dist(camera, bench.projector_optics.canvas_map.origin)
+        yield (
+            "the projector shines on the sensor itself as a pinhole, without its lens, which would blur the mask's "
+            f"shadow by {blur:.2g} mm; keep it out of the view, or set aperture_radius_mm to 0"
+        )
+    if bench.field_stop_cuts:
+        yield (
+            "the field stop (fov) cuts into the projector's window for part of the sensor; its edge is blurred over "
+            "the anchors, so open it or accept an error there"
+        )
+    if geometry.wall_shift_features >= 1:
+        yield (
+            f"mask_thickness {geometry.mask_thickness} mm shifts the far face by {geometry.wall_shift_features:.1f} "
+            "features at the field stop; the two-face model holds below 1"
+        )
+    of_light = bool(geometry.mask_plate and geometry.mask_plate.irradiance)
+    if not geometry.diffracts and not of_light and waves:
+        yield (
+            "diffraction is left out: behind blurred edges it is worked out for masks of one separable term, and this "
+            f"one ({geometry.mask_words}) has more; --effects=-diffraction says that a geometric shadow is meant"
+        )
+    left_out = geometry.tilt_left_out(geometry.diffracts and waves)
+    if left_out or (any(geometry.mask_tilt) and bench.loaded.mirrors):
+        yield (
+            f"the mask's tilt is left out{'' if left_out else ' of light over mirrors'}: it moves shadows by up to "
+            f"{geometry.tilt_shift_mm * 1e3:.2g} um; render --estimator reference has it, or set it to 0 in the "
+            "camera's [mask]"
+        )
+    longest, opening = float(bench.spectrum.wavelengths_nm.max()), geometry.build_mask().opening_mm
+    if opening * 1e6 < _FEW_WAVELENGTHS * longest and not of_light:
+        yield (
+            f"mask_feature {geometry.mask_feature:g} mm: the mask's openings are {opening:.3g} mm wide, less than "
+            f"{_FEW_WAVELENGTHS} wavelengths of {longest:.0f} nm; scalar theory of masks needs wider ones, so the "
+            "shadow is a guess"
+        )
+
+
+# -------- Light that frames are known to lack, whatever the plan
+
+
+_PATHS = 2**15
+"""Paths of the pilot's shortest runs."""
+_FEWEST = 8.0
+"""Hits of a lamp below which its light may be unknown: a Poisson number of mean 8 is zero once in 3000."""
+
+
+def known_losses(loaded: LoadedScene, effects: Mapping[str, bool]) -> Iterator[str]:
+    """Describe light of a scene that the factored estimator does not find, except that of ``effects`` switched off."""
+    if effects.get("ambient", True):
+        yield from unseen_lamps(loaded, _PATHS, "the factored estimator")
+    if effects.get("mirrors", True):
+        if loaded.unfit.lamps and effects.get("ambient", True):
+            yield loaded.unfit.lamps
+        if loaded.unfit.instances:
+            yield loaded.unfit.instances
+
+
+def unseen_lamps(loaded: LoadedScene, paths: float, estimator: str) -> Iterator[str]:
+    """Describe lamps that shine on the sensor directly and that ``paths`` of an ``estimator`` rarely meet."""
+    for lamp, tag in loaded.small_lamps:
+        if shines_in(loaded.scene, loaded.camera, lamp):
+            rule = (
+                f"it shines on the sensor itself, and {estimator} has no light of a lamp but over surfaces, so that is "
+                "missing; keep it out of the view, or use a light that has a surface (area)"
+            )
+            yield _refusal(tag, rule, "light")
+    for tag, shape in zip(loaded.shapes, loaded.scene.shapes(), strict=True) if loaded.shapes else ():
+        part = part_of_view(loaded.scene, loaded.camera, shape) if shape.is_emitter() else 0.0
+        if 0 < part * paths < _FEWEST:
+            rule = (
+                f"{estimator} meets what shines on the sensor itself by chance, and {paths:.2g} paths meet this "
+                f"{part * paths:.1g} times, so its light may be missing; keep it out of the view, or take a lamp that "
+                f"is {(_FEWEST / (part * paths)) ** 0.5:.2g} times as wide and as much dimmer"
+            )
+            yield str(tag.refusal("lamp", f"{part:.1e} of the field of view", rule))

@@ -40,7 +40,7 @@ from mitsim.metrics import relative_error
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.planner import pilot
 from mitsim.planner.choose import counts_of, predicted_candidate
-from mitsim.planner.explain import SceneFacts, explain_plan
+from mitsim.planner.planner import SceneFacts, explain_plan
 from mitsim.studies.ablation import MOST, OfOrders, ablations, reform
 from mitsim.studies.accuracy_findings import Budget, JudgeFacts, PartCost, Row, Spread, Timed
 

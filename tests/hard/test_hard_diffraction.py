@@ -173,7 +173,7 @@ def test_a_mask_below_the_wavelength_warns(
     small_scene: Callable[..., Path], variant: str, feature: float, warned: bool
 ) -> None:
     from mitsim.api.bench import open_bench
-    from mitsim.planner.explain import SceneFacts
+    from mitsim.planner.planner import SceneFacts
 
     found = [w for w in SceneFacts.of(open_bench(small_scene(mask_feature=feature))).warnings if "wavelength" in w]
     assert len(found) == warned and all("mask_feature 0.0005 mm" in w and "\n" not in w for w in found)

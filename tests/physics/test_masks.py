@@ -31,7 +31,7 @@ from mitsim.devices.session import Modelling, load_recipe
 from mitsim.optics.image_formation import FrameOptics
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.planner.explain import SceneFacts
+from mitsim.planner.planner import SceneFacts
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.studies.demo import demo
 from tests.physics.slopes import slope_of_reference

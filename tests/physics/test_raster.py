@@ -32,7 +32,7 @@ from mitsim.optics.fft_shadow import Correlation, raster
 from mitsim.optics.image_formation import FrameOptics, raster_error
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
-from mitsim.planner.explain import SceneFacts
+from mitsim.planner.planner import SceneFacts
 
 BARE = CameraGeometry(pixels=40, mask_offset_row=0.013)
 LINES = Spectrum(np.array([450.0, 638.0]), np.array([0.4, 0.6]))

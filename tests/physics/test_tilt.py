@@ -20,7 +20,7 @@ from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
-from mitsim.planner.explain import SceneFacts
+from mitsim.planner.planner import SceneFacts
 
 BARE = CameraGeometry(pixels=96, pixel_pitch=0.03, mask_offset_row=0.1, mask_offset_column=-0.21)
 LINE = Spectrum(np.array([550.0]), np.array([1.0]))

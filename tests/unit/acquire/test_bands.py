@@ -148,7 +148,7 @@ def test_errors_are_rounded_up_to_two_digits(error: float, reported: float) -> N
 def test_a_plan_says_of_which_tag_mono_knows_no_colours(small_scene: Callable[..., Path]) -> None:
     """Without tracing: the error of a scene in greys is 0, that of another is not known."""
     from mitsim.api.bench import open_bench
-    from mitsim.planner.explain import SceneFacts
+    from mitsim.planner.planner import SceneFacts
 
     scene = small_scene()
     grey, red = (SceneFacts.of(open_bench(scene, albedo=a)).spectrum for a in ("0.5", "400:0.2, 700:0.5"))

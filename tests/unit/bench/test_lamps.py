@@ -18,7 +18,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame
 from mitsim.light.settings import Settings
 from mitsim.light.simulation import Simulation
-from mitsim.planner.explain import known_losses
+from mitsim.planner.planner import known_losses
 
 N, ALBEDO, Z, HALF, SCALE = 16, 0.5, 400.0, 64.0, 111000.0
 STOP = np.tan(np.radians(10))

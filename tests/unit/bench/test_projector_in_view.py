@@ -9,7 +9,7 @@ import pytest
 
 from mitsim.acquire import reference
 from mitsim.api.bench import Bench, open_bench
-from mitsim.planner.explain import SceneFacts
+from mitsim.planner.planner import SceneFacts
 
 
 @pytest.fixture

@@ -29,8 +29,7 @@ from mitsim.light.simulation import Simulation
 from mitsim.optics.forming import bound_of
 from mitsim.optics.frames import ExpectedFrames, monte_carlo_error
 from mitsim.planner import choose, planner
-from mitsim.planner.explain import SceneFacts
-from mitsim.planner.planner import make_plan
+from mitsim.planner.planner import SceneFacts, make_plan
 from tests.unit.planner.invented_pilot_result import PILOT_RESULT
 
 pytestmark = pytest.mark.usefixtures("kept_plans")

@@ -51,7 +51,7 @@ def test_every_switch_has_a_row_and_more() -> None:
     assert {"cells", "keystone", "spectrum", "sensor-noise"} <= set(names)
     for effect in plan().effects:
         assert effect.state in ("exact", "approximate", "off")
-        assert effect.reason and "\n" not in effect.reason
+        assert (effect.reason or effect.state == "exact") and "\n" not in effect.reason
 
 
 @pytest.mark.parametrize("effects", ["", "+mirrors,-diffraction,+anchors,+layers,-interreflection"])
@@ -85,8 +85,7 @@ def test_rows_carry_the_measured_errors() -> None:
     assert found["layers"].error_if_off == pytest.approx(SIZES[Approximation("layers", 1)])
     for name, error in PILOT_RESULT.effects.items():
         assert found[name].error_if_off == error.value
-    assert found["diffraction"].reason.startswith("Fresnel number 3.2; ")
-    assert "without it the error would be up to 3.0e-01, and 0.001 is allowed" in found["diffraction"].reason
+    assert found["diffraction"].reason == "Fresnel number 3.2"
 
 
 def test_a_row_is_found_by_its_name() -> None:
@@ -194,10 +193,10 @@ def test_a_raster_has_as_many_cells_as_the_accuracy_needs() -> None:
     assert [each.settings.raster_cells for each in found.values()] == [6, 12]
     assert not any(each.warnings for each in found.values())
     row = found[2e-3].row("mask-shadow")
-    assert "12 cells a pixel" in row.reason and "leaves 1.1e-03, 6 3.0e-03" in row.reason and row.seconds > 0
+    assert "12 cells a pixel" in row.reason and "leaves 1.1e-03" in row.reason and row.seconds > 0
     assert found[2e-3].block()["settings"]["raster_cells"] == 12
     fewest = found[1e-2].row("mask-shadow")
-    assert "that leaves 3.0e-03" in fewest.reason and fewest.seconds == 0, "with none to compare with"
+    assert "leaves 3.0e-03" in fewest.reason and fewest.seconds == 0, "with none to compare with"
     (warning,) = plan(1e-3, drawn).warnings
     assert "the mask's raster, 1.4e-03" in warning
 

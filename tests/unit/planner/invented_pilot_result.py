@@ -4,6 +4,7 @@ Sizes of changes are chosen so that each accuracy of ``ACCURACIES`` needs others
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from mitsim.light.cost_model import (
 from mitsim.light.plan import Plan, PlanRow
 from mitsim.light.settings import (
     REPLICATES,
+    SURE,
     Approximation,
     ErrorCovariance,
     Forming,
@@ -30,7 +32,8 @@ from mitsim.light.settings import (
     SampleCost,
     Settings,
 )
-from mitsim.planner.explain import SceneFacts, explain_plan
+from mitsim.planner.choose import Candidate, Candidates
+from mitsim.planner.planner import SceneFacts, explain_plan
 
 FACTS = SceneFacts(notes={"diffraction": "Fresnel number 3.2"}, keystone=0.0)
 SIZES = {
@@ -82,6 +85,11 @@ ONE_CLASS = replace(PILOT_RESULT, forming=replace(PILOT_RESULT.forming, shots=1,
 
 
 ACCURACIES = [0.1, 1e-2, 3e-3, 1e-3, 3e-4]
+
+
+def cheapest(accuracy: float, pilot_result: PilotResult, switches: Mapping[str, bool], sure: float = SURE) -> Candidate:
+    """The choice of least work that keeps ``accuracy``, or of least error if none does."""
+    return Candidates(pilot_result, switches).choice(accuracy, sure)
 
 
 def plan(

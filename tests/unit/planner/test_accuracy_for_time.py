@@ -15,10 +15,9 @@ from mitsim.planner.choose import (
     Candidates,
     accuracies,
     accuracy_for_time,
-    cheapest,
     time_warnings,
 )
-from tests.unit.planner.invented_pilot_result import PILOT_RESULT
+from tests.unit.planner.invented_pilot_result import PILOT_RESULT, cheapest
 
 TIMES = (0.01, 0.3, 0.95, 1.0, 2.0, 4.0, 10.0, 40.0, 1e5)
 
@@ -43,9 +42,9 @@ def test_accuracies_fall_by_the_same_step_down_to_the_finest() -> None:
 def test_candidates_choose_as_the_plan_does(candidates: Candidates) -> None:
     """What is shared between accuracies does not depend on them, nor on their order."""
     for accuracy in (3e-4, 0.1, 3e-3):
-        table, index = candidates.best(accuracy)
+        found = candidates.best(accuracy)
         candidate = cheapest(accuracy, PILOT_RESULT, {})
-        assert table.settings(index) == candidate.settings
+        assert found.settings == candidate.settings
         seconds, keeps = candidates.seconds(accuracy)
         assert seconds == pytest.approx(
             candidate.work + truth_seconds(PILOT_RESULT, candidate.settings, FIXED), rel=1e-12

@@ -25,7 +25,6 @@ from mitsim.light.settings import (
 from mitsim.planner.choose import (
     _UNEVEN_GROUPS,
     Candidates,
-    cheapest,
     counts_of,
     predicted_candidate,
     value_of_refining,
@@ -38,6 +37,7 @@ from tests.unit.planner.invented_pilot_result import (
     PILOT_RESULT,
     SIZES,
     changes,
+    cheapest,
     plan,
     rows,
     stages,

@@ -18,8 +18,8 @@ from mitsim.light.plan import Plan
 from mitsim.light.settings import GROUPS, MOST_PATHS, REPLICATES, Approximation, Noise, SampleCost
 from mitsim.optics.forming import bound_of
 from mitsim.planner import pilot, planner
-from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for, cheapest
-from tests.unit.planner.invented_pilot_result import ONE_CLASS, plan
+from mitsim.planner.choose import _BOUND_OVER_ERROR, FIRST_ACCURACY, Candidate, _samples_for
+from tests.unit.planner.invented_pilot_result import ONE_CLASS, cheapest, plan
 
 LIGHTING, SEED, LOOKING, FRAMES = Lighting.uniform(4), 7, 0.5, {"sensor": 0.2, "write": 0.1}
 AROUND = planner.OPENING_S + sum(FRAMES.values()) + LOOKING

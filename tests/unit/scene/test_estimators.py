@@ -8,7 +8,7 @@ import pytest
 
 from mitsim.api.bench import open_bench
 from mitsim.core.errors import MitsimError
-from mitsim.planner.explain import known_losses
+from mitsim.planner.planner import known_losses
 
 pytestmark = pytest.mark.usefixtures("variant")
 Write = Callable[..., Path]
