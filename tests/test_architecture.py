@@ -555,7 +555,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 
 SIZES = {
     "__main__": (1, 18),
-    "acquire": (8, 1568),
+    "acquire": (8, 1567),
     "api": (2, 224),
     "bench": (8, 1473),
     "calibrate": (7, 1607),
@@ -564,11 +564,11 @@ SIZES = {
     "devices": (14, 2504),
     "exchange": (10, 1875),
     "learn": (10, 1718),
-    "light": (12, 1982),
+    "light": (12, 1976),
     "metrics": (1, 81),
     "mitsim": (1, 102),
     "optics": (12, 2145),
-    "planner": (7, 2134),
+    "planner": (6, 2029),
     "reconstruct": (27, 7537),
     "report": (9, 2474),
     "scene": (10, 1873),
