@@ -94,7 +94,7 @@ growth
 formats
 api
 glossary
-decisions/index
+decisions
 /CHANGELOG
 /CONTRIBUTING
 ```

@@ -33,7 +33,7 @@ from tests.test_verbs import verbs
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
-    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/decisions/*.md")]
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
 )
 EXAMPLES = [page for page in PAGES if page not in ("CHANGELOG.md", "CONTRIBUTING.md")]
 FIRST_SCREEN = 40
@@ -452,16 +452,18 @@ def resolves(dotted: str) -> bool:
 def test_the_house_stands_on_its_page_as_it_is_tested() -> None:
     """Floors and rooms of docs/architecture.md; files that stand by themselves are not in its tables."""
     page, alone = text_of("docs/architecture.md"), {"version", "metrics", "mitsim", "__main__"}
-    floors = [set(re.findall(r"\w+", rooms)) for rooms in re.findall(r"^\| \d+ \| (.*) \|$", page, flags=re.M)]
+    path = re.findall(r"^\| \d+ \| `([\w/.]+)` \|", page, flags=re.M)
+    assert len(path) == 12 and all((ROOT / name).is_file() for name in path)
+    floors = [set(re.findall(r"\w+", rooms)) for rooms in re.findall(r"^\| \d+ \| ([\w, ]+) \|$", page, flags=re.M)]
     assert floors == [rooms for floor in FLOORS if (rooms := set(floor.split()) - alone)]
-    assert re.findall(r"^\| `(\w+)` \|", page.split("## The way")[0], flags=re.M) == [
+    assert re.findall(r"^\| `(\w+)` \|", page.split("## The path")[0], flags=re.M) == [
         room for floor in FLOORS for room in floor.split() if room not in alone
     ]
 
 
 def test_every_pass_of_light_stands_in_the_table_of_passes(variant: str) -> None:
     passes = pytest.importorskip("mitsim.light.passes").PASSES
-    table = text_of("docs/architecture.md").split("## Passes of light")[1].split("## What is passed on")[0]
+    table = text_of("docs/architecture.md").split("## Passes of light")[1].split("## Data that is passed on")[0]
     named = {name for row in re.findall(r"^\| ([a-z ,]+) \|", table, flags=re.M) for name in row.split(", ")}
     assert named - {"pass", "specular chain"} == {name.replace("_", " ") for name in passes}
 
@@ -489,7 +491,7 @@ def test_readme_is_short() -> None:
 def test_every_page_stands_on_the_index() -> None:
     """(Planted: the line of growth.md taken away.)"""
     linked = set(re.findall(r"\]\(([^)#]+)\)", text_of("docs/index.md")))
-    expected = {os.path.relpath(ROOT / page, ROOT / "docs") for page in PAGES if "decisions/0" not in page}
+    expected = {os.path.relpath(ROOT / page, ROOT / "docs") for page in PAGES}
     assert expected - {"index.md"} <= linked
 
 

@@ -78,7 +78,7 @@ _DILUTED = 10.0
 _NOISIER = 2.0
 """Ratio of the Monte Carlo error to that of the family that was traced above which a run says so (6 dB)."""
 _AS_DENSE = 0.45
-"""Ratio of lit pixels to those of the planned shots down to which the plan's bound holds (docs/decisions, 0017)."""
+"""Ratio of lit pixels to those of the planned shots down to which the plan's bound holds (docs/decisions.md)."""
 _NEGLIGIBLE = 0.1
 """Part of the accuracy below which the cause of the Monte Carlo error does not matter."""
 

@@ -11,7 +11,7 @@ factors are prepared once, and frames are added one by one:
 With B = U S V^T on each side (:mod:`mitsim.reconstruct.factorisation`) and W = sum_ij U_Li^T Y_ij U_Rj, the solution is
 X = V_L [(s_L s_R^T o W) / (s_L^2 s_R^2^T + lambda)] V_R^T. The rounding error is about eps / sqrt(lambda_rel), where
 lambda_rel = lambda / (max s_L^2 max s_R^2). The paper's Q = sum (Phi_L^T Y Phi_R) o P in place of W would give
-eps / lambda_rel (docs/decisions/0001-projected-accumulation.md).
+eps / lambda_rel (docs/decisions.md).
 
 *Correlated neighbours.* The penalty lambda ||X||^2 darkens large even areas of noisy images. With the covariance
 rho^|p - p'| along rows and columns (a separable first-order Markov field; Jain, Fundamentals of Digital Image
@@ -20,7 +20,7 @@ The SVD of S V^T F keeps the closed form.
 
 *Lambda.* Coefficient W_ij is kept by the share sigma_ij^2 / (sigma_ij^2 + lambda), so that trying a lambda costs n^2
 operations. Where the model explains the frames, lambda minimises an unbiased estimate of the image's error. Elsewhere
-the image must also be stable when lambda changes (docs/decisions/0004-lambda-by-halves.md).
+the image must also be stable when lambda changes (docs/decisions.md).
 
 *Noise by halves of the sensor.* With G = U_0^T U_0 of half of the sensor's rows, W_0 - G W contains no image, but
 noise: white noise of variance v gives its number i the variance v (G (I - G))_ii. An error of the left factor that is
@@ -62,13 +62,13 @@ def check_lambda(lam: float | str) -> float:
 
 RISK_POWER = 0.5
 """Power of sigma that weights errors: 0 is the image's error, 2 that of the frames
-(docs/decisions/0002-automatic-lambda.md)."""
+(docs/decisions.md)."""
 MISFIT_RATIO = 1.2
 """Limit of noise outside the model's range over noise inside it. Flat prints have 0.92 to 1.02, and scenes with depth
 and gloss 1.4 and more."""
 _TAKEN, _TAKEN_RISE = 30.0, 4
 """Limit of the energy that lambda removes within the range, over the noise outside, and the power of the noise ratio
-that raises the limit (docs/decisions/0004-lambda-by-halves.md)."""
+that raises the limit (docs/decisions.md)."""
 _EXPONENTS = np.arange(np.log10(np.finfo(np.float64).eps), 1.01, 0.25)
 """Powers of ten of the tried lambdas, relative to the largest sigma^2."""
 _FELT = 100.0
@@ -811,7 +811,7 @@ def _product(first: FloatArray, second: FloatArray, strips: Strips) -> FloatArra
 
 NEIGHBOURS = 0.9
 """Correlation rho of neighbouring pixels; 0.8 to 0.98 are within 0.7 dB of each other
-(docs/decisions/0005-neighbours.md)."""
+(docs/decisions.md)."""
 
 
 def covariance_root(size: int) -> FloatArray:

@@ -123,7 +123,7 @@ def test_errors_do_not_depend_on_the_run(rows: tuple[SolverRow, ...]) -> None:
 
 
 def test_the_paper_s_geometry_is_the_anchor_s() -> None:
-    """Largest cond(A) of 49 dots at the anchor geometry: 539 (docs/decisions/0001)."""
+    """Largest cond(A) of 49 dots at the anchor geometry: 539 (docs/decisions.md)."""
     factor = paper_factor()
     values = [np.linalg.svd(factor[:, i::7], compute_uv=False) for i in range(7)]
     largest, smallest = max(v[0] for v in values), min(v[-1] for v in values)
