@@ -34,7 +34,7 @@ EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "sweep")
 and torch, which may be missing."""
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
-    **dict.fromkeys(("patterns", "exposure", "ambient"), "light_studies"),
+    **dict.fromkeys(("patterns", "exposure", "ambient", "reflectivity"), "light_studies"),
 }
 """Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
 GONE = {

@@ -1,48 +1,67 @@
-"""Studies of the paper on illumination: the patterns, the exposure that they share, and ambient light.
+"""Studies of light: the patterns, their exposure, ambient light, and what gloss and light over several surfaces do.
 
-*patterns*, section IV-B and figure 4: uniform, random, shifting dots and repeated Hadamard, 1 to 64 of them, by three
-ways to expose them; singular values, and the mean PSNR of eight test images by the number of patterns.
+*patterns*, section IV-B and figure 4 of the paper: uniform, random, shifting dots and repeated Hadamard, 1 to 64 of
+them, by three ways to expose them.
 
 *exposure*, section V-B, figure 9, and the error analysis of the supplement: one uniform frame, 49 uniform frames, and
-49 dots in the same time. Of a least-squares image x' of a scene x, ||x|| / ||x - x'|| = ||x|| / (s rho), rho^2 =
-Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of all frames, s being the noise of a datum. (The
-paper writes it as SER = sqrt(T) SNR / rho, of T equal frames.)
+49 dots in the same time. For a least-squares image x' of a scene x, ||x|| / ||x - x'|| = ||x|| / (s rho), with rho^2 =
+Tr (A^T A)^-1 = sum 1 / s_i^2 over the singular values of the model A of all frames, and s the noise of a datum. (The
+paper writes SER = sqrt(T) SNR / rho for T equal frames.)
 
-*ambient*, supplement: one uniform pattern, 64 dots and 64 Hadamard patterns under ambient light, from a hundredth of
-the projector's to a hundred times, whose reference frame is subtracted; the dynamic range of the measurements decides.
+*ambient*, supplement: one uniform pattern, 64 dots and 64 Hadamard patterns under a lamp from a hundredth of the
+projector's light to a hundred times, whose reference frame is subtracted.
+
+*reflectivity*, supplement, has two parts. *Gloss*: gift card, metal blade and compact disc, then roughness from 1 to a
+mirror on a plate, to 0.03 on a ball. Every scene has a twin of matt paint (``finish=matt``), whose reflectance is the
+truth, and the image's error against it is split by cause. At one lambda an image R(Y) is linear in the frames Y, so
+that its error is a sum of differences. With L the reflectance of the twin and t the apparent reflectance of the glossy
+scene, its mean over the sensor,
+
+    pixels           = t - L                         brightness that differs from the matt one
+    sensor           = R(Y_direct) - R(Y_even)       light of a projector pixel that changes over the sensor
+    interreflection  = R(Y_all) - R(Y_direct)
+    saturation       = R(mean reading of Y_all) - R(Y_all)
+    rest             = R(Y_even) - t and noise       what a matt scene of the same brightness has as well
+
+where Y_even is the twin's light, with that of each projector pixel times t / L.
+
+*Global light*: dots separate direct from global light. Nayar, Krishnan, Grossberg and Raskar (2006) need a camera with
+a lens for this; here :func:`mitsim.reconstruct.focus.separate` does it in scenes whose light over several surfaces is
+known. Depth hides most of the gain, so every scene is shown as it is, and with direct light as the calibrated factors
+have it at any depth. A scene of the user is measured for gloss if it has a parameter ``finish``, otherwise for global
+light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from math import inf
 
 import numpy as np
+from matplotlib.figure import Figure
+from scipy import sparse
+from scipy.interpolate import RegularGridInterpolator
 
-from mitsim.devices.patterns import PatternFamily
+from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import locate
+from mitsim.core.errors import MitsimError
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.devices.patterns import PatternFamily, Shot
+from mitsim.light.light import SampledLight
+from mitsim.metrics import psnr
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.reconstruct.focus import FactorOfDepths, parallax_of, separate
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import Accumulator
 from mitsim.report import CONVENTIONS, EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED, label
-from mitsim.report.lit_scene import DIM, Unexposed
-from mitsim.studies.framework.claims import (
-    Gain,
-    Holds,
-    Judged,
-    Level,
-    choose_rows,
-    distinct,
-    mean_of,
-    measured,
-    stated,
-    with_unit,
-    within,
-)
-from mitsim.studies.framework.experiment import Axes, Found, Point, Results, Study
+from mitsim.report.lit_scene import DIM, LitScene, Unexposed, peak_time
+from mitsim.sensor.moments import frame_moments
+from mitsim.studies.framework.claims import Gain, Level, measured, stated
+from mitsim.studies.framework.experiment import Axes, Found, Point, Results, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images, Lines
-from mitsim.studies.framework.studio import Image, Studio, finding, measure_image
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
+from mitsim.studies.framework.studio import Image, Studio, finding, flags_of, measure_image, single_precision
 
 # -------- The patterns, and their number
 
@@ -50,22 +69,22 @@ FAMILIES = (
     "uniform", "random:2", "random:4", "random:5", "random:7", "random:8", "dots:2", "dots:3", "dots:4", "dots:5",
     "dots:6", "dots:7", "dots:8", "hadamard:2", "hadamard:4", "hadamard:8",
 )  # fmt: skip
-_KINDS = {"dots": "shifting dots", "hadamard": "repeated Hadamard", "random": "random"}
-_STATED = ("uniform", "dots:7")
+_FEW = "uniform", "random:7", "dots:2", "dots:4", "dots:7", "dots:8", "hadamard:4", "hadamard:8"
+_SHOWN = "uniform", "random:7", "dots:4", "dots:7", "hadamard:8"
+_STATED = "uniform", "dots:7"
 """Families that the paper's figures 4 to 6 give decibels of, mask at 2000 um."""
-_SHOWN = ("uniform", "random:7", "dots:4", "dots:7", "hadamard:8")
 _SPECTRUM = "spectrum"
 """Squares of the left factor's singular values, of the calibrated camera with the family's patterns."""
 
 
 def _patterns_measure(studio: Studio, point: Point) -> Found:
     frames = studio.frames(point.setup, point["model"], point["patterns"], int(point["seed"]))
-    made, kind = measure_image(studio, point, _SHOWN), str(point["patterns"]).partition(":")[0]
+    found, kind = measure_image(studio, point, _SHOWN), str(point["patterns"]).partition(":")[0]
     count = frames.family.left.shape[1] * frames.family.right.shape[1]
-    arrays = dict(made.arrays)
-    if point["patterns"] in _SHOWN and point["model"] == RENDERED:
-        arrays[_SPECTRUM] = frames.prepare().left.singular ** 2
-    return Found(tuple({**row, "patterns_count": count, "kind": kind} for row in made.rows), arrays)
+    shown = point["patterns"] in _SHOWN and point["model"] == RENDERED
+    spectrum = {_SPECTRUM: frames.prepare().left.singular ** 2} if shown else {}
+    rows = tuple({**row, "patterns_count": count, "kind": kind} for row in found.rows)
+    return Found(rows, {**found.arrays, **spectrum})
 
 
 def _spectra(results: Results) -> Mapping[str, Figure]:
@@ -75,42 +94,26 @@ def _spectra(results: Results) -> Mapping[str, Figure]:
     return {"singular_values.png": singular_values({label(name): each for name, each in found if each is not None})}
 
 
+_ANY = {"exposure": CONVENTIONS}
 PATTERNS = Study(
     "patterns",
     "Which patterns, and how many",
     "What do uniform, random, shifting-dots and Hadamard patterns recover, by their number and exposure?",
     points=Axes(
         {"patterns": FAMILIES, "exposure": (*CONVENTIONS, DIM), "model": MODELS},
-        quick={
-            "patterns": ("uniform", "random:7", "dots:2", "dots:4", "dots:7", "dots:8", "hadamard:4", "hadamard:8"),
-            "exposure": (*CONVENTIONS[:2], DIM),
-        },
+        quick={"patterns": _FEW, "exposure": (*CONVENTIONS[:2], DIM)},
         kept=lambda values: values["exposure"] != DIM or values["patterns"] in _STATED,
     ),
     measure=_patterns_measure,
     claims=(
         stated("One uniform pattern gives 21 to 23 dB", 21.0, 23.0, patterns="uniform"),
         stated("49 shifting dots give 34 to 35.5 dB", 34.0, 35.5, patterns="dots:7"),
-        *(
-            Gain(claim, better, other, where={"exposure": CONVENTIONS}, paper="higher")
-            for claim, better, other in (
-                ("More dots, better images (49 against 4)", "dots:7", "dots:2"),
-                ("Orthogonal patterns outperform random ones (49 each)", "dots:7", "random:7"),
-                ("Hadamard patterns perform best, for their light (64 each)", "hadamard:8", "dots:8"),
-            )
-        ),
+        Gain("More dots, better images (49 against 4)", "dots:7", "dots:2", where=_ANY, paper="higher"),
+        Gain("Orthogonal patterns outperform random ones", "dots:7", "random:7", where=_ANY, paper="higher"),
+        Gain("Hadamard patterns perform best, for their light", "hadamard:8", "dots:8", where=_ANY, paper="higher"),
     ),
     panels=(
-        Lines(
-            "patterns_count",
-            "number of patterns [1]",
-            title="PSNR by the number of patterns",
-            where={"exposure": CONVENTIONS},
-            each="exposure",
-            colour="kind",
-            shared="uniform",
-            names=_KINDS,
-        ),
+        Lines("patterns_count", "number of patterns [1]", where=_ANY, each="exposure", colour="kind", shared="uniform"),
         _spectra,
         Images("patterns", columns=_SHOWN, title=f"exposure {EQUAL_FRAME}", where={"exposure": EQUAL_FRAME}),
     ),
@@ -119,39 +122,27 @@ PATTERNS = Study(
 # -------- The same time, shared differently
 
 FRAMES = 49
-"""As the paper's."""
 ONE, MANY, DOTS = SHARED = ("1 uniform", "49 uniform", "49 dots")
 _LAW_WITHIN = 0.1
 """Relative difference of law and measurement: one draw of 16384 unknowns scatters by 1 %, dots' noise is not white."""
 
 
-def _family(studio: Studio, point: Point) -> PatternFamily:
-    bench = studio.bench(point.setup)
-    if point["patterns"] == DOTS:
-        return bench.family("dots:7")
-    count = 1 if point["patterns"] == ONE else FRAMES
-    return PatternFamily(point["patterns"], np.ones((bench.n, count), np.int8), np.ones((bench.n, 1), np.int8))
-
-
 def _exposure_measure(studio: Studio, point: Point) -> Found:
     """All frames have the time in which one of uniform light fills the full well as far as it may."""
-    frames = studio.frames(point.setup, point["model"], _family(studio, point), int(point["seed"]))
+    bench, name = studio.bench(point.setup), str(point["patterns"])
+    ones, count = np.ones((bench.n, 1), np.int8), 1 if name == ONE else FRAMES
+    family = bench.family("dots:7") if name == DOTS else PatternFamily(name, ones.repeat(count, axis=1), ones)
+    frames = studio.frames(point.setup, point["model"], family, int(point["seed"]))
     seconds = frames.seconds(EQUAL_FRAME)
     image, law = Image.of(frames, seconds), {}
-    if point["model"] == IDEALISED and point["patterns"] == DOTS:
+    if point["model"] == IDEALISED and name == DOTS:
         # Elsewhere the law's model is not that of the frames, or least squares magnifies rounding beyond any image.
-        law = _law(frames, seconds)
+        truth, model = frames.lit.truth, frames.prepare()
+        signal, error = (float(np.linalg.norm(each)) for each in (truth, frames.solve(seconds, 0.0).image - truth))
+        rho = float(np.sqrt(np.square(1 / np.outer(model.left.singular, model.right.singular)).sum()))
+        expected = signal / (frames.noise(seconds) * rho)
+        law = {"ser": signal / error, "ser_law": expected, "ser_over_law": signal / error / expected}
     return finding(studio, point, image.image, **image.row(), **law)
-
-
-def _law(frames: Unexposed, seconds: float) -> dict[str, float]:
-    """Signal to error of a least-squares image without regularisation, measured and by the law."""
-    truth = frames.lit.truth
-    signal, error = (float(np.linalg.norm(each)) for each in (truth, frames.solve(seconds, 0.0).image - truth))
-    model = frames.prepare()
-    rho = float(np.sqrt(np.square(1 / np.outer(model.left.singular, model.right.singular)).sum()))
-    law = signal / (frames.noise(seconds) * rho)
-    return {"ser": signal / error, "ser_law": law, "ser_over_law": signal / error / law}
 
 
 EXPOSURE = Study(
@@ -181,125 +172,375 @@ EXPOSURE = Study(
 
 # -------- Ambient light
 
-RADIANCES = ("1.17", "11.7", "117", "1170", "11700")
-"""Of the scene's lamp [W m^-2 sr^-1]: that of lamp_bench lights its sheet a hundredth as the projector does, to a
-hundred times."""
-AMBIENT_FAMILIES = ("uniform", "dots:8", "hadamard:8")
-_SPREAD = (1.0, 99.0)
-"""Percentiles that bound a dynamic range: the noise of single pixels is no signal."""
+RADIANCES = WEAK, _, AS_BRIGHT, _, STRONG = ("1.17", "11.7", "117", "1170", "11700")
+"""Radiance of the scene's lamp [W m^-2 sr^-1]; that of lamp_bench lights its sheet a hundredth as the projector does,
+to a hundred times."""
+_PERCENTILES = (1.0, 99.0)
+"""Bounds of a dynamic range, because the noise of single pixels is no signal."""
+_BETTER, _OTHER = "hadamard:8", "dots:8"
+_by_lamp = partial(Lines, "lamp", "radiance of the lamp [W m$^{-2}$ sr$^{-1}$]", facet="", log=True)
 
 
 def _ambient_measure(studio: Studio, point: Point) -> Found:
+    """Measure the image, the lamp's light over the projector's, and the part of the full well without the lamp."""
     setup, patterns, seed = point.setup, str(point["patterns"]), int(point["seed"])
-    image = studio.image(setup, RENDERED, patterns, seed)
-    low, high = _range(studio.frames(setup, RENDERED, patterns, seed))
-    ratio = _ratio(studio.frames(setup, RENDERED, "uniform", seed))
-    return finding(studio, point, image.image, ratio=ratio, range_low=low, range_high=high, **image.row())
-
-
-def _ratio(uniform: Unexposed) -> float:
-    """Light of the lamp over the projector's in frames of ``uniform`` light, on the whole sensor."""
-    (white,) = uniform.expected
-    lamp = uniform.expected.projector_off.irradiance.sum()
-    return float(lamp / (white.irradiance.sum() - lamp))
-
-
-def _range(frames: Unexposed) -> tuple[float, float]:
-    """Part of the full well that ``frames`` take up without the lamp's light, from dark to bright pixels."""
+    image, frames = studio.image(setup, RENDERED, patterns, seed), studio.frames(setup, RENDERED, patterns, seed)
     exposer = frames.exposer(frames.seconds(EQUAL_PEAK))
     dark = exposer.electrons(frames.expected.projector_off)
-    ends = [np.percentile(exposer.electrons(frame) - dark, _SPREAD) for frame in frames.expected]
+    ends = [np.percentile(exposer.electrons(frame) - dark, _PERCENTILES) for frame in frames.expected]
     low, high = np.mean(ends, axis=0) / frames.lit.bench.sensor.superpixel_full_well_e
-    return float(low), float(high)
+    uniform = studio.frames(setup, RENDERED, "uniform", seed).expected
+    (white,), lamp = uniform, uniform.projector_off.irradiance.sum()
+    ratio = float(lamp / (white.irradiance.sum() - lamp))
+    measures = {"ratio": ratio, "range_low": float(low), "range_high": float(high), **image.row()}
+    return finding(studio, point, image.image, **measures)
 
-
-def _by_lamp(results: Results) -> Results:
-    """Return results whose lamp has one ratio for all prints, which differ by a tenth, to two digits.
-
-    The column ``least`` is True for the weakest lamp, ``strong`` for the first one as bright as the projector.
-    """
-    lamps = {
-        lamp: float(f"{choose_rows(results.frame, {'lamp': lamp})['ratio'].mean():.2g}")
-        for lamp in distinct(results.frame, "lamp")
-    }
-    least, most = min(lamps.values()), max(lamps.values())
-    strong = min((ratio for ratio in lamps.values() if ratio >= 1), default=most)
-    rows = [{**row, "ratio": lamps[row["lamp"]]} for row in results.rows]
-    return replace(
-        results, rows=[{**row, "least": row["ratio"] == least, "strong": row["ratio"] == strong} for row in rows]
-    )
-
-
-def _better_beyond(rows: DataFrame) -> tuple[str, Holds | str]:
-    """Judge whether Hadamard patterns are better from some ratio of the lamp's light on."""
-    ratios = sorted(distinct(rows, "ratio"))
-    gains = {}
-    for ratio in ratios:
-        dots, hadamard = (choose_rows(rows, {"ratio": ratio, "patterns": name}) for name in AMBIENT_FAMILIES[1:])
-        gains[ratio] = mean_of(hadamard, "psnr_db", dots)
-    holds = {ratio: within(gain, low=0) for ratio, gain in gains.items()}
-    better = [ratio for ratio in ratios if holds[ratio]]
-    beyond = bool(better) and all(holds[ratio] for ratio in ratios if ratio >= better[0])
-    where = f"from {better[0]:g} times on" if beyond else "at some ratios alone" if better else "at no ratio"
-    text = ", ".join(f"{with_unit(gain, 'dB', '+')} at {ratio:g} times" for ratio, gain in gains.items())
-    decided = beyond or "confirmed only at some ratios" if better else None if None in holds.values() else False
-    return f"{where}: {text}", decided
-
-
-_RATIO = "ratio", "lamp's light over the projector's [1]"
 
 AMBIENT = Study(
     "ambient",
     "A lamp beside the projector",
     "How much ambient light does each kind of pattern stand?",
     points=Axes(
-        {"patterns": AMBIENT_FAMILIES, "model": (RENDERED,), "exposure": (EQUAL_PEAK,)},
+        {"patterns": ("uniform", "dots:8", "hadamard:8"), "model": (RENDERED,), "exposure": (EQUAL_PEAK,)},
         scene={"lamp": RADIANCES},
         quick={"lamp": RADIANCES[::2]},
         quick_prints=1,
         default="lamp_bench",
     ),
     measure=_ambient_measure,
-    derive=_by_lamp,
     claims=(
         Gain(
-            "Under strong ambient light dots keep less dynamic range than Hadamard patterns (part of the full well)",
-            "hadamard:8",
-            "dots:8",
-            where={"strong": True},
-            every="ratio",
+            "Under a lamp as bright as the projector Hadamard patterns have more dynamic range (part of the full well)",
+            _BETTER,
+            _OTHER,
+            where={"lamp": AS_BRIGHT},
             column="range_high",
             unit="",
-            paper="0 to 0.02 against 0.06 to 0.17",
+            paper="0.06 to 0.17 against 0 to 0.02",
         ),
-        Judged("Hadamard patterns are better under strong ambient light", _better_beyond, paper="better"),
         Gain(
-            "Dots are preferred when ambient light is not strong: they take half the frames",
-            "dots:8",
-            "hadamard:8",
-            where={"least": True},
-            every="ratio",
+            "Hadamard patterns are better under a strong lamp", _BETTER, _OTHER, where={"lamp": STRONG}, paper="better"
+        ),
+        Gain(
+            "Dots, half of the frames, are preferred under a weak lamp",
+            _OTHER,
+            _BETTER,
+            where={"lamp": WEAK},
             paper="preferred",
         ),
     ),
     panels=(
-        Lines(*_RATIO, title="PSNR by the lamp's light, exposure equal peak", facet="", log=True),
-        Lines(
-            *_RATIO,
-            file="range",
-            title="The projector's light in bright pixels (99th percentile)",
-            y="range_high",
-            y_label="part of the full well [1]",
-            facet="",
-            log=True,
-        ),
-        Images("ratio", title="Images by the lamp's light, exposure equal peak", down=("patterns",), names="{} times"),
+        _by_lamp(title="PSNR by the lamp, exposure equal peak"),
+        _by_lamp(file="range", y="range_high", y_label="projector's light in bright pixels / full well [1]"),
+        Images("lamp", title="Images by the lamp's radiance, exposure equal peak", down=("patterns",)),
     ),
     heads=("Paper", "", "Rendered"),
-    note="The lamp's light is its part of a frame of uniform light over the projector's, on the whole sensor. From "
-    "every frame a frame with the projector off is taken; its noise stays. PSNR of an even grey is that of no image: "
-    "12 to 20 dB, by the print's contrast.",
+    note="The column ratio has the lamp's light over the projector's in a frame of uniform light. From every frame a "
+    "frame with the projector off is subtracted; its noise stays. An even grey has a PSNR of 12 to 20 dB.",
 )
 
+# -------- Gloss: the error against the matt twin by cause
 
-STUDIES = {each.name: each for each in (PATTERNS, EXPOSURE, AMBIENT)}
+PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
+    "pixels", "sensor", "interreflection", "saturation", "rest",
+)  # fmt: skip
+_DARK = 1e-3
+"""Reflectance below which a pixel of the twin has no light to be scaled: shadows, beyond which sampling decides."""
+
+
+@single_threaded_blas()
+def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, dict[str, FloatArray]]:
+    """Solve one noisy exposure, and split its error against the twin's reflectance by :data:`ERROR_SOURCES`.
+
+    Parameters
+    ----------
+    frames
+        Rendered frames of a family whose every pattern is one shot.
+    twin
+        The same scene of matt paint, in its light.
+    seconds
+        Exposure time of each frame.
+
+    Returns
+    -------
+    The solution, and (n, n) errors by cause, whose sum is the image less the twin's reflectance.
+    """
+    model, sums = frames.data(seconds)
+    solution, exposer, lit = model.solve(sums), frames.exposer(seconds), frames.lit
+
+    def rate(frame: Frame) -> FloatArray:
+        return exposer.electrons(frame) / seconds
+
+    def reading(frame: Frame) -> FloatArray:
+        return exposer.rate(frame_moments(exposer.electrons(frame), seconds, lit.bench.sensor)[0])
+
+    def image(expected: ExpectedFrames, seen: Callable[[Frame], FloatArray]) -> FloatArray:
+        sums = model.accumulator()
+        for shot, frame in zip(frames.family.shots, expected, strict=True):
+            sums.add(seen(frame), shot.row, shot.column)
+        return model.solve(sums, solution.lam).image
+
+    even, direct = (
+        LitScene(light).expected_frames(RENDERED, frames.family)
+        for light in (as_bright(twin.light, lit.light), direct_of(lit.light))
+    )
+    images = [image(even, rate), image(direct, rate), image(frames.expected, rate), image(frames.expected, reading)]
+    parts = {PIXELS: lit.truth - twin.truth}
+    parts |= dict(zip(ERROR_SOURCES[1:], np.diff(images, axis=0), strict=False))
+    return solution, {**parts, REST: solution.image - twin.truth - sum(parts.values())}
+
+
+def direct_of(light: SampledLight) -> SampledLight:
+    """Return a ``light`` without what was followed over several surfaces."""
+    names = "indirect", "indirect_residual"
+    groups = (each.with_light({name: sparse.csr_array(each[name].shape) for name in names}) for each in light.groups)
+    return replace(light, groups=tuple(groups))
+
+
+def as_bright(matt: SampledLight, glossy: SampledLight) -> SampledLight:
+    """Return direct light of a matt scene, scaled projector pixel by pixel to the brightness of a glossy one.
+
+    The scale comes from the traced light and not from the truth, so that sampling noise of a pixel's brightness does
+    not count as gloss.
+    """
+    lit = matt.flux > _DARK * matt.apparent.board_flux
+    ratio = np.divide(glossy.flux, matt.flux, out=np.zeros_like(glossy.flux), where=lit)
+    rows = sparse.diags_array(np.append(ratio, 1.0))  # the last row is ambient light
+    matt = direct_of(matt)
+    scaled = ({grid: sparse.csr_array(rows @ light) for grid, light in each.light.items()} for each in matt.groups)
+    groups = (each.with_light(light) for each, light in zip(matt.groups, scaled, strict=True))
+    return replace(matt, groups=tuple(groups))
+
+
+CARD, BLADE, DISC = SHIPPED = ("gift_card", "metal_blade", "compact_disc")
+SHAPES = {"plate": {"shape": "rectangle", "z": "400"}, "ball": {"shape": "sphere", "z": "440"}}
+"""Shapes in the scene `highlight`."""
+ROUGHNESSES = {"plate": (1.0, 0.3, 0.1, 0.03, 0.003, 0.001), "ball": (1.0, 0.3, 0.1, 0.03)}
+"""Roughness of GGX lobes: from all directions to 0.8 mm at the sensor, which is 6 mm wide. At 0.01 lobes are neither
+wide enough for a few anchors nor sharp enough to be aimed at, so light takes minutes; as on a sharper ball."""
+GLOSS_FAMILIES = ("uniform", "dots:7")
+AS_MATT = "as the matt scene"
+"""The exposure time of the twin, with which highlights saturate."""
+EXPOSURES = (EQUAL_PEAK, AS_MATT)
+_TRUTHS = ("matt paint", "apparent")
+_KEPT_AS = "{patterns}, {exposure}"
+"""Names of the images."""
+_GREY = 0.5
+"""Grey of an error of 0, as images of errors are kept."""
+_ROUNDING = 1e-12
+"""Mean square of an error that is rounding: factors of a condition of 1e7 leave 1e-28 to 1e-14 of the image's."""
+_PLAIN_DB = 20.0
+"""Artefacts of a tenth of white are plainly seen."""
+_ACCURACY = 3e-3
+"""Accuracy of the light: a tenth of the artefacts that matter, and of global light, in a third of the time of 1e-3."""
+
+
+def _measure_gloss(studio: Studio, point: Point) -> Found:
+    def decibels(error: FloatArray) -> float | None:
+        power = float(np.square(error).mean())
+        return -10 * float(np.log10(power)) if power > _ROUNDING else None
+
+    seed = int(point["seed"])
+    factors = studio.factors(point.setup, seed)
+    twin, lit = studio.lit_scene(point.setup.with_parameters(finish="matt")), studio.lit_scene(point.setup)
+    rows, images = [], dict(zip(_TRUTHS, (twin.truth, lit.truth), strict=True))
+    for name in GLOSS_FAMILIES:
+        family = lit.bench.family(name, seed)
+        frames = lit.rendered_frames(factors, family, seed)
+        times = frames.seconds(EQUAL_PEAK), peak_time(twin.bench, twin.expected_frames(RENDERED, family))
+        for exposure, seconds in zip(EXPOSURES, times, strict=True):
+            solution, parts = split(frames, twin, seconds)
+            row = point.row(
+                patterns=name,
+                exposure=exposure,
+                exposure_s=seconds,
+                artefacts_db=decibels(np.sum([parts[cause] for cause in ERROR_SOURCES[1:4]], axis=0)),
+                psnr_db=psnr(solution.image, lit.truth),
+                psnr_matt_db=psnr(solution.image, twin.truth),
+                **flags_of(solution.status),
+                **{f"{cause}_db": decibels(part) for cause, part in parts.items()},
+            )
+            rows.append(row)
+            images[_KEPT_AS.format(**row)] = solution.image
+            if name == "dots:7" and exposure == EQUAL_PEAK:
+                images |= {cause: part + _GREY for cause, part in parts.items()}
+    return Found(tuple(rows), single_precision(images))
+
+
+# -------- Direct and global light
+
+SCENES = ("corner", "cookie_bag")
+GLOBAL_FAMILIES = ("dots:4", "dots:7", "dots:10")
+AS_IT_IS, MENDED = DEPTHS = ("as it is", "depth mended")
+_ALL, SEPARATED, ALONE, GLOBAL = IMAGES = ("all light", "separated", "direct alone", "global")
+"""Images of all light taken for direct, of what is left once global light is subtracted, of direct light without any
+other, and of global light."""
+_MARGIN = 2
+"""Periods of the dots beyond the window that light comes from: in the corner four give no more."""
+
+
+def _measure_global(studio: Studio, point: Point) -> Found:
+    frames = studio.frames(point.setup, RENDERED, str(point["patterns"]), int(point["seed"]))
+    lit, family, model = frames.lit, frames.family, frames.prepare()
+    if not lit.light.simulation.physics.interreflection:
+        raise MitsimError(
+            f"study reflectivity: light over several surfaces is not worth following in {point['subject']}"
+        )
+    parallax = parallax_of(studio.factors(point.setup, int(point["seed"])))
+    margin = _MARGIN * max(family.left.shape[1], family.right.shape[1])
+    seen = [FactorOfDepths(factor, parallax, axis).beyond(margin)[0] for axis, factor in enumerate(frames.sides)]
+    patterns = family.left.astype(float), family.right.astype(float)
+    seconds = frames.seconds(EQUAL_PEAK)
+    exposer, (left, right) = frames.exposer(seconds), frames.sides
+
+    def measure(rates: list[FloatArray]) -> list[tuple[Shot, FloatArray]]:
+        """Expose frames of these rates [electrons/s] once."""
+        return [
+            (shot, exposer.rate(exposer.digital(np.maximum(rate, 0.0) * seconds, *shot.names)))
+            for shot, rate in zip(family.shots, rates, strict=True)
+        ]
+
+    def accumulate(taken: list[tuple[Shot, FloatArray]], common: FloatArray | float = 0.0) -> Accumulator:
+        sums = model.accumulator()
+        for shot, frame in taken:
+            sums.add(frame - common, shot.row, shot.column)
+        return sums
+
+    electrons = frames.exposer(1.0).electrons
+    direct = [electrons(frame) for frame in LitScene(direct_of(lit.light)).expected_frames(RENDERED, family)]
+    bounced = [electrons(frame) - own for frame, own in zip(frames.expected, direct, strict=True)]
+    mended = [np.asarray(left @ (family.light(shot) * lit.truth) @ right.T) for shot in family.shots]
+    known = global_truth(lit.light)
+    rows, arrays = [], {"direct, true": lit.truth, "global, true": known}
+    for depth, own in zip(DEPTHS, (direct, mended), strict=True):
+        taken = measure([one + more for one, more in zip(own, bounced, strict=True)])
+        whole = accumulate(taken)
+        found = separate(model, (seen[0], seen[1]), patterns, whole.sum, np.sum([frame for _, frame in taken], axis=0))
+        solved = whole, accumulate(taken, found.common), accumulate(measure(own))
+        images = dict(zip(IMAGES, (*(model.solve(sums).image for sums in solved), found.image), strict=True))
+        levels = {f"{name}_db": psnr(image, known if name == GLOBAL else lit.truth) for name, image in images.items()}
+        gain = levels[f"{SEPARATED}_db"] - levels[f"{_ALL}_db"]
+        rows.append(point.row(depth=depth, gain_db=gain, told=float(found.eigenvalues[0]), **levels))
+        arrays |= {f"{depth} {name}": image for name, image in images.items()}
+    return Found(tuple(rows), single_precision(arrays))
+
+
+def global_truth(light: SampledLight) -> FloatArray:
+    """Return (n, n) the image of global light under uniform light, over the board's light in each direction."""
+    bench, grid = light.bench, light.simulation.grids["indirect"].bundle
+    cells = np.asarray(sum(group["indirect"].sum(axis=0) for group in light.groups)) / len(light.groups)
+    shape = len(grid.rows.centres), len(grid.columns.centres)
+    density = cells.reshape(-1, *shape).sum(axis=0) / (grid.rows.width * grid.columns.width)
+    windows = [np.linspace(*edges, bench.n + 1) for edges in bench.windows]
+    rows, columns = ((edges[1:] + edges[:-1]) / 2 for edges in windows)
+    seen = RegularGridInterpolator(
+        (grid.rows.centres, grid.columns.centres), density, bounds_error=False, fill_value=None
+    )(np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1))
+    area = np.outer(*(np.diff(edges) for edges in windows))
+    return np.asarray(seen * area / light.apparent.board_flux.reshape(bench.n, bench.n))
+
+
+# -------- The study of both
+
+GLOSS, GLOBAL_LIGHT = ("gloss", "global light")
+
+
+def _reflectivity_points(scope: Scope) -> list[Point]:
+    base = replace(scope.setup, accuracy=max(scope.setup.accuracy, _ACCURACY))
+    if scope.pictures == (None,):
+        glossy = 'name="finish"' in locate(base.scene, "scenes", "scene.xml").read_text(errors="replace")
+        gloss, bounced = ([(base.scene, base)], []) if glossy else ([], [base])
+    else:
+        gloss = [(name, replace(base, scene=name)) for name in scope.choose(SHIPPED, (CARD, DISC))]
+        highlight, bounced = replace(base, scene="highlight"), [replace(base, scene=name) for name in SCENES]
+        gloss += [
+            (name, highlight.with_parameters(roughness=each, **shape))
+            for name, shape in scope.choose(tuple(SHAPES.items()), ())
+            for each in ROUGHNESSES[name]
+        ]
+        bounced = list(scope.choose(bounced, bounced[:1]))
+    seeds, families = scope.repeats, scope.choose(GLOBAL_FAMILIES, GLOBAL_FAMILIES[1:2])
+    found = [Point.of(setup, part=GLOSS, subject=name, seed=seed) for name, setup in gloss for seed in seeds]
+    for setup in bounced:
+        columns = {"part": (GLOBAL_LIGHT,), "subject": (setup.scene,), "seed": seeds, "patterns": families}
+        found += Point.grid([setup], "part subject patterns seed", **columns)
+    return found
+
+
+def _reflectivity_measure(studio: Studio, point: Point) -> Found:
+    return (_measure_gloss if point["part"] == GLOSS else _measure_global)(studio, point)
+
+
+_CAUSES = {cause: (cause, f"{{{cause}_db:.1f}} dB") for cause in ERROR_SOURCES}
+_LIGHT = {"direct, true": ("direct, true", "")}
+_LIGHT |= {f"{{depth}} {name}": (name, f"{{{name}_db:.1f}} dB") for name in IMAGES[:-1]}
+_LIGHT |= {"global, true": ("global, true", ""), f"{{depth}} {GLOBAL}": (GLOBAL, f"{{{GLOBAL}_db:.1f}} dB")}
+_DOTS_ALONE = {"part": GLOSS, "patterns": "dots:7"}
+_DRAWN = _DOTS_ALONE | {"exposure": EQUAL_PEAK}
+_SWEPT, _NOT_SWEPT = {"subject": tuple(SHAPES)}, {"part": GLOSS, "subject": lambda name: name not in SHAPES}
+_SEPARATED = {"part": GLOBAL_LIGHT, "patterns": "dots:7"}
+_LEVELS = {"psnr_matt_db": "image", **{f"{cause}_db": f"{cause} alone" for cause in ERROR_SOURCES}}
+_artefacts = partial(Level, column="artefacts_db", optional=True)
+_gain = partial(Level, column="gain_db", every="subject", at_least=0.0, optional=True)
+_by_subject = partial(Images, down=("subject",))
+
+REFLECTIVITY = Study(
+    "reflectivity",
+    "Gloss and global light",
+    "What do shiny surfaces and light over several surfaces do to the image, and what do dots tell of it?",
+    points=_reflectivity_points,
+    measure=_reflectivity_measure,
+    claims=(
+        *(
+            _artefacts(
+                f"{words} (artefacts of gloss, 49 dots)",
+                where=_DOTS_ALONE | {"subject": name},
+                at_least=low,
+                at_most=high,
+            )
+            for name, words, low, high in (
+                (CARD, "The gift card comes out well", _PLAIN_DB, inf),
+                (BLADE, "The metal blade comes out well", _PLAIN_DB, inf),
+                (DISC, "The compact disc has severe artefacts", -inf, _PLAIN_DB),
+            )
+        ),
+        *(
+            _gain(f"49 dots separate global light in scenes {words} (Nayar et al. 2006)", where=_SEPARATED | depth)
+            for words, depth in (("as they are", {"depth": AS_IT_IS}), ("with depth mended", {"depth": MENDED}))
+        ),
+    ),
+    panels=(
+        Lines(
+            "roughness",
+            "roughness, alpha of GGX [1]",
+            file="causes",
+            y_label="PSNR against matt paint [dB]",
+            where=_DOTS_ALONE | _SWEPT,
+            each="exposure",
+            colour=_LEVELS,
+            facet="subject",
+            log=True,
+        ),
+        _by_subject("roughness", where=_DRAWN | _SWEPT, each="subject", array=_KEPT_AS, names="alpha {}"),
+        _by_subject(
+            ("patterns", "exposure"),
+            file="images_shipped",
+            where=_NOT_SWEPT,
+            array=_KEPT_AS,
+            before=dict(zip(_TRUTHS, _TRUTHS, strict=True)),
+        ),
+        _by_subject(_CAUSES, file="causes_shipped", title="Errors by cause, grey is none", where=_DRAWN | _NOT_SWEPT),
+        _by_subject(_LIGHT, title="49 dots", where=_SEPARATED, each="depth"),
+    ),
+    heads=("Paper", "", "Rendered"),
+    note="Each scene with gloss has a twin of matt paint, the truth of errors; apparent is the mean of the glossy "
+    "scene over the sensor, the truth of the images' decibels. As the matt scene: exposed as long as the twin, so that "
+    "highlights saturate. Decibels of a cause are the PSNR that its errors alone would leave. Pixels: brightness that "
+    "is not the matt one; sensor: light of a projector pixel that changes over the sensor. Global light came over "
+    "several surfaces, direct light over one. Images, exposed at equal peak: all light taken for direct; what is left "
+    "once global light is separated (Nayar et al. 2006, without a lens); direct light alone, the best that separation "
+    "can reach; and global light. As it is: the solver does not know the depth; depth mended: direct light is that of "
+    "the calibration at any depth.",
+)
+
+STUDIES = {each.name: each for each in (PATTERNS, EXPOSURE, AMBIENT, REFLECTIVITY)}

@@ -29,7 +29,7 @@ from mitsim.studies.framework.experiment import (
 from mitsim.studies.framework.page import Section, build_page, flag_warnings
 from mitsim.studies.framework.panels import Images
 from mitsim.studies.framework.run import batches
-from mitsim.studies.reflectivity_study import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
+from mitsim.studies.light_studies import ERROR_SOURCES, EXPOSURES, GLOSS_FAMILIES
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 WHOLE = Scope(Setup(), ("coins", "page"))
