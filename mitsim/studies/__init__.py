@@ -33,7 +33,7 @@ EXPERIMENTS = (*PAPER, "colour", "drift", "learned", "sweep")
 """Studies of many points: their modules have a ``STUDY``. ``learned`` is not on the page of all: it takes hours,
 and torch, which may be missing."""
 SHARED = {
-    **dict.fromkeys(("distance", "binning", "resolution"), "camera_studies"),
+    **dict.fromkeys(("distance", "binning", "resolution", "depth"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient", "reflectivity"), "light_studies"),
 }
 """Modules of several studies of many points, whose ``STUDIES`` have each by its name."""

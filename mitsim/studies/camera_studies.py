@@ -1,4 +1,4 @@
-"""Studies of the paper on the camera: the mask's distance, the sensor's pixels, and the resolution.
+"""Studies of the paper on the camera: the mask's distance, the sensor's pixels, the resolution, and depth.
 
 *distance*, section IV-C and figure 5: the mask at 500 to 2000 um, and on to where diffraction ends the shadow; mean
 PSNR of eight test images by the number of dots.
@@ -9,51 +9,42 @@ unknowns in a single frame. Frames are binned by averaging after capture.
 *resolution*, section V-C and figure 11: bars of 0.13 to 0.6 line pairs a mm under 9, 16 and 49 patterns, and the
 transfer of a slanted edge. The paper takes (I_max - I_min) / (I_max + I_min) of the mean along the bars, of which noise
 alone makes 0.2 to 0.5: it is in the table as `contrast_of_extremes`; figure and verdicts take the contrast at the bars'
-own frequency. Pixels of the image are 0.9375 mm, so 0.533 line pairs a mm are the most there can be.
+own frequency. Pixels of the image are 0.9375 mm, so that it shows at most 0.533 line pairs a mm.
 
 The slanted edge is ISO 12233's: the edge's place is fitted row by row, all pixels are put in order of their distance
 from it, four bins a pixel, and the spectrum of the derivative is the modulation transfer function.
+
+*depth*, section V-A and the limitations: "our method is robust to small variations in depth", with camera and projector
+co-located. Parallax moves each projector pixel's light by B (1/z - 1/z_0), where B is the distance between both.
+Idealised: a plane beside the calibrated distance, any baseline. Rendered: the shipped devices, 60 mm, with the sheet
+moved, and its depth neglected, found, or calibrated at; and scenes of many depths, one found for each projector pixel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from math import inf
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, MODELS
-from mitsim.report.lit_scene import LitScene
-from mitsim.studies.framework.claims import (
-    Gain,
-    Holds,
-    Judged,
-    Level,
-    choose_rows,
-    distinct,
-    mean_of,
-    measured,
-    stated,
-    value_name,
-    within,
-)
-from mitsim.studies.framework.experiment import PRINT_MM, Axes, Found, Point, Study
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
+from mitsim.report.lit_scene import Plane
+from mitsim.studies.framework.claims import Gain, Level, measured, stated
+from mitsim.studies.framework.experiment import PRINT_MM, Axes, Found, Point, Scope, Study, group_by_setup
 from mitsim.studies.framework.panels import Images, Lines
 from mitsim.studies.framework.studio import Image, Studio, finding, image_arrays, measure_image
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
+_FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
+"""Families of the first two studies, and those whose images are shown."""
+_STABLE_DB = 3.0
+"""Loss of an image that still counts as stable: half of its squared error is then as before."""
 
 # -------- The distance of the mask
 
-DISTANCES_MM = (0.5, 0.75, 1.0, 2.0, 4.0, 8.0)
-"""The paper's four; features of 60 um have a Fresnel number of 3.2 at 2 mm and of 0.8 at 8 mm."""
-_FAMILIES, _SHOWN = ("uniform", "dots:5", "dots:7"), ("uniform", "dots:7")
-"""Families of this study and the next, and those whose images are shown."""
 _COMPARABLE_DB = 1.0
 """A difference that may be seen: a fifth of the squared error."""
 
@@ -63,8 +54,9 @@ DISTANCE = Study(
     "What does a thin camera cost, and how much of it do patterns give back?",
     points=Axes(
         {"patterns": _FAMILIES, "exposure": (EQUAL_PEAK, EQUAL_FRAME), "model": MODELS},
-        scene={"mask_distance": DISTANCES_MM},
-        quick={"mask_distance": (0.75, 2.0)},  # the two that the paper gives decibels of
+        # The paper's four; features of 60 um have a Fresnel number of 3.2 at 2 mm and of 0.8 at 8 mm.
+        scene={"mask_distance": (0.5, 0.75, 1.0, 2.0, 4.0, 8.0)},
+        quick={"mask_distance": (0.75, 2.0)},
     ),
     measure=partial(measure_image, shown=_SHOWN),
     claims=(
@@ -87,11 +79,8 @@ DISTANCE = Study(
 
 # -------- The number of sensor pixels
 
-BINNINGS = (1, 2, 4, 8)
+_FINE, *_, _COARSE = BINNINGS = (1, 2, 4, 8)
 """Pixels a side that are averaged: the paper's 512 to 64 pixels a side."""
-_FINE, _COARSE = BINNINGS[0], BINNINGS[-1]
-_STABLE_DB = 3.0
-"""Loss of an image that is still called stable: half of its squared error is then as before."""
 
 
 def _binning_measure(studio: Studio, point: Point) -> Found:
@@ -103,6 +92,7 @@ def _binning_measure(studio: Studio, point: Point) -> Found:
     return finding(studio, point, image.image if point["patterns"] in _SHOWN else None, pixels=pixels, **image.row())
 
 
+_loss = partial(Gain, one={"binning": _FINE}, other={"binning": _COARSE})
 BINNING = Study(
     "binning",
     "How many sensor pixels",
@@ -113,22 +103,8 @@ BINNING = Study(
     ),
     measure=_binning_measure,
     claims=(
-        Gain(
-            "49 dots are stable down to 64 x 64 pixels (3 dB lost at most)",
-            {"binning": _FINE},
-            {"binning": _COARSE},
-            where="dots:7",
-            paper="stable",
-            at_least=-inf,
-            at_most=_STABLE_DB,
-        ),
-        Gain(
-            "Uniform light degrades with fewer pixels",
-            {"binning": _FINE},
-            {"binning": _COARSE},
-            where="uniform",
-            paper="degrades",
-        ),
+        _loss("49 dots lose at most 3 dB on 64 x 64 pixels", where="dots:7", at_least=-inf, at_most=_STABLE_DB),
+        _loss("Uniform light degrades with fewer pixels", where="uniform", paper="degrades"),
         Gain(
             "49 dots on 64 x 64 pixels are better than uniform light on 512 x 512",
             {"patterns": "dots:7", "binning": _COARSE},
@@ -146,112 +122,84 @@ BINNING = Study(
 
 PAIRS_A_MM = (0.13, 0.17, 0.21, 0.26, 0.35, 0.43, 0.52, 0.6)
 """The paper's groups 20 to 5, and one that pixels of 0.9375 mm can't resolve."""
-RESOLVING = ("uniform", "dots:3", "dots:4", "dots:7")
-_TOLD = 0.1
+_FINEST = 0.52
+"""The paper's group 5."""
+_RESOLVED = 0.1
 """Contrast above which bars are resolved: what the eye needs of a print."""
 _SEEN, _BESIDE = slice(16, -16), slice(8, -8)
 """Pixels that are evaluated: the margin is beside the bars of the sheet's other half, or beyond the print."""
-_FINEST = 0.52  # the paper's group 5
-_SHOWN_CYCLES = 0.35
-"""Cycles a pixel up to which the truth must show bars: pixels that average over them leave 0.8 of their contrast."""
-_SHOWS = 0.4
-"""Contrast that the truth must have of such bars: half of what print and pixels leave."""
+_SHOWN_CYCLES, _SHOWS = 0.35, 0.4
+"""Cycles a pixel up to which the truth must show bars, and its least contrast: pixels that average over such bars leave
+0.8 of their contrast.
+"""
 
 
 def _resolution_measure(studio: Studio, point: Point) -> Found:
     image = studio.image(point.setup, point["model"], point["patterns"], int(point["seed"]), EQUAL_FRAME)
-    lit = studio.lit_scene(point.setup)
+    lit, row = studio.lit_scene(point.setup), point.row(**image.row())
+    depth = lit.light.plan.settings.depth
+    pixel_mm = float(np.mean([high - low for low, high in lit.bench.windows_at(depth)])) * depth / lit.bench.n
     kind, _, frequency = str(point.setup.picture).partition(" ")
-    pixel_mm, row = _pixel_mm(lit), point.row(**image.row())
     if kind == "edge":
         cycles, transfer = slanted_edge(image.image[_SEEN, _SEEN])
         pairs = zip(cycles / pixel_mm, transfer, strict=True)
         return Found(tuple({**row, "pairs_a_mm": float(each), "transfer": float(value)} for each, value in pairs))
     own = float(frequency) * pixel_mm
-    if own < _SHOWN_CYCLES and (there := _contrast(lit.truth, own)) < _SHOWS:
+
+    def halves(picture: FloatArray) -> list[tuple[FloatArray, int]]:
+        """Return the bars of each half without the margins, and the axis along which they lie."""
+        left, right = np.split(picture, 2, axis=1)
+        return [(left[_SEEN, _BESIDE], 0), (right[_SEEN, _BESIDE], 1)]
+
+    there, found = (
+        float(np.mean([modulation(*half, own) for half in halves(each)])) for each in (lit.truth, image.image)
+    )
+    if own < _SHOWN_CYCLES and there < _SHOWS:
         raise MitsimError(
             f"scene {point.setup.scene}: bars of {frequency} line pairs a mm have a contrast of {there:.2f} in its "
             f"truth; give a print {PRINT_MM:g} mm wide, flat and facing the camera, that fills the image"
         )
-    extremes = float(np.mean([contrast(*half) for half in _halves(image.image)]))
-    row |= {"pairs_a_mm": float(frequency), "contrast": _contrast(image.image, own), "contrast_of_extremes": extremes}
+    extremes = float(np.mean([contrast(*half) for half in halves(image.image)]))
+    row |= {"pairs_a_mm": float(frequency), "contrast": found, "contrast_of_extremes": extremes}
     return Found((row,), image_arrays(image.image, lit.truth))
 
 
-def _pixel_mm(lit: LitScene) -> float:
-    """Width of the image's pixels on the print."""
-    depth = lit.light.plan.settings.depth
-    extents = [high - low for low, high in lit.bench.windows_at(depth)]
-    return float(np.mean(extents)) * depth / lit.bench.n
-
-
-def _halves(image: FloatArray) -> list[tuple[FloatArray, int]]:
-    """Bars of each half of an ``image``, without the margins, and the axis along which they lie."""
-    left, right = np.split(image, 2, axis=1)
-    return [(left[_SEEN, _BESIDE], 0), (right[_SEEN, _BESIDE], 1)]
-
-
-def _contrast(image: FloatArray, cycles: float) -> float:
-    """Mean of both halves at so many ``cycles`` a pixel."""
-    return float(np.mean([modulation(*half, cycles) for half in _halves(image)]))
-
-
-def _rises(rows: DataFrame) -> tuple[str, Holds]:
-    """Compare the contrast of the finest bars from fewer to more patterns, in the order of the table."""
-    families = {name: choose_rows(rows, {"patterns": name}) for name in distinct(rows, "patterns")}
-    fine = [choose_rows(own, {"pairs_a_mm": _FINEST}) for own in families.values()]
-    text = ", ".join(
-        f"{value_name('patterns', name)} {_limit(own):g} ({mean_of(finest, 'contrast').value:.2f})"
-        for (name, own), finest in zip(families.items(), fine, strict=True)
-    )
-    gains = [within(mean_of(more, "contrast", fewer), low=0) for fewer, more in pairwise(fine)]
-    return text, False if False in gains else within(mean_of(fine[-1], "contrast", fine[0]), low=0)
-
-
-def _limit(rows: DataFrame) -> float:
-    """Return the finest bars up to which all are resolved; 0 for none."""
-    limit = 0.0
-    for pairs in sorted(distinct(rows, "pairs_a_mm")):
-        if mean_of(choose_rows(rows, {"pairs_a_mm": pairs}), "contrast").value < _TOLD:
-            break
-        limit = pairs
-    return limit
-
-
-_BARS = "spatial frequency on the print [line pairs/mm]"
-
+_by_pairs = partial(Lines, "pairs_a_mm", "spatial frequency on the print [line pairs/mm]", ticks=False)
+_BARS = {"pairs_a_mm": lambda pairs: pairs <= _FINEST, "contrast": measured}
 RESOLUTION = Study(
     "resolution",
     "How fine",
-    "Which bars are told apart, and how much contrast does an edge keep?",
+    "Which bars are resolved, and how much contrast does an edge keep?",
     points=Axes(
-        {"patterns": RESOLVING, "model": MODELS, "exposure": (EQUAL_FRAME,)},
+        {"patterns": ("uniform", "dots:3", "dots:4", "dots:7"), "model": MODELS, "exposure": (EQUAL_FRAME,)},
         quick={"patterns": _SHOWN, "picture": ("bars 0.13", "bars 0.26", "bars 0.52", "edge")},
         prints=(*(f"bars {pairs:g}" for pairs in PAIRS_A_MM), "edge"),
         repeats=True,
     ),
     measure=_resolution_measure,
     claims=(
-        Judged(
-            "Resolution rises with the number of patterns (finest bars of 10 % contrast, line pairs a mm; contrast at "
-            f"{_FINEST})",
-            _rises,
-            where={"contrast": measured},
+        Gain(
+            f"49 patterns resolve finer bars than one (contrast at {_FINEST} line pairs a mm)",
+            "dots:7",
+            "uniform",
+            where={"pairs_a_mm": _FINEST, "contrast": measured},
+            column="contrast",
+            unit="",
             paper="rises",
         ),
         Level(
-            f"49 patterns tell {_FINEST} line pairs a mm apart",
+            f"49 patterns resolve {_FINEST} line pairs a mm (contrast of 10 %)",
+            where=_BARS | {"patterns": "dots:7"},
             every="pairs_a_mm",
             column="contrast",
             unit="",
-            where={"patterns": "dots:7", "pairs_a_mm": lambda pairs: pairs <= _FINEST, "contrast": measured},
             paper="told apart",
-            at_least=_TOLD,
+            at_least=_RESOLVED,
         ),
     ),
     panels=(
-        Lines("pairs_a_mm", _BARS, y="contrast", y_label="contrast of bars at their own frequency [1]", ticks=False),
-        Lines("pairs_a_mm", _BARS, y="transfer", y_label="transfer of a slanted edge [1]", file="edge", ticks=False),
+        _by_pairs(y="contrast", y_label="contrast of bars at their own frequency [1]"),
+        _by_pairs(y="transfer", y_label="transfer of a slanted edge [1]", file="edge"),
         Images(
             "picture",
             title=f"Bars by line pairs/mm of the print, exposure {EQUAL_FRAME}",
@@ -265,8 +213,6 @@ RESOLUTION = Study(
     "is chosen for each image: the two need not agree.",
 )
 
-
-# -------- Images of bars and of a slanted edge in, how much contrast is left by spatial frequency out
 
 _BINS = 4
 """Bins a pixel along the edge's normal, as the standard has them."""
@@ -344,4 +290,131 @@ def _centroid(weights: FloatArray, places: FloatArray) -> float:
     return float((squares * places).sum() / squares.sum())
 
 
-STUDIES = {each.name: each for each in (DISTANCE, BINNING, RESOLUTION)}
+# -------- Depth
+
+CALIBRATED_MM = 400.0
+"""The paper's distance."""
+_BESIDE_MM = (395.0, 405.0)
+"""Small variations of depth: the bag's folds."""
+DEPTHS_MM = (360.0, 380.0, 395.0, CALIBRATED_MM, 405.0, 420.0, 440.0)
+"""A tenth of the distance either way, as the shipped scenes with depth have."""
+BASELINES_MM = (0.0, 15.0, 60.0, 150.0, 300.0)
+"""From co-located, over a pico projector that touches the camera, to one on the other side of a bench."""
+ALONG = {"columns": (0.0, -1.0), "rows": (-1.0, 0.0), "both": (-(0.5**0.5), -(0.5**0.5))}
+"""Unit vectors of the baseline; that of the shipped devices is along the columns."""
+DEEP = {"cards": ("dots:7", "dots:7x14"), "cookie_bag": ("dots:7", "dots:7x16")}
+"""Scenes of many depths, and patterns whose period is too short for their parallax, and long enough."""
+NONE, AUTO, MAP, OWN = ("none", "auto", "map", "own calibration")
+_FOCUSED = {NONE: "factors as calibrated", AUTO: "depth found (--focus auto)", OWN: "calibrated at its own depth"}
+
+
+def _depth_points(scope: Scope) -> Sequence[Point]:
+    setups = [scope.setup.with_print(name) for name in scope.choose(scope.pictures, scope.pictures[:1])]
+    seed, depths = scope.seeds[0], scope.choose(DEPTHS_MM, (395.0, CALIBRATED_MM))
+    along = [("columns", baseline) for baseline in scope.choose(BASELINES_MM, (0.0, 60.0))]
+    along += [(each, 60.0) for each in scope.choose(("rows", "both"), ())]
+    families = scope.choose(("uniform", "dots:4", "dots:7"), ("dots:7",))
+    ideal = [
+        Point.of(setup, model=IDEALISED, patterns=family, seed=seed, depth=depth, baseline=baseline, along=axis)
+        for setup in setups
+        for axis, baseline in along
+        for depth in depths
+        for family in families
+    ]
+    moved = [
+        Point.of(own, model=RENDERED, patterns="dots:7", seed=seed, depth=depth, focus=focus)
+        for setup in setups
+        for depth in depths
+        for focus in (NONE, AUTO, OWN)
+        if not (focus == OWN and depth == CALIBRATED_MM)  # that is the bench as it is
+        for own in (setup.with_parameters(sheet_z=depth, **({"scene_distance": depth} if focus == OWN else {})),)
+    ]
+    deep = [
+        Point.of(replace(scope.setup, scene=scene), model=RENDERED, patterns=family, seed=each, focus=focus)
+        for scene, both in scope.choose(tuple(DEEP.items()), tuple(DEEP.items())[:1])
+        for each in scope.repeats
+        for family in both
+        for focus in (NONE, MAP)
+    ]
+    # The longest first, so that no process is left with it at the end.
+    return group_by_setup([*(deep if scope.setup.scene == "photograph" else []), *moved, *ideal])
+
+
+def _depth_measure(studio: Studio, point: Point) -> Found:
+    setup, patterns, seed = point.setup, str(point["patterns"]), int(point["seed"])
+    if point["model"] == RENDERED:
+        # Frames of the sheet elsewhere, factors of the bench as it was aligned.
+        focus = point["focus"] if point["focus"] in (AUTO, MAP) else None
+        image = studio.image(setup, RENDERED, patterns, seed, focus=focus)
+    else:
+        lit, (row, column) = studio.lit_scene(setup), ALONG[point["along"]]
+        plane = Plane(point["depth"], (point["baseline"] * row, point["baseline"] * column))
+        frames = lit.idealised_frames(lit.bench.family(patterns, seed), seed, plane)
+        image = Image.of(frames, frames.seconds(EQUAL_PEAK))
+    return finding(studio, point, image.image, scene=setup.scene, **image.row())
+
+
+_by_depth = partial(Lines, "depth", "depth of the plane [mm]", facet="")
+_IDEAL = {"model": IDEALISED, "along": "columns"}
+_MOVED = {"model": RENDERED, "patterns": "dots:7", "focus": tuple(_FOCUSED)}
+_robust = partial(
+    Gain,
+    one={"depth": CALIBRATED_MM},
+    other={"depth": _BESIDE_MM},
+    paper="robust",
+    at_least=-inf,
+    at_most=_STABLE_DB,
+)
+DEPTH = Study(
+    "depth",
+    "Depth",
+    "What does a scene beside the calibrated distance cost, and what is left once its depth is found?",
+    points=_depth_points,
+    measure=_depth_measure,
+    claims=(
+        _robust(
+            "49 dots are robust to 5 mm of depth, at any baseline",
+            where=_IDEAL | {"patterns": "dots:7"},
+            every="baseline",
+        ),
+        _robust("49 dots are robust to 5 mm of depth, 60 mm beside the projector", where=_MOVED | {"focus": NONE}),
+        Gain(
+            "A plane whose depth is found (--focus auto) is within 3 dB of a calibration at its depth",
+            {"focus": AUTO},
+            {"focus": OWN},
+            where=_MOVED | {"depth": lambda depth: depth != CALIBRATED_MM},
+            every="depth",
+            at_least=-_STABLE_DB,
+        ),
+        *(
+            Gain(
+                f"A depth for each pixel (--focus map) mends {scene}",
+                {"focus": MAP},
+                {"focus": NONE},
+                where={"scene": scene, "patterns": long},
+                at_least=_STABLE_DB,
+                optional=True,
+            )
+            for scene, (_, long) in DEEP.items()
+        ),
+        *(
+            Level(
+                f"Images of {scene} are flagged where dots are too near to each other for its depths (share of images)",
+                where={"scene": scene, "patterns": short, "focus": MAP},
+                column="flagged",
+                unit="",
+                at_least=0.99,
+                optional=True,
+            )
+            for scene, (short, _) in DEEP.items()
+        ),
+    ),
+    panels=(
+        _by_depth(file="baseline", where=_IDEAL | {"patterns": "dots:7"}, colour="baseline", names="{} mm"),
+        _by_depth(file="patterns", where=_IDEAL | {"baseline": 60.0}),
+        _by_depth(file="focus", title="Rendered, 49 dots", where=_MOVED, colour="focus", names=_FOCUSED),
+        Images("focus", where={"scene": tuple(DEEP), "focus": (NONE, MAP)}, down=("scene", "patterns")),
+    ),
+)
+
+STUDIES = {each.name: each for each in (DISTANCE, BINNING, RESOLUTION, DEPTH)}

@@ -494,14 +494,15 @@ REFLECTIVITY = Study(
         *(
             _artefacts(
                 f"{words} (artefacts of gloss, 49 dots)",
+                paper=paper,
                 where=_DOTS_ALONE | {"subject": name},
                 at_least=low,
                 at_most=high,
             )
-            for name, words, low, high in (
-                (CARD, "The gift card comes out well", _PLAIN_DB, inf),
-                (BLADE, "The metal blade comes out well", _PLAIN_DB, inf),
-                (DISC, "The compact disc has severe artefacts", -inf, _PLAIN_DB),
+            for name, words, paper, low, high in (
+                (CARD, "The gift card comes out well", "quite good", _PLAIN_DB, inf),
+                (BLADE, "The metal blade comes out well", "quite good", _PLAIN_DB, inf),
+                (DISC, "The compact disc is worst", "severe artefacts", -inf, _PLAIN_DB),
             )
         ),
         *(
