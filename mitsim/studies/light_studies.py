@@ -244,6 +244,8 @@ AMBIENT = Study(
 PIXELS, SENSOR, INTERREFLECTION, SATURATION, REST = ERROR_SOURCES = (
     "pixels", "sensor", "interreflection", "saturation", "rest",
 )  # fmt: skip
+_ADDED = SENSOR, INTERREFLECTION, SATURATION
+"""Causes of artefacts."""
 _DARK = 1e-3
 """Reflectance below which a pixel of the twin has no light to be scaled: shadows, beyond which sampling decides."""
 
@@ -286,7 +288,7 @@ def split(frames: Unexposed, twin: LitScene, seconds: float) -> tuple[Solution, 
     )
     images = [image(even, rate), image(direct, rate), image(frames.expected, rate), image(frames.expected, reading)]
     parts = {PIXELS: lit.truth - twin.truth}
-    parts |= dict(zip(ERROR_SOURCES[1:], np.diff(images, axis=0), strict=False))
+    parts |= dict(zip(_ADDED, np.diff(images, axis=0), strict=True))
     return solution, {**parts, REST: solution.image - twin.truth - sum(parts.values())}
 
 
@@ -354,7 +356,7 @@ def _measure_gloss(studio: Studio, point: Point) -> Found:
                 patterns=name,
                 exposure=exposure,
                 exposure_s=seconds,
-                artefacts_db=decibels(np.sum([parts[cause] for cause in ERROR_SOURCES[1:4]], axis=0)),
+                artefacts_db=decibels(np.sum([parts[cause] for cause in _ADDED], axis=0)),
                 psnr_db=psnr(solution.image, lit.truth),
                 psnr_matt_db=psnr(solution.image, twin.truth),
                 **flags_of(solution.status),
