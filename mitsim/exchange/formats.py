@@ -42,20 +42,20 @@ if TYPE_CHECKING:
     from mitsim.exchange.packed import Run
 
 
-FORMATS = {
-    "hdf5": "hdf5.write_hdf5",
-    "mat": "matlab.write_matlab",
-    "torch": "tensors.write_tensors",
-    "png": "png_files.write_pngs",
-}
-"""Modules of this room and functions that write a format, by the name that `--format` takes: from the place, the run
-(of one line, coloured or behind filters), and its ``calibration`` or a ``projector``'s name, to sentences on what of
-the run the format does not hold, or how it is used."""
 PNG = "png"
 """The format that is a folder in place of a file. It alone holds no calibration and no run behind colour filters."""
-READERS = {".h5": "hdf5.load_hdf5", ".hdf5": "hdf5.load_hdf5", ".mat": "matlab.load_mat"}
-"""What opens a file that `mitsim import` takes, by the end of its name: from the place and a channel to a context of
-:class:`mitsim.exchange.packed.Loaded`."""
+FORMATS = {
+    "hdf5": "packed.write_hdf5",
+    "mat": "matlab.write_matlab",
+    "torch": "labelled.write_tensors",
+    PNG: "png_files.write_pngs",
+}
+"""Modules of this room and functions that write a format, by the name that `--format` takes: from the place, the run
+(of one line, coloured or behind filters), and its ``calibration`` or a ``projector``'s name, to sentences on the parts
+of the run that the format does not hold, or on its use."""
+READERS = {".h5": "packed.load_hdf5", ".hdf5": "packed.load_hdf5", ".mat": "matlab.load_mat"}
+"""Functions that open a file that `mitsim import` takes, by the end of its name: from the place and a channel to a
+context of :data:`mitsim.exchange.packed.Loaded`."""
 _CALLED = {"output": "run", "calibration_output": "calibration"}
 """What the folder of an argument is, in messages."""
 
@@ -236,9 +236,8 @@ def import_file(
     check_plain(source)  # refused before numpy is imported
     if channel is not None:
         check_channel(channel)
-    with _function(READERS[source.suffix.lower()])(source, channel) as loaded:
-        places = [None if place is None else Path(place) for place in (output, calibration_output)]
-        wanted = {"output": (places[0], loaded.run), "calibration_output": (places[1], loaded.calibration)}
+    with _function(READERS[source.suffix.lower()])(source, channel) as (run, calibration, left_out):
+        wanted = {"output": (output, run), "calibration_output": (calibration_output, calibration)}
         for argument, (place, held) in wanted.items():
             if place is not None and held is None:
                 raise ArgumentError(argument, f"{place}: {source} holds no {_CALLED[argument]}; leave this out")
@@ -246,7 +245,6 @@ def import_file(
             folders = [(stack.enter_context(whole_folder(place)), held) for place, held in wanted.values() if place]
             for folder, held in folders:
                 held.fill(folder)
-    run, calibration = loaded.run, loaded.calibration
     parts = {} if calibration is None or calibration_output is None else calibration.parts
     angles = sorted({part.manifest.configuration.get(TURNED, 0) for part in parts.values()})
     return {
@@ -254,7 +252,7 @@ def import_file(
         "output": None if output is None else str(output),
         "calibration_output": None if calibration_output is None else str(calibration_output),
         "holds": [_CALLED[argument] for argument, (_, held) in wanted.items() if held],
-        "left_out": list(loaded.left_out),
+        "left_out": list(left_out),
         "notes": [
             f"Its frames are turned by {angle:g} degrees: import them with --turn {angle:g}"
             for angle in angles

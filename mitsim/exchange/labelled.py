@@ -1,16 +1,25 @@
-"""Captures, factors and images in; xarray Datasets out, with axes, units and coordinates by the CF conventions."""
+"""Runs and factors in, a file of PyTorch's tensors out; captures, factors and images in, xarray Datasets out, with
+axes, units and coordinates by the CF conventions.
+
+PyTorch and xarray are extras (`pip install mitsim[torch,xarray]`), imported when they are used.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
-from mitsim.core.runs import Capture
+from mitsim.core.errors import MitsimError, cut, reason_of
+from mitsim.core.files import whole_file
+from mitsim.core.manifests import SIDES
+from mitsim.core.runs import TRUTH, Capture
+from mitsim.exchange.packed import FACTORS, Calibration, Run
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, Reconstruction
 from mitsim.version import __version__
@@ -18,13 +27,90 @@ from mitsim.version import __version__
 if TYPE_CHECKING:
     from xarray import Dataset
 
+# -------- Tensors
+
+_PATTERNS = ("P_L", "P_R")
+"""Tensors of the patterns' factors."""
+
+
+def write_tensors(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
+    """Write a run as a file of tensors that `torch.load` reads with `weights_only`, whole or not at all.
+
+    Of several lines the tensors have an axis of lines before the others. Behind colour filters `y` has none, and
+    `weights` (4, lines) is what each filter passes.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        that is exported; its lines were captured under the same patterns.
+    calibration
+        that goes with it, of the same lines.
+
+    Raises
+    ------
+    MitsimError
+        where PyTorch is not installed, a frame cannot be read, or lines differ in their patterns or in the shape of a
+        tensor.
+    """
+    try:
+        torch: Any = importlib.import_module("torch")
+    except ImportError as error:
+        raise MitsimError(f"torch is not installed ({error}); type: pip install 'mitsim[torch]'") from error
+    shared, lines = dict[str, FloatArray](), dict[str, dict[str, FloatArray]]()
+    for name, part in run.parts.items():
+        shots = Capture(part.manifest, None, {file: part.read(file) for file in dict.fromkeys(part.names)})
+        lines[name] = {"y": measurements(shots), **dict(zip(_PATTERNS, shots.patterns, strict=True))}
+    if run.filters:  # frames of all lines at once
+        shared = {**lines.pop(""), "weights": np.array(run.filters.weights)}
+    for name in run.names:
+        arrays = lines.setdefault(name, {})
+        if name in run.parts and TRUTH in run.parts[name].names:
+            arrays["x"] = run.parts[name].read(TRUTH)[0]["reflectance"][None].astype(np.float64)
+        elif run.truths.keys() >= {*run.names}:
+            arrays["x"] = run.truths[name][0]["reflectance"][None].astype(np.float64)
+        if calibration is not None:
+            factors = (calibration.parts[name].read(file)[0]["factor"] for file in FACTORS)
+            arrays.update({side: np.asarray(factor, np.float64) for side, factor in zip(SIDES, factors, strict=True)})
+    first, *others = lines.values()
+    for arrays in others:
+        if arrays.keys() != first.keys() or any(arrays[key].shape != first[key].shape for key in first):
+            raise MitsimError(f"{path}: lines differ in shape; use the format hdf5")
+        if not all(np.array_equal(arrays[key], first[key]) for key in first.keys() & {*_PATTERNS}):
+            raise MitsimError(f"{path}: lines differ in their patterns; use the format hdf5")
+    for key, values in first.items():
+        # The truth has an axis of one channel, which the lines take.
+        join = np.concatenate if key == "x" else np.stack
+        alone = run.colours is None or key in _PATTERNS
+        shared[key] = values if alone else join([arrays[key] for arrays in lines.values()])
+    if run.colours:
+        shared["wavelengths_nm"] = np.array(run.colours.wavelengths_nm)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in shared.items()}
+    with whole_file(path) as place:
+        try:
+            torch.save(tensors, place)
+        except RuntimeError as error:  # torch's own words for a full disk, in pages
+            raise OSError(f"torch: {cut(reason_of(error))}") from error
+    return ()
+
+
+def measurements(shots: Capture) -> FloatArray:
+    """Return (K K', rows, columns) electrons a second of every pattern of ``shots``, row-major over (i, j): differences
+    of signed pairs, others less the ambient frame. MitsimError for a frame that cannot be read."""
+    columns = shots.patterns[1].shape[1]
+    frames = {each.row * columns + each.column: each.frame for each in shots.pattern_measurements()}
+    return np.stack([frames[index] for index in sorted(frames)])
+
+
+# -------- Labelled arrays
+
 Labels = dict[str, tuple[Any, ...]]
 """Dimensions, values and attributes by name, as xarray takes them."""
-_CONVENTIONS = "CF-1.11"
 
 
 def label_capture(shots: Capture) -> Dataset:
-    """Frames (shot, row, column), expected electrons and the truth where they are known, of ``shots``.
+    """Label frames (shot, row, column), expected electrons and the truth where they are known, of ``shots``.
 
     MitsimError where xarray is not installed.
     """
@@ -36,12 +122,8 @@ def label_capture(shots: Capture) -> Dataset:
     if shots.truth is not None:
         scene = ("scene_row", "scene_column")
         numbers["truth"] = (scene, shots.truth, _attributes("1", "apparent reflectance, relative to the board"))
-        if shots.truth_standard_error is not None:
-            numbers["truth_standard_error"] = (
-                scene,
-                shots.truth_standard_error,
-                _attributes("1", "its standard error"),
-            )
+        if (error := shots.truth_standard_error) is not None:
+            numbers["truth_standard_error"] = (scene, error, _attributes("1", "its standard error"))
     places: Labels = {
         "shot": ("shot", np.arange(len(captures)), _attributes("1", "number of the frame")),
         "pattern_row": ("shot", [each.row for each in captures], _attributes("1", "index i of the pattern")),
@@ -59,7 +141,7 @@ def label_capture(shots: Capture) -> Dataset:
 
 
 def label_factors(factors: Factors) -> Dataset:
-    """Both of a camera's ``factors``, with places on the sensor and in the scene where the calibration states them.
+    """Label both of a camera's ``factors``, with places on sensor and scene where the calibration states them.
 
     MitsimError where xarray is not installed.
     """
@@ -75,7 +157,7 @@ def label_factors(factors: Factors) -> Dataset:
 
 
 def label_image(image: Reconstruction, factors: Factors | None = None) -> Dataset:
-    """An image, its uncertainty and depths where they are known.
+    """Label an image, its uncertainty and depths where they are known.
 
     Parameters
     ----------
@@ -110,7 +192,6 @@ def label_image(image: Reconstruction, factors: Factors | None = None) -> Datase
 
 
 def _attributes(units: str, long_name: str) -> dict[str, str]:
-    """Attributes of a variable."""
     return {"units": units, "long_name": long_name}
 
 
@@ -119,12 +200,12 @@ def _dataset(title: str, numbers: Labels, places: Labels, facts: Mapping[str, An
         from xarray import Dataset
     except ImportError:
         raise MitsimError("xarray is not installed; type: pip install 'mitsim[xarray]'") from None
-    about = {"Conventions": _CONVENTIONS, "title": f"mitsim {title}", "source": f"mitsim {__version__}"}
+    about = {"Conventions": "CF-1.11", "title": f"mitsim {title}", "source": f"mitsim {__version__}"}
     return Dataset(numbers, places, {**about, **facts})
 
 
 def _sensor_places(camera: Mapping[str, Any], name: str, axis: str, count: int) -> Labels:
-    """Middles of a frame's rows or columns on the sensor [mm], where a ``camera``'s identity states its pixels."""
+    """Return the middles of a frame's rows or columns on the sensor [mm], where a ``camera`` states its pixels."""
     known = camera.get("geometry")
     if not isinstance(known, Mapping) or "pixel_pitch" not in known:
         return {}
@@ -138,19 +219,13 @@ def _sensor_places(camera: Mapping[str, Any], name: str, axis: str, count: int) 
 
 
 def _scene_places(factors: Factors) -> Labels:
-    """Middles of scene pixels on the calibrated plane [mm], where a calibration states its parallax."""
-    parallax = factors.manifest.parallax
+    """Return the middles of scene pixels on the calibrated plane [mm], where a calibration states its parallax."""
+    parallax, found = factors.manifest.parallax, Labels()
     if parallax is None:
-        return {}
-    sides = (("row", factors.left, parallax.row_tan), ("column", factors.right, parallax.column_tan))
-    found: Labels = {}
-    for axis, side, (near, far) in sides:
-        count = side.shape[1]
-        parts: npt.NDArray[np.float64] = (np.arange(count) + 0.5) / count
+        return found
+    sides = (("row", "y", factors.left, parallax.row_tan), ("column", "x", factors.right, parallax.column_tan))
+    for axis, letter, side, (near, far) in sides:
+        parts: npt.NDArray[np.float64] = (np.arange(side.shape[1]) + 0.5) / side.shape[1]
         said = _attributes("mm", f"place of the scene's {axis} at {parallax.depth_mm:g} mm, from the frame's middle")
-        found[f"scene_{'y' if axis == 'row' else 'x'}"] = (
-            f"scene_{axis}",
-            parallax.depth_mm * (near + (far - near) * parts),
-            said,
-        )
+        found[f"scene_{letter}"] = f"scene_{axis}", parallax.depth_mm * (near + (far - near) * parts), said
     return found

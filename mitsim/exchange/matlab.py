@@ -14,16 +14,16 @@ import json
 import math
 import operator
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from mitsim.core.arrays import FloatArray, is_hdf5, read_variables, write_variables
+from mitsim.core.arrays import FloatArray, checked_hdf5, hdf5_errors, is_hdf5, read_variables, write_variables
 from mitsim.core.errors import MitsimError, cut
 from mitsim.core.exr import Channel, Channels, Metadata
 from mitsim.core.imagelist import ALL, WAVELENGTHS_NM, check_channel
@@ -35,12 +35,10 @@ from mitsim.core.manifests import (
     CalibrationManifest,
     Digital,
     RunManifest,
-    ShotFile,
     lines_of_planes,
 )
 from mitsim.core.runs import TRUTH
 from mitsim.exchange.capture_list import TURNED
-from mitsim.exchange.hdf5 import read_matlab
 from mitsim.exchange.packed import (
     FACTORS,
     Calibration,
@@ -49,23 +47,24 @@ from mitsim.exchange.packed import (
     Packed,
     Run,
     as_channel,
+    hdf5_item,
     shots_of,
     unpack,
     unpack_colours,
-    unpack_run,
 )
 
+if TYPE_CHECKING:
+    import h5py
+
 ELECTRONS = "expected electrons of the frames"
-"""What such a file does not hold of a simulated run."""
-Variables = dict[str, Any]
-"""Arrays and texts by name."""
+"""Part of a simulated run that such a file does not hold."""
 
 # -------- The variables of a file
 
 
 @dataclass(frozen=True, eq=False)
 class MatFile:
-    """What a MATLAB file holds, or what it holds of one line; checked as it is asked for.
+    """Variables of a MATLAB file, or of one line in it, checked as they are asked for.
 
     Attributes
     ----------
@@ -82,7 +81,7 @@ class MatFile:
         return name in self.values
 
     def text(self, name: str) -> str:
-        """The text called ``name``; MitsimError where there is none."""
+        """Return the text called ``name``; MitsimError where there is none."""
         value = np.asarray(self.values.get(name))
         if value.dtype.kind != "U" or value.size != 1:
             raise MitsimError(
@@ -92,7 +91,7 @@ class MatFile:
         return str(value.item())
 
     def array(self, name: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-        """The array called ``name``, in a ``shape`` of which MATLAB drops axes of length 1 at the end.
+        """Return the array called ``name`` in a ``shape``, of which MATLAB drops axes of length 1 at the end.
 
         MitsimError where it is missing, or not of so many real numbers.
         """
@@ -103,7 +102,7 @@ class MatFile:
         return array.reshape(shape, order="F")
 
     def matrix(self, name: str) -> FloatArray:
-        """The matrix called ``name``, of any size; MitsimError where it is missing, or none of real numbers."""
+        """Return the matrix called ``name``, of any size; MitsimError where it is missing, or none of real numbers."""
         matrix = np.asarray(self.values.get(name))
         if matrix.ndim != 2 or matrix.dtype.kind not in "uif":
             reported = "no matrix of numbers" if name in self else "missing"
@@ -111,12 +110,12 @@ class MatFile:
         return matrix.astype(np.float64)
 
     def image(self, name: str, scale: float = 1.0) -> Channel:
-        """The matrix called ``name``, over a ``scale``, as a channel: (rows, columns) float32."""
+        """Return the matrix called ``name``, over a ``scale``, as a channel: (rows, columns) float32."""
         # Rounding in double precision is far below half of the last digit in single: the number is the one written.
         return as_channel((self.matrix(name) / scale).astype(np.float32), name, self.path)
 
     def by_line(self, names: Sequence[str]) -> dict[str, MatFile]:
-        """What it holds of each of the lines ``names``, by the variables' names without their ending."""
+        """Return the variables of each of the lines ``names``, by their names without the ending."""
         return {
             name: MatFile(
                 self.path, {key.removesuffix(end): each for key, each in self.values.items() if key.endswith(end)}
@@ -125,12 +124,36 @@ class MatFile:
         }
 
 
+_CLASSES = {"char", "single", "double", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+"""MATLAB's names of arrays of numbers and texts."""
+
+
 def variables_in(path: Path) -> dict[str, Any]:
-    """The arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name.
+    """Return the arrays of real numbers and the texts of the MATLAB file ``path``, of version 5 or 7.3, by name; cells,
+    structures and sparse matrices are not looked into.
 
     MitsimError for a file that is missing, damaged, of version 4, or that takes more memory than is free.
     """
-    return read_matlab(path) if is_hdf5(path) else read_variables(path)
+    if not is_hdf5(path):
+        return read_variables(path)
+    import h5py
+
+    found = dict[str, Any]()
+
+    def kind(dataset: h5py.Dataset) -> str:
+        """Return the class of an array of the file's own; "" of the content of structures and cells."""
+        held = dataset.name.count("/") > 1 or dataset.dtype.kind not in "uif" or "MATLAB_empty" in dataset.attrs
+        return "" if held else bytes(dataset.attrs.get("MATLAB_class", b"double")).decode("ascii")
+
+    with hdf5_errors(path), checked_hdf5(path, lambda each: 2.0 * (kind(each) in _CLASSES)) as file:
+        for name in file:
+            # Groups are structures, sparse matrices, or content of cells.
+            if isinstance(file[name], h5py.Dataset) and (known := kind(file[name])) in _CLASSES:
+                values = hdf5_item(file, name, path)[()].T  # MATLAB stores columns first
+                # Texts are stored as numbers of 16 bits.
+                text = known == "char"
+                found[name] = np.array(["".join(map(chr, values.ravel("F").tolist()))]) if text else values
+    return found
 
 
 COLOURED, FILTERED, _CALIBRATED = "colour_run", "mosaic_run", "colour_calibration"
@@ -140,7 +163,7 @@ _LONGEST_LINE = 31
 
 
 def endings(names: Sequence[str], path: Path) -> dict[str, str]:
-    """What variables of each line end in, by the line's name: of letters, digits and _, as MATLAB wants it.
+    """Return the endings of each line's variables by the line's name: of letters, digits and _, as MATLAB wants it.
 
     Parameters
     ----------
@@ -164,11 +187,16 @@ def endings(names: Sequence[str], path: Path) -> dict[str, str]:
     return ends
 
 
+def _dn_per_rate(digital: Digital) -> float:
+    """Return the digital numbers of a photoelectron a second, in frames that are read as ``digital`` says."""
+    return digital.gain_dn_per_e * digital.exposure_s
+
+
 # -------- Folders in, the paper's variables out
 
 
 def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple[str, ...]:
-    """Write a run with the paper's variables, whole or not at all; returns sentences on what is left out.
+    """Write a run with the paper's variables, whole or not at all; return sentences on the parts that are left out.
 
     Of several lines, the variables of each end in its name: `phi_left_638nm`. Behind colour filters the frames are
     those of all lines, only the truths and factors of each line end in its name, and `weights` is (4, lines) of what
@@ -189,100 +217,65 @@ def write_matlab(path: Path, run: Run, calibration: Calibration | None) -> tuple
         for a run that mixes whole shots and pairs, or is larger than such a file may be, and for lines whose names
         cannot end one of a variable.
     """
-    ends, variables = endings(run.names, path), _colour_variables(run, calibration)
-    if run.filters:
-        shots = run.parts[""]
-        variables.update(
-            {**_coded_frames(shots), **_folder_variables(shots, None), "weights": np.array(run.filters.weights)}
-        )
-    for name, end in ends.items():
-        factors = calibration.parts[name] if calibration else None
+    variables: dict[str, Any] = {}
+
+    def add_truth(channels: Channels, metadata: Metadata, end: str) -> None:
+        variables[f"truth{end}"] = channels["reflectance"]
+        variables[f"truth_board_reflectance{end}"] = float(metadata.get("board_reflectance", math.nan))
+        if "standard_error" in channels:
+            variables[f"truth_standard_error{end}"] = channels["standard_error"]
+
+    for name, end in {"": "", **endings(run.names, path)}.items():
         if name in run.parts:
-            own = {**_coded_frames(run.parts[name]), **_folder_variables(run.parts[name], factors)}
-        else:
-            own = _truth_variables(*run.truths[name]) if name in run.truths else {}
-            own.update(_calibration_variables(factors, run.of_line(name).manifest.digital))
-        variables.update({f"{key}{end}": values for key, values in own.items()})
+            shots = run.parts[name]
+            variables |= {f"{key}{end}": values for key, values in _run_variables(shots).items()}
+            if TRUTH in shots.names:
+                add_truth(*shots.read(TRUTH), end)
+        elif name in run.truths:
+            add_truth(*run.truths[name], end)
+        if calibration and name in calibration.parts:
+            factors, root = calibration.parts[name], math.sqrt(_dn_per_rate(run.of_line(name).manifest.digital))
+            for side, file in zip(SIDES, FACTORS, strict=True):  # [sqrt(electrons / s)] in sqrt(DN)
+                variables[f"phi_{side}{end}"] = factors.read(file)[0]["factor"].astype(np.float64) * root
+            variables[f"calibration_manifest{end}"] = factors.text
+    if run.colours:
+        variables[FILTERED if run.filters else COLOURED] = run.text
+    if run.filters:
+        variables["weights"] = np.array(run.filters.weights)
+    if calibration and calibration.colours:
+        variables[_CALIBRATED] = calibration.text
     write_variables(path, variables)
     without = () if calibration else ("phi_left and phi_right are left out: no calibration was given",)
     return (*without, f"Left out: {ELECTRONS}")
 
 
-def _coded_frames(run: Packed[RunManifest]) -> Variables:
-    """`data_coded`, `measBg` and, of signed pairs, `data_negative`: (rows, columns, K, K') each, or (rows, columns)."""
-    manifest = run.manifest
+def _run_variables(run: Packed[RunManifest]) -> dict[str, Any]:
+    """Return manifest, patterns, other frames, and `data_coded`, `measBg` and, of signed pairs, `data_negative`:
+    (rows, columns, K, K') each, or (rows, columns)."""
+    manifest, digital = run.manifest, run.manifest.digital
     signs = {abs(shot.sign) for shot in manifest.patterns.captures}
     if len(signs) != 1:
         raise MitsimError(f"{run.place}: mixes whole shots and signed pairs; use the format hdf5")
-    signed = signs == {1}
     left, right = manifest.patterns.matrices
     stacks: dict[int, FloatArray] = {}
     for shot, channels, _ in shots_of(run):
         dn = channels["DN"]
         if not stacks:
-            kind = dn.dtype.name
             shape = *dn.shape, left.shape[1], right.shape[1]
-            stacks = {sign: np.empty(shape, order="F") for sign in ((-1, 1) if signed else (0,))}
+            stacks = {sign: np.empty(shape, order="F") for sign in ((-1, 1) if signs == {1} else (0,))}
         stacks[shot.sign][:, :, shot.row, shot.column] = dn
-    if not signed:
-        return {"data_coded": stacks[0], "dn_class": kind, "measBg": _background(run, stacks[0].shape[:2])}
-    difference = stacks[1] - stacks[-1]
-    if not np.array_equal(difference + stacks[-1], stacks[1]):
-        raise MitsimError(f"{run.place}: differences of its pairs have more digits than a double; use the format hdf5")
-    none = np.zeros(difference.shape[:2])
-    return {"data_coded": difference, "data_negative": stacks[-1], "dn_class": kind, "measBg": none}
-
-
-def _background(run: Packed[RunManifest], shape: tuple[int, ...]) -> FloatArray:
-    """(rows, columns) digital numbers of a frame without the projector's light."""
-    ambient, digital = run.manifest.ambient_frame, run.manifest.digital
-    if ambient is not None:
-        return run.read(ambient.file)[0]["DN"].astype(np.float64)
-    return np.full(shape, digital.black_level_dn + digital.dark_current_e_per_s * _dn_per_rate(digital))
-
-
-def _colour_variables(run: Run, calibration: Calibration | None) -> Variables:
-    """Variables that say of which lines a file is: the colour.json of ``run`` and ``calibration``."""
-    variables = {FILTERED if run.filters else COLOURED: run.text} if run.colours else {}
-    return {**variables, _CALIBRATED: calibration.text} if calibration and calibration.colours else variables
-
-
-def _folder_variables(run: Packed[RunManifest], calibration: Packed[CalibrationManifest] | None) -> Variables:
-    """Variables of every MATLAB file: manifests, patterns, factors, truth and ambient frame."""
-    variables: Variables = {"run_manifest": run.text}
-    variables["PL"], variables["PR"] = run.manifest.patterns.matrices
-    variables.update(_calibration_variables(calibration, run.manifest.digital))
-    variables.update({name: run.read(file)[0]["DN"] for name, file in run.manifest.others.items()})
-    return {**variables, **_truth_variables(*run.read(TRUTH))} if TRUTH in run.names else variables
-
-
-def _calibration_variables(calibration: Packed[CalibrationManifest] | None, digital: Digital) -> Variables:
-    """Factors (pixels, n) [sqrt(DN)] and manifest of a ``calibration``, for frames that are read as ``digital`` says;
-    none without one."""
-    if calibration is None:
-        return {}
-    named = {f"phi_{side}": factor for side, factor in zip(SIDES, _factors_in_dn(calibration, digital), strict=True)}
-    return {**named, "calibration_manifest": calibration.text}
-
-
-def _truth_variables(channels: Channels, metadata: Metadata) -> Variables:
-    """A truth, of the ``channels`` (n, n') and ``metadata`` of its file."""
-    variables: Variables = {"truth": channels["reflectance"]}
-    variables["truth_board_reflectance"] = float(metadata.get("board_reflectance", math.nan))
-    if "standard_error" in channels:
-        variables["truth_standard_error"] = channels["standard_error"]
-    return variables
-
-
-def _dn_per_rate(digital: Digital) -> float:
-    """Digital numbers of a photoelectron a second, in frames that are read as ``digital`` says."""
-    return digital.gain_dn_per_e * digital.exposure_s
-
-
-def _factors_in_dn(calibration: Packed[CalibrationManifest], digital: Digital) -> tuple[FloatArray, ...]:
-    """Left and right factor (pixels, n) of a ``calibration`` [sqrt(electrons / s)] in sqrt(DN)."""
-    root = math.sqrt(_dn_per_rate(digital))
-    return tuple(calibration.read(name)[0]["factor"].astype(np.float64) * root for name in FACTORS)
+    others = {name: run.read(file)[0]["DN"] for name, file in manifest.others.items()}
+    variables = {"run_manifest": run.text, "PL": left, "PR": right, "dn_class": dn.dtype.name, **others}
+    if signs == {1}:
+        difference = stacks[1] - stacks[-1]
+        if not np.array_equal(difference + stacks[-1], stacks[1]):
+            raise MitsimError(
+                f"{run.place}: differences of its pairs have more digits than a double; use the format hdf5"
+            )
+        return {**variables, "data_coded": difference, "data_negative": stacks[-1], "measBg": np.zeros(dn.shape)}
+    dark = digital.black_level_dn + digital.dark_current_e_per_s * _dn_per_rate(digital)
+    background = others["ambient"].astype(np.float64) if "ambient" in others else np.full(dn.shape, dark)
+    return {**variables, "data_coded": stacks[0], "measBg": background}
 
 
 # -------- A file in, folders out
@@ -290,7 +283,7 @@ def _factors_in_dn(calibration: Packed[CalibrationManifest], digital: Digital) -
 
 @contextmanager
 def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
-    """Run and calibration in a MATLAB file of `mitsim export`.
+    """Read run and calibration in a MATLAB file of `mitsim export`.
 
     Parameters
     ----------
@@ -305,82 +298,81 @@ def load_mat(path: Path, channel: str | None) -> Iterator[Loaded]:
         for a file that is none of these, or is damaged.
     """
     if channel is not None:
-        yield Loaded(None, flatcam_calibration(path, channel))
+        yield None, flatcam_calibration(path, channel), ()
         return
     file = MatFile(path, variables_in(path))
-    run, lines = _run_in(file)
-    held = {name: _calibration_part(own, run.of_line(name).manifest.digital) for name, own in lines.items()}
-    yield Loaded(run, _calibration_in(file, held, run), (ELECTRONS,))
-
-
-def _run_in(file: MatFile) -> tuple[Run, dict[str, MatFile]]:
-    """The run in a ``file``, and what the file holds of each line."""
-    if COLOURED not in file:
-        shots = _run_part(file)
-        if FILTERED not in file:
-            return Content({"": shots}), {"": file}
-        text = file.text(FILTERED)
-        colours = unpack_colours(text, MOSAIC, file.path, shots.names)
+    if COLOURED in file:
+        text = file.text(COLOURED)
+        colours = unpack_colours(text, RUN, path)
+        lines = file.by_line(colours.names)
+        run = Content({name: _run_in(own) for name, own in lines.items()}, colours, text)
+    elif FILTERED in file:
+        shots, text = _run_in(file), file.text(FILTERED)
+        colours = unpack_colours(text, MOSAIC, path, shots.names)
         lines = file.by_line(colours.names)
         truths = {name: _truth_in(own) for name, own in lines.items() if "truth" in own}
-        return Content({"": shots}, colours, text, truths), lines
-    text = file.text(COLOURED)
-    colours = unpack_colours(text, RUN, file.path)
-    lines = file.by_line(colours.names)
-    return Content({name: _run_part(own) for name, own in lines.items()}, colours, text), lines
+        run = Content({"": shots}, colours, text, truths)
+    else:
+        run, lines = Content({"": _run_in(file)}), {"": file}
+    parts = {
+        name: _calibration_in(own, run.of_line(name).manifest.digital)
+        for name, own in lines.items()
+        if "calibration_manifest" in own
+    }
+    calibration = None
+    if not run.colours and parts:
+        calibration = Content(parts)
+    elif run.colours and _CALIBRATED in file:
+        text = file.text(_CALIBRATED)
+        colours = unpack_colours(text, CALIBRATION, path)
+        if {*parts} != {*colours.names}:
+            raise MitsimError(f"{path}: has calibrations of {', '.join(parts)}, not of {', '.join(colours.names)}")
+        calibration = Content(parts, colours, text)
+    yield run, calibration, (ELECTRONS,)
 
 
-def _run_part(own: MatFile) -> Packed[RunManifest]:
+def _run_in(own: MatFile) -> Packed[RunManifest]:
     """Return the run of the variables ``own``."""
     text = own.text("run_manifest")
-    manifest = unpack_run(text, own.path)
-    captures, ambient, closing = manifest.patterns.captures, manifest.ambient_frame, manifest.closing_frame
-    frame = _frames_of_patterns(own, manifest)
-    shots = {shot.file: shot for shot in captures}
+    manifest = unpack(text, RunManifest, own.path)
+    ambient, closing = manifest.ambient_frame, manifest.closing_frame
+    shots = {shot.file: shot for shot in manifest.patterns.captures}
     kind = np.float32 if own.text("dn_class") == "float32" else np.uint32
+    coded = np.asarray(own.values.get("data_coded"))
+    if coded.ndim < 2:
+        raise MitsimError(f"{own.path}: data_coded is missing, or no frames; export it again")
+    shape = *coded.shape[:2], *(matrix.shape[1] for matrix in manifest.patterns.matrices)
+    data = own.array("data_coded", shape)
+    stacks = {0: data}
+    if any(shot.sign for shot in shots.values()):
+        negative = own.array("data_negative", shape)
+        stacks = {1: data + negative, -1: negative}
+
+    def exactly(values: npt.NDArray[Any], name: str) -> dict[str, Channel]:
+        with np.errstate(invalid="ignore"):
+            digital = np.asarray(values).astype(kind)
+        if not np.array_equal(digital.astype(np.float64), values):
+            raise MitsimError(f"{own.path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
+        return {"DN": as_channel(digital, name, own.path)}
 
     def read(name: str) -> tuple[Channels, Metadata]:
         known: Metadata = {"exposure_s": manifest.digital.exposure_s}
         if name in shots:
             shot = shots[name]
             place: Metadata = {"row": shot.row, "column": shot.column, "sign": shot.sign}
-            return {"DN": _digital(frame(shot), kind, name, own.path)}, {**place, **known}
+            return exactly(stacks[shot.sign][:, :, shot.row, shot.column], name), {**place, **known}
         if ambient is not None and name == ambient.file:
             return {"DN": own.image("ambient")}, {"shots": ambient.shots, **known}
         if closing is not None and name == closing.file:
-            return {"DN": _digital(own.matrix("closing"), kind, name, own.path)}, {"exposure_s": closing.exposure_s}
+            return exactly(own.matrix("closing"), name), {"exposure_s": closing.exposure_s}
         return _truth_in(own)
 
     names = (*shots, *manifest.others.values(), *((TRUTH,) if "truth" in own else ()))
     return Packed(manifest, text, names, read, own.path)
 
 
-def _frames_of_patterns(own: MatFile, manifest: RunManifest) -> Callable[[ShotFile], npt.NDArray[Any]]:
-    """The frame of a shot in `data_coded`, (rows, columns, K, K')."""
-    left, right = manifest.patterns.matrices
-    coded = np.asarray(own.values.get("data_coded"))
-    if coded.ndim < 2:
-        raise MitsimError(f"{own.path}: data_coded is missing, or no frames; export it again")
-    shape = *coded.shape[:2], left.shape[1], right.shape[1]
-    data = own.array("data_coded", shape)
-    stacks = {0: data}
-    if any(shot.sign for shot in manifest.patterns.captures):
-        negative = own.array("data_negative", shape)
-        stacks = {1: data + negative, -1: negative}
-    return lambda shot: stacks[shot.sign][:, :, shot.row, shot.column]
-
-
-def _digital(values: npt.NDArray[Any], kind: Any, name: str, path: Path) -> Channel:
-    """Digital numbers (rows, columns) as a frame holds them, exactly."""
-    with np.errstate(invalid="ignore"):
-        digital = np.asarray(values).astype(kind)
-    if not np.array_equal(digital.astype(np.float64), values):
-        raise MitsimError(f"{path}: {name} has numbers that are no {np.dtype(kind).name}; export it again")
-    return as_channel(digital, name, path)
-
-
 def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
-    """Channels (n, n') and metadata of the truth; MitsimError where it is no image."""
+    """Return channels (n, n') and metadata of the truth; MitsimError where it is no image."""
     channels = {"reflectance": own.image("truth")}
     if "truth_standard_error" in own:
         own.array("truth_standard_error", channels["reflectance"].shape)
@@ -391,27 +383,9 @@ def _truth_in(own: MatFile) -> tuple[Channels, Metadata]:
     return channels, {} if math.isnan(board) else {"board_reflectance": board}
 
 
-def _calibration_in(
-    file: MatFile, held: Mapping[str, Packed[CalibrationManifest] | None], run: Run
-) -> Calibration | None:
-    """The calibration in a ``file`` of a ``run``, whose lines' are ``held``; None where it holds none."""
-    parts = {name: part for name, part in held.items() if part is not None}
-    if not run.colours:
-        return Content(parts) if parts else None
-    if _CALIBRATED not in file:
-        return None
-    text = file.text(_CALIBRATED)
-    colours = unpack_colours(text, CALIBRATION, file.path)
-    if {*parts} != {*colours.names}:
-        raise MitsimError(f"{file.path}: has calibrations of {', '.join(parts)}, not of {', '.join(colours.names)}")
-    return Content(parts, colours, text)
-
-
-def _calibration_part(own: MatFile, digital: Digital) -> Packed[CalibrationManifest] | None:
-    """The calibration of the variables ``own``, where there is one, of a run whose frames are read as ``digital`` says,
-    and whose unit `phi_left` and `phi_right` have."""
-    if "calibration_manifest" not in own:
-        return None
+def _calibration_in(own: MatFile, digital: Digital) -> Packed[CalibrationManifest]:
+    """Return the calibration of the variables ``own``, of a run whose frames are read as ``digital`` says: its unit is
+    that of `phi_left` and `phi_right`."""
     text = own.text("calibration_manifest")
     manifest = unpack(text, CalibrationManifest, own.path)
     metadata: Metadata = {"unit": "sqrt(e-/s)"}

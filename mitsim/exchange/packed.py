@@ -1,22 +1,35 @@
-"""A RUN or CAL folder in, its manifests and files by name out; or the other way, from wherever they were kept.
+"""RUN and CAL folders in, one HDF5 file out, and back, bit for bit; manifests and files by name for other formats.
 
 Whatever lines a folder tells apart, its content is one :class:`Content`: of a mono folder it has one part, of a
 coloured one a part for each line. A run behind colour filters is one RUN folder of all lines; of each there is what a
-perfect image would show.
+perfect image would show. docs/exchange.md describes the layout of HDF5 files.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from mitsim.core.errors import MitsimError, cut
-from mitsim.core.exr import Channel, Channels, Metadata, checksum, read_frame, verify, write_frame
-from mitsim.core.files import LOCK, MOST_BYTES, fits_a_frame, parse_json, read_text, whole_folder, write_text
+from mitsim.core.arrays import PACKED, checked_hdf5, hdf5_errors, whole_hdf5
+from mitsim.core.errors import ArgumentError, MitsimError, cut
+from mitsim.core.exr import Channel, Channels, Metadata, Value, checksum, read_frame, verify, write_frame
+from mitsim.core.files import (
+    FRAME_LIMITS,
+    LOCK,
+    MOST_BYTES,
+    fits_a_frame,
+    parse_json,
+    read_text,
+    whole_folder,
+    write_text,
+)
+from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import (
     CALIBRATION,
     COLOUR,
@@ -29,7 +42,6 @@ from mitsim.core.manifests import (
     MosaicManifest,
     RunManifest,
     ShotFile,
-    SpectralFolder,
     checked_colours,
     checked_manifest,
     open_lines,
@@ -37,14 +49,16 @@ from mitsim.core.manifests import (
     write_manifest,
 )
 from mitsim.core.runs import TRUTH, load_run
+from mitsim.version import __version__
+
+if TYPE_CHECKING:
+    import h5py
 
 Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
-Reader = Callable[[str], tuple[Channels, Metadata]]
-"""Channels and metadata of a file, by its name."""
 FACTORS = tuple(f"{name}.exr" for name in SIDES)
 """Names of a CAL folder's files: the left factor's and the right one's."""
-_OWN = frozenset((".", "..", MANIFEST, LOCK, TRUTH))
-"""Names that no frame may have."""
+
+# -------- The content of a folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +82,11 @@ class Packed(Generic[Manifest]):
     manifest: Manifest
     text: str
     names: tuple[str, ...]
-    read: Reader
+    read: Callable[[str], tuple[Channels, Metadata]]
     place: Path
 
     def save(self, folder: Path | str) -> Path:
-        """Write the ``folder``, new or empty, whole or not at all; returns it. MitsimError where that cannot be
+        """Write the ``folder``, new or empty, whole or not at all; return it. MitsimError where that cannot be
         written, or a file cannot be read."""
         with whole_folder(folder) as place:
             self.fill(place)
@@ -98,120 +112,9 @@ class Packed(Generic[Manifest]):
             write_manifest(folder, self.manifest.model_copy(update={"checksums": sums}))
 
 
-def pack_run(folder: Path) -> Packed[RunManifest]:
-    """The RUN ``folder``. MitsimError when it is not a complete one."""
-    shots = load_run(folder)
-    return Packed(shots.manifest, _text_of(folder), shots.files, shots.read, folder)
-
-
-def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
-    """The CAL ``folder``. MitsimError when it is not a complete one."""
-    manifest = read_manifest(folder, CalibrationManifest)
-
-    def read(name: str) -> tuple[Channels, Metadata]:
-        verify(folder, name, manifest.checksums, "calibrate again")
-        return read_frame(folder / name)
-
-    for name in FACTORS:
-        if "factor" not in read(name)[0]:
-            raise MitsimError(f"{folder / name}: channels are {', '.join(read(name)[0])}; factor is needed")
-    return Packed(manifest, _text_of(folder), FACTORS, read, folder)
-
-
-def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
-    """Every shot of a ``run`` with its channels, (rows, columns) each, and metadata, read one at a time.
-
-    MitsimError for a shot without DN, or of another shape or other channels than the first: elsewhere one array holds
-    them all.
-    """
-    first: Mapping[str, tuple[object, ...]] | None = None
-    for shot in run.manifest.patterns.captures:
-        channels, metadata = run.read(shot.file)
-        kinds = {name: (values.dtype.name, *values.shape) for name, values in sorted(channels.items())}
-        first = first or kinds
-        if "DN" not in kinds or kinds != first:
-            raise MitsimError(
-                f"{run.place / shot.file}: holds {_kinds_text(kinds)}, but the first frame {_kinds_text(first)}; "
-                "frames of one shape with the same channels, DN among them, can be exchanged"
-            )
-        yield shot, channels, metadata
-
-
-def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
-    """The manifest in the ``text`` that an exchanged file holds.
-
-    Parameters
-    ----------
-    text
-        of a `manifest.json`.
-    model
-        of the manifest.
-    place
-        the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        when it is not JSON, or breaks a rule of its format.
-    """
-    try:
-        if len(text) > MOST_BYTES:
-            raise ValueError(f"it has {len(text)} letters; at most {MOST_BYTES} are allowed")
-        data = parse_json(text)
-    except ValueError as error:
-        raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
-    return checked_manifest(data, model, place)
-
-
-def unpack_run(text: str, place: Path) -> RunManifest:
-    """The manifest of a run in the ``text`` that an exchanged file holds, found at ``place``; with names of frames that
-    a folder can have. MitsimError as for :func:`unpack`."""
-    manifest = unpack(text, RunManifest, place)
-    for name in (*(shot.file for shot in manifest.patterns.captures), *manifest.others.values()):
-        if name in _OWN or not name.isprintable():
-            raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
-    return manifest
-
-
-def as_channel(values: object, name: str, place: Path) -> Channel:
-    """An array of an exchanged file as a channel of a frame.
-
-    Parameters
-    ----------
-    values
-        (rows, columns) float32 or uint32.
-    name
-        of the channel, for messages.
-    place
-        the file, for messages.
-
-    Raises
-    ------
-    MitsimError
-        for another type or shape.
-    """
-    array = np.asarray(values)
-    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not array.size or not fits_a_frame(array.shape):
-        raise MitsimError(
-            f"{place}: {name} is {array.dtype} of shape {array.shape}; float32 or uint32 of rows x columns is needed"
-        )
-    return np.ascontiguousarray(array)
-
-
-def _text_of(folder: Path, name: str = MANIFEST) -> str:
-    return read_text(folder / name, MOST_BYTES)
-
-
-def _kinds_text(kinds: Mapping[str, tuple[object, ...]]) -> str:
-    return ", ".join(f"{name} ({' '.join(map(str, kind))})" for name, kind in kinds.items())
-
-
-# -------- The content of a whole folder, whatever lines it tells apart
-
-
 @dataclass(frozen=True, eq=False)
 class Content(Generic[Manifest]):
-    """What a RUN or CAL folder holds.
+    """All that a RUN or CAL folder holds.
 
     Attributes
     ----------
@@ -237,11 +140,11 @@ class Content(Generic[Manifest]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its lines; "" alone where it tells none apart."""
+        """Names of its lines; "" alone where it tells none apart."""
         return self.colours.names if self.colours else ("",)
 
     def of_line(self, name: str) -> Packed[Manifest]:
-        """The folder that a line called ``name`` is in: its own, or that of all lines."""
+        """Return the folder that a line called ``name`` is in: its own, or that of all lines."""
         return self.parts.get(name) or self.parts[""]
 
     def fill(self, folder: Path) -> None:
@@ -258,46 +161,95 @@ class Content(Generic[Manifest]):
 
 Run = Content[RunManifest]
 Calibration = Content[CalibrationManifest]
+Loaded = tuple[Run | None, Calibration | None, tuple[str, ...]]
+"""Run and calibration of an exchanged file, where it has them, and the parts of a run that it does not hold."""
 
 
-@dataclass(frozen=True, eq=False)
-class Loaded:
-    """What an exchanged file holds.
+def pack_run(folder: Path) -> Packed[RunManifest]:
+    """Return the content of the RUN ``folder``. MitsimError when it is not a complete one."""
+    shots = load_run(folder)
+    return Packed(shots.manifest, read_text(folder / MANIFEST, MOST_BYTES), shots.files, shots.read, folder)
 
-    Attributes
-    ----------
-    run, calibration
-        content of the folders, where the file has them.
-    left_out
-        parts of a run that the file does not hold.
-    """
 
-    run: Run | None
-    calibration: Calibration | None
-    left_out: tuple[str, ...] = ()
+def pack_calibration(folder: Path) -> Packed[CalibrationManifest]:
+    """Return the content of the CAL ``folder``. MitsimError when it is not a complete one."""
+    manifest = read_manifest(folder, CalibrationManifest)
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        verify(folder, name, manifest.checksums, "calibrate again")
+        return read_frame(folder / name)
+
+    for name in FACTORS:
+        if "factor" not in (channels := read(name)[0]):
+            raise MitsimError(f"{folder / name}: channels are {', '.join(channels)}; factor is needed")
+    return Packed(manifest, read_text(folder / MANIFEST, MOST_BYTES), FACTORS, read, folder)
 
 
 def run_content(folder: Path) -> Run:
-    """The RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a line's folder, is not
-    a complete one."""
+    """Return the content of the RUN ``folder``, coloured, behind colour filters, or neither. MitsimError when it, or a
+    line's folder, is not a complete one."""
     lines = open_lines(folder, RUN, MOSAIC)
     files = {name: folder / name / TRUTH for name in (lines.names if lines.filters else ())}
     truths = {name: read_frame(path) for name, path in files.items() if path.is_file()}
-    return replace(_content(lines, pack_run), truths=truths)
+    text = read_text(folder / COLOUR, MOST_BYTES) if lines.colours else ""
+    return Content({name: pack_run(part) for name, part in lines.parts.items()}, lines.colours, text, truths)
 
 
 def calibration_content(folder: Path) -> Calibration:
-    """The CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a complete one."""
-    return _content(open_lines(folder, CALIBRATION), pack_calibration)
+    """Return the content of the CAL ``folder``, coloured or not. MitsimError when it, or a line's folder, is not a
+    complete one."""
+    lines = open_lines(folder, CALIBRATION)
+    text = read_text(folder / COLOUR, MOST_BYTES) if lines.colours else ""
+    return Content({name: pack_calibration(part) for name, part in lines.parts.items()}, lines.colours, text)
 
 
-def _content(lines: SpectralFolder, pack: Callable[[Path], Packed[Manifest]]) -> Content[Manifest]:
-    text = _text_of(lines.folder, COLOUR) if lines.colours else ""
-    return Content({name: pack(part) for name, part in lines.parts.items()}, lines.colours, text)
+def shots_of(run: Packed[RunManifest]) -> Iterator[tuple[ShotFile, Channels, Metadata]]:
+    """Yield every shot of a ``run`` with its channels, (rows, columns) each, and metadata, read one at a time.
+
+    MitsimError for a shot without DN, or of another shape or other channels than the first: elsewhere one array holds
+    them all.
+    """
+    first = ""
+    for shot in run.manifest.patterns.captures:
+        channels, metadata = run.read(shot.file)
+        kinds = ", ".join(
+            f"{name} ({' '.join(map(str, (values.dtype.name, *values.shape)))})"
+            for name, values in sorted(channels.items())
+        )
+        first = first or kinds
+        if "DN" not in channels or kinds != first:
+            raise MitsimError(
+                f"{run.place / shot.file}: holds {kinds}, but the first frame {first}; "
+                "frames of one shape with the same channels, DN among them, can be exchanged"
+            )
+        yield shot, channels, metadata
+
+
+# -------- Texts and arrays of exchanged files
+
+
+def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
+    """Return the manifest, of a ``model``, in the ``text`` that an exchanged file at a ``place`` holds.
+
+    MitsimError when it is not JSON, breaks a rule of its format, or names frames that a folder cannot have.
+    """
+    try:
+        if len(text) > MOST_BYTES:
+            raise ValueError(f"it has {len(text)} letters; at most {MOST_BYTES} are allowed")
+        data = parse_json(text)
+    except ValueError as error:
+        raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
+    manifest = checked_manifest(data, model, place)
+    checked: RunManifest | CalibrationManifest = manifest
+    if isinstance(checked, RunManifest):
+        for name in (*(shot.file for shot in checked.patterns.captures), *checked.others.values()):
+            if name in (".", "..", MANIFEST, LOCK, TRUTH) or not name.isprintable():
+                raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
+    return manifest
 
 
 def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ()) -> ColourManifest:
-    """The lines, and filters, that an exchanged file has.
+    """Return the lines, and filters, that an exchanged file has.
 
     Parameters
     ----------
@@ -323,3 +275,237 @@ def unpack_colours(text: str, kind: str, place: Path, files: Sequence[str] = ())
     for name in {COLOUR, LOCK, *((MANIFEST, *files) if kind == MOSAIC else ())}.intersection(colours.names):
         raise MitsimError(f"{place}: a line is called {name}; give it a name of its own")
     return colours
+
+
+def as_channel(values: object, name: str, place: Path) -> Channel:
+    """Return an array of an exchanged file as a channel of a frame.
+
+    Parameters
+    ----------
+    values
+        (rows, columns) float32 or uint32.
+    name, place
+        of the channel, and the file, for messages.
+
+    Raises
+    ------
+    MitsimError
+        for another type or shape.
+    """
+    array = np.asarray(values)
+    if array.dtype not in (np.float32, np.uint32) or array.ndim != 2 or not array.size or not fits_a_frame(array.shape):
+        raise MitsimError(
+            f"{place}: {name} is {array.dtype} of shape {array.shape}; float32 or uint32 of rows x columns is needed"
+        )
+    return np.ascontiguousarray(array)
+
+
+# -------- HDF5 files: shots are chunks of their own, so that one is read without the others
+
+_LINES = "lines"
+"""Group that has a group of each line."""
+LAYOUT = 1
+"""Number of the layout that is written here, and the newest that is read: attribute `mitsim_exchange` of the file."""
+
+
+def write_hdf5(path: Path, run: Run, calibration: Calibration | None = None) -> tuple[str, ...]:
+    """Write a run to one file, whole or not at all; nothing is left out.
+
+    Parameters
+    ----------
+    path
+        of the file.
+    run
+        with shots of one shape, each line's where they are told apart.
+    calibration
+        that goes with it, of the same lines.
+
+    Raises
+    ------
+    MitsimError
+        for shots that differ in shape or channels, or a file that cannot be read or written.
+    """
+
+    def write_text(group: h5py.Group, name: str, text: str) -> None:
+        # Of bytes with their length: manifests outgrow an attribute, and an HDF5 text ends at its first zero.
+        group.create_dataset(name, data=np.frombuffer(text.encode(), dtype=np.uint8), **PACKED)
+
+    def write_frames(group: h5py.Group, files: Mapping[str, tuple[Channels, Metadata]]) -> None:
+        for name, (channels, metadata) in files.items():
+            held = group.create_group(name)
+            for channel, values in channels.items():
+                held.create_dataset(channel, data=values, **PACKED)
+            held.create_dataset("metadata", data=[json.dumps(dict(metadata))])
+
+    def write_shots(place: h5py.Group, shots: Packed[RunManifest]) -> None:
+        group = place.create_group("run", track_order=True)
+        write_text(group, "manifest", shots.text)
+        captures, stacks, texts = shots.manifest.patterns.captures, group.create_group("shots", track_order=True), []
+        for index, (_, channels, known) in enumerate(shots_of(shots)):
+            for name, values in channels.items():
+                if index == 0:
+                    shape = len(captures), *values.shape
+                    stacks.create_dataset(name, shape, values.dtype, chunks=(1, *values.shape), **PACKED)
+                stacks[name][index] = values
+            texts.append(json.dumps(dict(known)))
+        group.create_dataset("metadata", data=texts)
+        numbers = np.array([(shot.row, shot.column, shot.sign) for shot in captures], np.int32)
+        group.create_dataset("pattern", data=numbers).attrs["columns"] = (
+            "column of P_L from 0, column of P_R from 0, sign"
+        )
+        for name, matrix in zip(("P_L", "P_R"), shots.manifest.patterns.matrices, strict=True):
+            group.create_dataset(name, data=matrix, **PACKED)
+        others = {**shots.manifest.others, "truth": TRUTH}
+        write_frames(group, {name: shots.read(file) for name, file in others.items() if file in shots.names})
+
+    with whole_hdf5(path) as file:
+        file.attrs["mitsim_exchange"] = LAYOUT
+        file.attrs["mitsim_version"] = __version__
+        for held in (run, calibration):
+            if held is not None and held.colours:
+                write_text(file, held.colours.kind, held.text)
+        if "" in run.parts:
+            write_shots(file, run.parts[""])
+        lines = file.create_group(_LINES, track_order=True) if run.colours else None
+        for name in run.names:
+            place = file if lines is None else lines.create_group(name, track_order=True)
+            if name and name in run.parts:
+                write_shots(place, run.parts[name])
+            if name in run.truths:
+                write_frames(place, {"truth": run.truths[name]})
+            if calibration is not None:
+                factors, group = calibration.parts[name], place.create_group("calibration", track_order=True)
+                write_text(group, "manifest", factors.text)
+                write_frames(group, {side: factors.read(name) for side, name in zip(SIDES, FACTORS, strict=True)})
+    return ()
+
+
+@contextmanager
+def load_hdf5(path: Path | str, channel: str | None = None) -> Iterator[Loaded]:
+    """Open the folders in the file ``path``, coloured or not, while the context lasts.
+
+    MitsimError for a file that is missing or damaged, is none of these, or leads to other files; and for a ``channel``,
+    because its frames have one.
+    """
+    path = Path(path)
+    if channel is not None:
+        raise ArgumentError("channel", f"{channel}: {path} has frames of one; leave it out")
+    with checked_hdf5(path, lambda _: 0.0) as file:  # _frame checks what is read at once
+        with hdf5_errors(path):
+            layout = file.attrs.get("mitsim_exchange")
+            if not isinstance(layout, (int, np.integer)) or not 1 <= layout <= LAYOUT:
+                raise MitsimError(
+                    f"{path}: is no HDF5 file of `mitsim export` (mitsim_exchange is {layout}, 1 to {LAYOUT} are read)"
+                )
+            kind = RUN if RUN in file else MOSAIC
+            own = {"": _run_in(file, path)} if _LINES not in file or kind == MOSAIC else {}
+            if _LINES not in file:
+                run, factors = Content(own), _calibration_in(file, path) if "calibration" in file else None
+                calibration = Content({"": factors}) if factors else None
+            else:
+                text, group = _text_in(file, kind, path), hdf5_item(file, _LINES, path, "Group")
+                colours = unpack_colours(text, kind, path, own[""].names if own else ())
+                lines = {name: hdf5_item(group, name, path, "Group") for name in colours.names}
+                truths = {name: line for name, line in lines.items() if "truth" in line and own}
+                run = Content(
+                    own or {name: _run_in(line, path) for name, line in lines.items()},
+                    colours,
+                    text,
+                    {name: _frame_in(line, "truth", path) for name, line in truths.items()},
+                )
+                calibration = None
+                if CALIBRATION in file:
+                    text = _text_in(file, CALIBRATION, path)
+                    colours = unpack_colours(text, CALIBRATION, path)
+                    for name in colours.names:
+                        if "calibration" not in lines.get(name, ()):
+                            raise MitsimError(f"{path}: has no calibration of {name}; export it again")
+                    parts = {name: _calibration_in(lines[name], path) for name in colours.names}
+                    calibration = Content(parts, colours, text)
+        yield run, calibration, ()
+
+
+def _run_in(place: h5py.Group, path: Path) -> Packed[RunManifest]:
+    group = hdf5_item(place, "run", path, "Group")
+    text = _text_in(group, "manifest", path)
+    manifest = unpack(text, RunManifest, path)
+    captures, stacks = manifest.patterns.captures, hdf5_item(group, "shots", path, "Group")
+    channels = {name: hdf5_item(stacks, name, path) for name in stacks}
+    shapes = {values.shape for values in channels.values()}
+    if "DN" not in channels or len(shapes) != 1 or next(iter(shapes))[0] != len(captures):
+        raise MitsimError(
+            f"{path}: /run/shots holds arrays of shapes {sorted(shapes)}; one shape of {len(captures)} x rows x "
+            "columns, DN among them, is needed"
+        )
+    metadata = hdf5_item(group, "metadata", path)
+    index = {shot.file: number for number, shot in enumerate(captures)}
+    others = {file: name for name, file in manifest.others.items()} | ({TRUTH: "truth"} if "truth" in group else {})
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        with hdf5_errors(path):
+            if name in others:
+                return _frame_in(group, others[name], path)
+            number = index[name]
+            frame = {key: as_channel(values[number], f"/run/shots/{key}", path) for key, values in channels.items()}
+            return frame, _metadata_in(metadata, number, path)
+
+    return Packed(manifest, text, (*(shot.file for shot in captures), *others), read, path)
+
+
+def _calibration_in(place: h5py.Group, path: Path) -> Packed[CalibrationManifest]:
+    group = hdf5_item(place, "calibration", path, "Group")
+    text = _text_in(group, "manifest", path)
+
+    def read(name: str) -> tuple[Channels, Metadata]:
+        with hdf5_errors(path):
+            return _frame_in(group, Path(name).stem, path)
+
+    return Packed(unpack(text, CalibrationManifest, path), text, FACTORS, read, path)
+
+
+def _text_in(group: h5py.Group, name: str, path: Path) -> str:
+    text = hdf5_item(group, name, path)
+    if text.dtype != np.uint8 or text.size > MOST_BYTES:
+        raise MitsimError(
+            f"{path}: {text.name} is {text.dtype} of shape {text.shape}; a text of at most {MOST_BYTES} bytes is needed"
+        )
+    return str(text[()].tobytes().decode("utf-8"))
+
+
+def _frame_in(place: h5py.Group, name: str, path: Path) -> tuple[Channels, Metadata]:
+    """Return channels and metadata of the frame ``name``. MitsimError where it takes more memory than is free."""
+    group, channels = hdf5_item(place, name, path, "Group"), {}
+    for key in group:
+        if key != "metadata":
+            array = hdf5_item(group, key, path)
+            Cost(memory_bytes=array.nbytes).check(f"{path}: {array.name}", Limits())
+            channels[key] = as_channel(array[()], array.name, path)
+    return channels, _metadata_in(hdf5_item(group, "metadata", path), 0, path)
+
+
+def _metadata_in(texts: h5py.Dataset, number: int, path: Path) -> dict[str, Value]:
+    """Return the metadata of a frame whose channels were read before."""
+    # What is beyond the end of a file that was cut short after it was opened is read as zeros.
+    if path.stat().st_size < texts.file.id.get_filesize():
+        raise ValueError("it was cut short while it was read")
+    text = texts[number] if texts.ndim == 1 else None
+    if not isinstance(text, bytes):
+        raise MitsimError(f"{path}: {texts.name} is {texts.dtype} of shape {texts.shape}; a text a frame is needed")
+    known = parse_json(text.decode("utf-8"))
+    if not isinstance(known, dict) or not all(isinstance(value, (str, int, float)) for value in known.values()):
+        raise MitsimError(f"{path}: metadata of a frame is no object of texts and numbers; export it again")
+    return known
+
+
+def hdf5_item(parent: h5py.Group, name: str, path: Path, kind: str = "Dataset") -> Any:
+    """Return the item ``name`` of a group of the file ``path``. MitsimError where it is not of that ``kind``, or is an
+    array that no frames fit."""
+    item = parent.get(name)
+    if type(item).__name__ != kind:
+        what = "is missing" if item is None else f"is no {kind.lower()}"
+        raise MitsimError(f"{path}: {parent.name.rstrip('/')}/{name} {what}; export it again")
+    if kind == "Dataset" and item.shape is None:
+        raise MitsimError(f"{path}: {item.name} is empty; export it again")
+    if kind == "Dataset" and not fits_a_frame(item.shape[1:]):
+        raise MitsimError(f"{path}: {item.name} claims {item.shape}; {FRAME_LIMITS} are allowed")
+    return item

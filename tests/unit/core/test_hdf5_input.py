@@ -12,7 +12,8 @@ import pytest
 
 from mitsim.core.arrays import checked_hdf5
 from mitsim.core.errors import MitsimError
-from mitsim.exchange.hdf5 import open_folders, read_matlab
+from mitsim.exchange.matlab import variables_in
+from mitsim.exchange.packed import load_hdf5
 from mitsim.learn.pair_store import PairStore, is_shard
 from mitsim.light.light_file import read_light
 
@@ -62,8 +63,8 @@ HOSTILE: dict[str, tuple[Callable[[h5py.File], object], str]] = {
 }  # fmt: skip
 READERS: dict[str, Callable[[Path], object]] = {
     "light": lambda path: read_light(path, None),  # type: ignore[arg-type]
-    "run": lambda path: open_folders(path).__enter__(),
-    "MATLAB": read_matlab,
+    "run": lambda path: load_hdf5(path).__enter__(),
+    "MATLAB": variables_in,
     "pairs": lambda path: PairStore(path.parent, None)._file(Stub(path.name)).__enter__(),  # type: ignore[arg-type]
 }
 

@@ -13,7 +13,7 @@ from scipy.io import loadmat, savemat
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.exchange import tensors
+from mitsim.exchange import labelled
 from mitsim.exchange.formats import export, import_file
 from mitsim.reconstruct.colour import behind
 from tests.coloured import WEIGHTS, mosaic_folders
@@ -104,7 +104,7 @@ def test_tensors_are_of_all_lines(folders: tuple[Path, Path], tmp_path: Path) ->
     torch = pytest.importorskip("torch")
     export(folders[0], "torch", tmp_path / "run.pt", folders[1])
     held = {name: each.numpy() for name, each in torch.load(tmp_path / "run.pt", weights_only=True).items()}
-    assert np.array_equal(held["y"], tensors.measurements(ms.load_run(folders[0])))
+    assert np.array_equal(held["y"], labelled.measurements(ms.load_run(folders[0])))
     columns, rows = held["P_R"].shape[1], held["y"].shape[1:]
     for index, frame in enumerate(held["y"]):
         lit = np.outer(held["P_L"][:, index // columns], held["P_R"][:, index % columns]) * held["x"]

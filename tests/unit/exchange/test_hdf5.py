@@ -16,7 +16,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import read_frame, write_frame
 from mitsim.exchange import packed
 from mitsim.exchange.formats import export, import_file
-from mitsim.exchange.hdf5 import open_folders
+from mitsim.exchange.packed import load_hdf5
 from tests.exchanged import COLUMNS, ROWS, SCENE, Made, bytes_of, made
 
 
@@ -72,7 +72,7 @@ def test_a_shot_is_read_without_the_others(bench: Made, tmp_path: Path) -> None:
     damaged = bytearray(path.read_bytes())
     damaged[place + size // 2] ^= 0xFF
     path.write_bytes(damaged)
-    with open_folders(path) as (folders, _):
+    with load_hdf5(path) as (folders, *_):
         run = folders.parts[""]
         names = [shot.file for shot in run.manifest.patterns.captures]
         for index in (0, 1, 2, 4, 5):
@@ -209,7 +209,7 @@ def test_a_file_that_is_cut_while_it_is_read_is_refused(bench: Made, tmp_path: P
         frames = file["run/shots/DN"][()]
         del file["run/shots/DN"]
         file["run/shots/DN"] = frames
-    with open_folders(path) as (folders, _):
+    with load_hdf5(path) as (folders, *_):
         run = folders.parts[""]
         names = run.names
         run.read(names[5])
