@@ -562,7 +562,7 @@ SIZES = {
     "cli": (7, 1939),
     "core": (16, 3703),
     "devices": (14, 2504),
-    "exchange": (10, 1875),
+    "exchange": (8, 1787),
     "learn": (10, 1718),
     "light": (12, 1976),
     "metrics": (1, 81),
