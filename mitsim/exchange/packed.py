@@ -240,9 +240,9 @@ def unpack(text: str, model: type[Manifest], place: Path) -> Manifest:
     except ValueError as error:
         raise MitsimError(f"{place}: its manifest is not valid JSON ({error}); export it again") from error
     manifest = checked_manifest(data, model, place)
-    checked: RunManifest | CalibrationManifest = manifest
-    if isinstance(checked, RunManifest):
-        for name in (*(shot.file for shot in checked.patterns.captures), *checked.others.values()):
+    run: Any = manifest
+    if model is RunManifest:
+        for name in (*(shot.file for shot in run.patterns.captures), *run.others.values()):
             if name in (".", "..", MANIFEST, LOCK, TRUTH) or not name.isprintable():
                 raise MitsimError(f"{place}: a frame is called {cut(name)!r}; give it a name of its own")
     return manifest
