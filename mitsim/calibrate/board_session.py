@@ -30,12 +30,7 @@ from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import UNIFORM, BoardShape, Half, SessionRecipe, halves_in_order
 from mitsim.light.cost_model import FIXED, Numbers, forming_seconds, in_waves
 from mitsim.light.light import SampledLight, Sampling, trace_lines
-from mitsim.light.memory import (
-    first_shadow,
-    frame_seconds,
-    frames_at_once,
-    light_bytes,
-)
+from mitsim.light.memory import first_shadow, frame_seconds, frames_at_once, light_bytes
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Forming, Settings
 from mitsim.light.simulation import Simulation

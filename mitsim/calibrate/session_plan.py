@@ -397,10 +397,7 @@ def _noisy(lit: LitSession, sums: StripeSums, draw: int) -> StripeSums:
     # One number a row (or column) of each response was fitted.
     energy, fitted = sums.done * float(own.sum()), 1 - 1 / len(sums.common)
     return replace(
-        sums,
-        vectors=sums.vectors + noise,
-        misfit=sums.misfit + fitted * energy,
-        energy=sums.energy + energy,
+        sums, vectors=sums.vectors + noise, misfit=sums.misfit + fitted * energy, energy=sums.energy + energy
     )
 
 

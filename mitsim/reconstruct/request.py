@@ -99,10 +99,7 @@ class ImageRequest(Options):
         read=_two("bounds", "give the least and the largest number, such as 0:1 or 0:", -math.inf, math.inf),
     )
     iterations: int | None = option(
-        None,
-        "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given",
-        min=1,
-        metavar="N",
+        None, "most steps of nonnegative and tv; 5000, and 300 with --psf, if not given", min=1, metavar="N"
     )
     margin: int = option(
         0, "cells round the window that are solved for too: they take up light from outside it", min=0, metavar="K"

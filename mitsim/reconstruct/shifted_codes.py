@@ -464,9 +464,7 @@ class Pose:
 
 @single_threaded_blas()
 def find_pose(
-    exposures: Sequence[Exposure],
-    orientation: str | None = None,
-    scales: tuple[float, float] | None = None,
+    exposures: Sequence[Exposure], orientation: str | None = None, scales: tuple[float, float] | None = None
 ) -> Pose:
     """Find the pose of scenes by spectra, and then by codes that are fitted to centred frames."""
     exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]

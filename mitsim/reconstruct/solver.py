@@ -42,14 +42,7 @@ from scipy.optimize import minimize_scalar
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.reconstruct.factorisation import (
-    Side,
-    Slab,
-    StripHalves,
-    Strips,
-    factorise,
-    group_pixels,
-)
+from mitsim.reconstruct.factorisation import Side, Slab, StripHalves, Strips, factorise, group_pixels
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 
 
@@ -594,11 +587,7 @@ class Prepared:
 
 
 def prepare(
-    left: npt.ArrayLike,
-    right: npt.ArrayLike,
-    P_L: npt.ArrayLike,
-    P_R: npt.ArrayLike,
-    centre: bool = False,
+    left: npt.ArrayLike, right: npt.ArrayLike, P_L: npt.ArrayLike, P_R: npt.ArrayLike, centre: bool = False
 ) -> Prepared:
     """Factorise the model of a camera and a pattern family.
 

@@ -30,14 +30,7 @@ def exposed(lit: LitSession) -> list[Estimate]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("mode", "n", "repeats"),
-    [
-        ("pair", 7, 1),
-        ("uniform", 8, 1),
-        ("pair", 4, 3),
-    ],
-)
+@pytest.mark.parametrize(("mode", "n", "repeats"), [("pair", 7, 1), ("uniform", 8, 1), ("pair", 4, 3)])
 def test_drawn_noise_is_that_of_exposed_frames_number_by_number(mode: str, n: int, repeats: int) -> None:
     """The mean squared error of a row of a factor, and of a column, by 120 sessions and by 480 draws.
 

@@ -202,10 +202,7 @@ def test_flatcam_leak_where_the_mask_does_not_cover_the_view():
         ({"horizontal": []}, "only 0 horizontal"),
         ({"vertical": [np.ones((3, 3))] * N}, "shape"),
         ({"horizontal": [np.full((M, M + 5), np.nan)] * N}, "not finite"),
-        (
-            {"horizontal": [np.zeros((M, M + 5))] * N, "vertical": [np.zeros((M, M + 5))] * N},
-            "zero everywhere",
-        ),
+        ({"horizontal": [np.zeros((M, M + 5))] * N, "vertical": [np.zeros((M, M + 5))] * N}, "zero everywhere"),
         ({"H": np.ones((N, N))}, "not orthogonal"),
         ({"H": 0.5 * H}, r"\+1 and -1"),
         ({"H": H[:, ::-1]}, "column 0"),

@@ -11,12 +11,7 @@ import pytest
 
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns
-from mitsim.reconstruct.convolution import (
-    MOST_FACTORISED,
-    Classes,
-    conjugate_gradients,
-    solve_iteratively,
-)
+from mitsim.reconstruct.convolution import MOST_FACTORISED, Classes, conjugate_gradients, solve_iteratively
 from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.reconstruct.solution import Verdict
 

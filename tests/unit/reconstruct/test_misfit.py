@@ -196,10 +196,7 @@ def test_misfit_has_no_unit() -> None:
     shots, factors = bench().run("dots:3", picture(), 0), bench().calibrated(0)
     digital = shots.manifest.digital
     longer = digital.model_copy(
-        update={
-            "exposure_s": digital.exposure_s * 1e12,
-            "dark_current_e_per_s": digital.dark_current_e_per_s / 1e12,
-        }
+        update={"exposure_s": digital.exposure_s * 1e12, "dark_current_e_per_s": digital.dark_current_e_per_s / 1e12}
     )
     other = Capture(shots.manifest.model_copy(update={"digital": longer}), memory=shots._memory)
     found, expected = misfit(reconstruct(other, factors)), misfit(reconstruct(shots, factors))
