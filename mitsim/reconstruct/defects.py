@@ -62,10 +62,6 @@ class Defects:
         """Return these defects and ``others``."""
         return Defects(*np.array(sorted({*self.places, *(others.places if others else ())}), dtype=np.intp).T)
 
-    def left_out(self, data: Accumulation) -> LeftOut:
-        """Return the capture of ``data`` whose readings at these pixels are those that all others predict."""
-        return LeftOut(data, self)
-
 
 class LeftOut(DerivedCapture):
     """The capture of ``data`` with other readings at ``defects``: those that all other readings predict."""

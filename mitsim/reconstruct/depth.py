@@ -7,18 +7,17 @@ misfit may have raised are named beside the lowest. Columns of neighbouring dept
 span them, so that frames are read once and kept small.
 
 *A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the baseline
-were lit, which shows where each dot's light arrives. Then each pixel has columns of both factors at its own depth. The
-model is linear in (X, X o d), d a change of 1/z, so that each Gauss-Newton step, with the d of neighbours pooled, is
-one closed-form solve for each frame: its normal matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take
-the depth on its other side where that explains more. Depths whose parallax spans more than a period of the dots are
+were lit, which shows where each dot's light arrives. Then each pixel has columns of both factors at its own depth, and
+the model is linear in (X, X o d), d a change of 1/z. So each Gauss-Newton step, with the d of neighbours pooled, is one
+closed-form solve for each frame, whose normal matrix is (L^T L) o (R^T R). Last, single pixels beside an edge take the
+depth on its other side where that explains more. Depths whose parallax spans more than a period of the dots are
 ambiguous."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,30 +29,20 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture, Measurement
 from mitsim.reconstruct.accumulation import FrameNoise, LitFrames, factor_energy
-from mitsim.reconstruct.factorisation import Group, factorise, group_pixels
+from mitsim.reconstruct.factorisation import factorise, group_pixels
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import (
-    LEAST_PART,
-    STEP,
-    FactorOfDepths,
-    are_dots,
-    move_factors,
-    parallax_of,
-    parallax_period,
-    pixels_of_parallax,
-    unambiguous_parallax,
-)
+from mitsim.reconstruct.focus import LEAST_PART, FactorOfDepths, move_factors, parallax_of, pixels_of_parallax
 from mitsim.reconstruct.misfit import Misfit, weigh
 from mitsim.reconstruct.residuals import CHANCE
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare, project_frames
 
-_STEP = 1.0
-"""Projector pixels of parallax between depths that are tried first."""
+RANGE = 0.25
+"""Searched part of 1/z on either side: 320 to 533 mm for 400."""
+_FEWEST = 32
+"""Least number of steps of one projector pixel of parallax, for devices without a baseline."""
 _RESOLUTION = 0.01
 """Projector pixels of parallax to which valleys are refined: 0.06 mm at 400 mm and a baseline of 60 mm."""
-_FEWEST = 32
-"""Least number of steps, for devices without a baseline."""
 _LEAST_RISE = 2e-5
 """Part of the measurements' energy that a pixel of parallax must add, or depth is undetermined. Uniform light stays
 below."""
@@ -66,7 +55,7 @@ _LAMBDA = 1e-3
 """Lambda over the largest sigma^2 of the image that weighs the noise of factors."""
 
 
-# ---- A depth, its error and its alternatives ----
+# ---- Results ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -109,363 +98,6 @@ class Depth:
             return found
         near, far = self.range_mm
         return f"{found} +- {self.error_mm:.1g}, by the least misfit from {near:.0f} to {far:.0f} mm"
-
-
-# ---- The search for the depth that leaves least ----
-
-
-def chance_difference(difference: float, variance: float, unknowns: int) -> float:
-    """Return the energy by which noise may make the residuals of two models differ.
-
-    Light of energy D (``difference``) that the wrong model does not explain meets noise of variance v: 4 v D. Noise
-    that only one of the models takes up has the variance 4 v^2 times the ``unknowns``, or less.
-    """
-    return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
-
-
-@single_threaded_blas()
-def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
-    """Return the depth whose factors explain most of the measurements.
-
-    ``depth_range`` are the nearest and farthest tried depth [mm], by default a quarter of 1/z either way. Raises
-    MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
-    """
-    return _Search(shots, factors, depth_range).find()
-
-
-class _Search:
-    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
-        self._ends, self._period = shifts_searched(factors, depth_range), np.inf
-        beyond = 0.0
-        if depth_range is None:
-            # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
-            self._period = parallax_period(shots.patterns, parallax_of(factors))
-            beyond = min(self._period, self._ends[1])
-        self._tried = self._ends[0] - beyond, self._ends[1] + beyond
-        self._shots, self._factors = shots, factors
-        rows, columns = shots.patterns
-        self._groups = group_pixels(rows), group_pixels(columns)
-        self._all = CommonBasis(shots, factors, self._tried, self._groups)
-        self._inverse, self._factor_noise = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
-        self.pixel = 1 / max(self._all.reach(axis) for axis in (0, 1))
-        self._unknowns = self._all.shape[0] * self._all.shape[1]
-
-    def find(self) -> Depth:
-        margin = 2 * _RESOLUTION * self.pixel
-        valleys = sorted(self._valleys(*self._ends))
-        valleys = sorted([*valleys, *self._beyond(valleys[0][1], margin)])
-        least, shift = valleys[0]
-        error, rise = self._certainty(shift, least)
-        mm, range_mm = self._mm(shift), (self._mm(self._ends[1]), self._mm(self._ends[0]))
-        at_end = min(abs(end - shift) for end in (*self._ends, *self._tried)) < margin
-        local = float(np.hypot(error, _RESOLUTION * self.pixel)) * mm**2
-        misfit = self._misfit(shift, least)
-        if misfit and (self._ties(valleys, misfit) or rise < self._indifferent(rise, least, misfit)):
-            misfit *= 1 - self._print_part(shift)
-        ties = self._ties(valleys, misfit)
-        others = tuple(
-            Alternative(self._mm(other), float(np.sqrt((left - least) / self._all.energy))) for left, other in ties
-        )
-        doubt = ""
-        if at_end or not self._ends[0] < shift < self._ends[1]:
-            doubt = (
-                f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
-                "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
-                "NEAR:FAR or depth_range, or calibrate nearer to it."
-            )
-        elif not (
-            error < self.pixel and rise > max(self._indifferent(rise, least, misfit), _LEAST_RISE * self._all.energy)
-        ):
-            doubt = "These patterns hardly tell depth: use shifting dots."
-        elif others:
-            named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
-            doubt = (
-                f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
-                f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
-                "range of depths."
-            )
-        return Depth(
-            mm,
-            float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0))),
-            doubt,
-            range_mm,
-            others,
-            at_end,
-        )
-
-    def left_over(self, shift: float) -> float:
-        left, right = (
-            factorise(self._all.side(axis, shift), patterns, groups)
-            for axis, (patterns, groups) in enumerate(zip(self._all.patterns, self._groups, strict=True))
-        )
-        measured = np.outer(left.singular, right.singular) > 0
-        return self._all.energy - float(np.square(project_frames(left, right, self._all.stack)[measured]).sum())
-
-    # ---- Valleys of the energy over 1/z ----
-
-    def _valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
-        steps = max(int(np.ceil((last - first) / (_STEP * self.pixel))), _FEWEST)
-        shifts = np.linspace(first, last, steps + 1)
-        scores = np.array([self.left_over(shift) for shift in shifts])
-        beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
-        lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
-        least = below = np.inf
-        for index in lows:
-            if scores[index] - _SIMILAR * below > least:
-                break
-            left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
-            if left < least:
-                half = shifts[1] - shifts[0]
-                around = [self.left_over(float(np.clip(shift + part * half, first, last))) for part in (-0.5, 0.5)]
-                least, below = left, max(around) - left
-            yield left, shift
-
-    def _beyond(self, shift: float, margin: float) -> Iterator[tuple[float, float]]:
-        """Yield valleys beyond the range, whole periods of the dots from the best ``shift`` or beside it at an end."""
-        for end, tried, step in zip(self._ends, self._tried, (-self._period, self._period), strict=True):
-            if tried == end:
-                continue
-            if abs(shift - end) < margin:
-                yield from self._valleys(*sorted((end, tried)))
-            elif np.isfinite(self._period):
-                away = shift + step
-                while self._ends[0] <= away <= self._ends[1]:
-                    away += step
-                if abs(away) < abs(tried):
-                    yield self._bottom(away - _STEP * self.pixel, away + _STEP * self.pixel)
-
-    def _bottom(self, first: float, last: float) -> tuple[float, float]:
-        least = minimize_scalar(
-            self.left_over, bounds=(first, last), method="bounded", options={"xatol": _RESOLUTION * self.pixel}
-        )
-        return float(least.fun), float(least.x)
-
-    # ---- Standard error, and valleys that may be as low ----
-
-    def _certainty(self, shift: float, least: float) -> tuple[float, float]:
-        before, after = (self.left_over(shift + part * self.pixel) for part in (-0.25, 0.25))
-        rise = min(self.left_over(shift + self.pixel), self.left_over(shift - self.pixel)) - least
-        curvature = (before - 2 * least + after) / (self.pixel / 4) ** 2
-        error = float(np.sqrt(2 * self._variance(least) / curvature)) if curvature > 0 else float("inf")
-        return error, float(rise)
-
-    def _variance(self, least: float) -> float:
-        return float(least / max(self._all.data - self._unknowns, 1))
-
-    def _indifferent(self, difference: float, least: float, misfit: float) -> float:
-        """Return the energy by which two depths may differ of which either is the right one."""
-        return max(chance_difference(difference, self._variance(least), self._unknowns), _OPPOSED * misfit)
-
-    def _ties(self, valleys: list[tuple[float, float]], misfit: float) -> list[tuple[float, float]]:
-        least = valleys[0][0]
-        return [each for each in valleys[1:] if each[0] - least < self._indifferent(each[0] - least, least, misfit)]
-
-    # ---- Print, and what stays unexplained ----
-
-    def _print_part(self, shift: float) -> float:
-        there = move_factors(self._factors, self._mm(shift))
-        lit = LitFrames(there.factors.sides, self._all.patterns)
-        for each in there.of(self._shots).pattern_measurements():
-            frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
-            lit.collect(each, frame, float(self._all.noise.variance[each.row, each.column]))
-        return float(np.nan_to_num(lit.print_part()))
-
-    def _misfit(self, shift: float, least: float) -> float:
-        noise, stated = self._all.noise, self._factor_noise
-        if not (noise.stated and stated):
-            return 0.0
-        prepared = prepare(self._all.side(0, shift), self._all.side(1, shift), *self._all.patterns)
-        sums = prepared.accumulator()
-        for each in self._all.frames:
-            sums.add(each.frame, each.row, each.column)
-        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
-        expected = float(noise.variance.mean()) * (self._all.data - self._unknowns) + self._all.part * noise.rendering
-        of_factors = self._all.smoothing(shift) * factor_energy(prepared, self._all.patterns, stated, image)
-        return float(max(least - expected - of_factors, 0.0))
-
-    def _mm(self, shift: float) -> float:
-        return 1 / (self._inverse + shift)
-
-
-# ---- A basis that factors of all depths share ----
-
-RANGE = 0.25
-"""Searched part of 1/z on either side: 320 to 533 mm for 400."""
-_LEFT_OUT = 1e-6
-"""Part of the factors' energy that the common basis may omit."""
-_STILL, _BETWEEN = 2.0, 4
-"""Projector pixels of parallax up to which dots have a basis of their own along an axis, and depths a pixel of the
-basis."""
-
-
-class CommonBasis:
-    """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
-
-    Parameters
-    ----------
-    shifts
-        Least and largest change of 1/z [1/mm].
-    groups
-        Groups of scene pixels that patterns light apart (:func:`mitsim.reconstruct.factorisation.group_pixels`), each
-        of which may have a basis of its own. None: all frames of an axis share one.
-
-    Attributes
-    ----------
-    noise
-        Noise of the measurements on the whole sensor.
-    frames, stack
-        Measurements on the bases, one by one and in one array (K, r, K', r').
-    energy, outside
-        Squared norm of the measurements where all depths are known, and the part that no depth explains.
-    data, part
-        Number of these measurements, and their part of the sensor.
-    """
-
-    def __init__(
-        self,
-        shots: Capture,
-        factors: Factors,
-        shifts: tuple[float, float],
-        groups: tuple[tuple[Group, ...], tuple[Group, ...]] | None = None,
-    ) -> None:
-        self.parallax, self.patterns = parallax_of(factors), shots.patterns
-        self._sides = tuple(
-            FactorOfDepths(side, self.parallax, axis) for axis, side in enumerate((factors.left, factors.right))
-        )
-        self._centre = factors.manifest.centre
-        self._parts, self._bases = [], list[_Basis]()
-        for axis, side in enumerate(self._sides):
-            pixels = (shifts[1] - shifts[0]) * side.reach
-            alone = _alone(groups[axis], self.patterns[axis]) if groups and pixels <= _STILL else None
-            tried = np.linspace(*shifts, max(int(np.ceil(pixels * (_BETWEEN if alone else 1))) + 1, 2))
-            found = [side.at(shift) for shift in tried]
-            part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
-            if part.stop - part.start < LEAST_PART * len(side.factor):
-                near, far = (1 / (1 / self.parallax.depth_mm + shift) for shift in reversed(shifts))
-                raise ArgumentError(
-                    "depth_range",
-                    f"{near:.4g} to {far:.4g} mm: {max(part.stop - part.start, 0)} of {len(side.factor)} sensor rows "
-                    f"or columns know the shadow at all of these depths; give a range nearer to the calibrated "
-                    f"{self.parallax.depth_mm:g} mm",
-                )
-            self._parts.append(part)
-            self._bases.append(_Basis([self._own(columns[part]) for columns, _ in found], alone))
-        self.energy, kept = 0.0, list[Measurement]()
-        left, right = self._bases
-        self.stack = np.zeros((self.patterns[0].shape[1], left.size, self.patterns[1].shape[1], right.size))
-        self.noise = FrameNoise(shots.manifest)
-        for each in shots.pattern_measurements((len(factors.left), len(factors.right))):
-            frame = each.frame[self._parts[0], self._parts[1]]
-            frame = centre_frame(frame) if self._centre else frame
-            self.energy += float(np.square(frame).sum())
-            self.noise.add(each)
-            small = self.stack[each.row, :, each.column]
-            small[:] = left.of(each.row).T @ frame @ right.of(each.column)
-            kept.append(Measurement(small, each.row, each.column, small, each.shots, 0))
-        self.frames = tuple(kept)
-        self.outside = self.energy - sum(float(np.square(each.frame).sum()) for each in kept)
-        sizes = [part.stop - part.start for part in self._parts]
-        self.data = len(kept) * sizes[0] * sizes[1]
-        self.part = sizes[0] * sizes[1] / (len(factors.left) * len(factors.right))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Scene pixels along both axes."""
-        return self._sides[0].factor.shape[1], self._sides[1].factor.shape[1]
-
-    def side(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        """Return the factor (r, n) of an ``axis`` on its basis, with 1/z changed by ``shift`` [1/mm]."""
-        return self._bases[axis].project(self._own(self._columns_at(axis, shift)))
-
-    def widen(self, axis: int, pixels: int) -> FloatArray:
-        """Return the columns of an ``axis`` with ``pixels`` more a side, of the outermost pixels at other depths."""
-        edges = self.edges(axis)
-        before, beyond = (self._columns_at(axis, offset / edges) for offset in (-pixels, pixels))
-        count = before.shape[1]
-        columns = np.hstack([before[:, :pixels], self._columns_at(axis, 0.0), beyond[:, count - pixels :]])
-        return self._bases[axis].project(self._own(columns))
-
-    def edges(self, axis: int) -> FloatArray:
-        """Return the projector pixels (n,) along an ``axis`` that a change of 1/z by 1/mm moves each pixel's light."""
-        return self._sides[axis].edges
-
-    def reach(self, axis: int) -> float:
-        """Return the largest parallax along an ``axis`` by a change of 1/z by 1/mm [projector pixels]."""
-        return self._sides[axis].reach
-
-    def smoothing(self, shift: float) -> float:
-        """Return the variance of noise in the factors at 1/z changed by ``shift``, over that of the calibrated ones."""
-        return float(np.mean([side.noise(shift) ** 2 for side in self._sides]))
-
-    def _columns_at(self, axis: int, shift: float | FloatArray) -> FloatArray:
-        return self._sides[axis].at(shift)[0][self._parts[axis]]
-
-    def _own(self, columns: FloatArray) -> FloatArray:
-        return centre_columns(columns) if self._centre else columns
-
-
-# ---- The range of depths, and vectors of the basis ----
-
-
-def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the least and largest change of 1/z [1/mm] of the searched depths."""
-    parallax = parallax_of(factors)
-    if depth_range is None:
-        return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
-    near, far = depth_range
-    if near <= parallax.mask_distance_mm:
-        raise ArgumentError(
-            "depth_range", f"{near:g} to {far:g} mm: begin above {parallax.mask_distance_mm:g} mm, where the mask is"
-        )
-    return 1 / far - 1 / parallax.depth_mm, 1 / near - 1 / parallax.depth_mm
-
-
-def _alone(groups: tuple[Group, ...], patterns: FloatArray) -> list[tuple[npt.NDArray[np.intp], list[int]]] | None:
-    lit = np.array([[group.lights(index) for index in range(patterns.shape[1])] for group in groups])
-    if len(groups) == 1 or (lit.sum(axis=0) > 1).any():
-        return None
-    return [(group.pixels, [int(k) for k in np.flatnonzero(own)]) for group, own in zip(groups, lit, strict=True)]
-
-
-class _Basis:
-    def __init__(self, factors: list[FloatArray], alone: list[tuple[npt.NDArray[np.intp], list[int]]] | None) -> None:
-        self._alone = alone or [(np.arange(factors[0].shape[1]), [])]
-        found = [np.linalg.eigh(sum(own @ own.T for own in (f[:, px] for f in factors))) for px, _ in self._alone]
-        lost = [np.cumsum(np.maximum(energies, 0.0)) for energies, _ in found]
-        self.size = max(int((each > _LEFT_OUT * each[-1]).sum()) for each in lost)
-        self._vectors = [vectors[:, -self.size :] for _, vectors in found]
-        self._by_pattern = {
-            index: vectors
-            for (_, indices), vectors in zip(self._alone, self._vectors, strict=True)
-            for index in indices
-        }
-
-    def of(self, index: int) -> FloatArray:
-        return self._by_pattern.get(index, self._vectors[0])
-
-    def project(self, columns: FloatArray) -> FloatArray:
-        if len(self._vectors) == 1:
-            return np.asarray(self._vectors[0].T @ columns)
-        seen = np.zeros((self.size, columns.shape[1]))
-        for (pixels, _), vectors in zip(self._alone, self._vectors, strict=True):
-            seen[:, pixels] = vectors.T @ columns[:, pixels]
-        return seen
-
-
-_STEPS, _STEP_POOLED = 4, 3.0
-"""Largest number of Gauss-Newton steps, and the standard deviation [pixels] over which changes of depth are pooled."""
-_ROUNDS, _BESIDE = 4, 5
-"""Largest number of rounds in which single pixels take another depth of the 5 x 5 around them."""
-_SURE = 25.0
-"""Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
-_RIVAL, _ASTRAY = 2.0, 0.05
-"""Starts that leave less than twice as much as the best one may place at most this part of the reliable pixels half a
-period beside it.
-"""
-_RELIABLE = 0.5
-"""Least confidence of a reliable depth: twice as much light arrives there as anywhere else."""
-SPARE = 2.0
-"""Projector pixels of the period that reliable depths must leave free, as many as a dot's image is wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,7 +150,7 @@ class DepthMap:
         return Solution(self.image, self.lam, residual, status)
 
     @property
-    def reliable(self) -> np.ndarray:
+    def reliable(self) -> npt.NDArray[np.bool_]:
         """Whether each depth (n, n') is reliable."""
         return np.asarray(self.confidence >= _RELIABLE)
 
@@ -546,6 +178,307 @@ class DepthMap:
         return {"least_mm": low, "median_mm": middle, "most_mm": high, "told_part": float(self.reliable.mean())}
 
 
+# ---- A basis that factors of all depths share ------------------------------------------------------------------------
+
+_LEFT_OUT = 1e-6
+"""Part of the factors' energy that the common basis may omit."""
+
+
+class CommonBasis:
+    """Frames of a capture, and factors of any depth within a range, on a basis that depths share.
+
+    Attributes
+    ----------
+    sides
+        Both factors as they move with depth.
+    noise
+        Noise of the measurements on the whole sensor.
+    frames, stack
+        Measurements on the bases, one by one and in one array (K, r, K', r').
+    energy, outside
+        Squared norm of the measurements where all depths are known, and the part that no depth explains.
+    data, part
+        Number of these measurements, and their part of the sensor.
+    """
+
+    def __init__(self, shots: Capture, factors: Factors, shifts: tuple[float, float]) -> None:
+        """Read all ``shots``; ``shifts`` are the least and largest change of 1/z [1/mm]."""
+        parallax, self.patterns, self._centre = parallax_of(factors), shots.patterns, factors.manifest.centre
+        sensor = len(factors.left), len(factors.right)
+        self.sides = [FactorOfDepths(side, parallax, axis) for axis, side in enumerate((factors.left, factors.right))]
+        self._parts, self._bases = list[slice](), list[FloatArray]()
+        for side, size in zip(self.sides, sensor, strict=True):
+            tried = np.linspace(*shifts, max(int(np.ceil((shifts[1] - shifts[0]) * side.reach)) + 1, 2))
+            found = [side.at(shift) for shift in tried]
+            part = slice(max(each.start for _, each in found), min(each.stop for _, each in found))
+            if part.stop - part.start < LEAST_PART * size:
+                near, far = (1 / (1 / parallax.depth_mm + shift) for shift in reversed(shifts))
+                raise ArgumentError(
+                    "depth_range",
+                    f"{near:.4g} to {far:.4g} mm: {max(part.stop - part.start, 0)} of {size} sensor rows or columns "
+                    "know the shadow at all of these depths; give a range nearer to the calibrated "
+                    f"{parallax.depth_mm:g} mm",
+                )
+            own = [self._centred(columns[part]) for columns, _ in found]
+            energies, vectors = np.linalg.eigh(sum(each @ each.T for each in own))
+            lost = np.cumsum(np.maximum(energies, 0.0))
+            self._parts.append(part)
+            self._bases.append(vectors[:, -int((lost > _LEFT_OUT * lost[-1]).sum()) :])
+        (rows, columns), (left, right) = self._parts, self._bases
+        counts = [patterns.shape[1] for patterns in self.patterns]
+        self.stack = np.zeros((counts[0], left.shape[1], counts[1], right.shape[1]))
+        self.energy, self.noise, kept = 0.0, FrameNoise(shots.manifest), list[Measurement]()
+        for each in shots.pattern_measurements(sensor):
+            frame = each.frame[rows, columns]
+            frame = centre_frame(frame) if self._centre else frame
+            self.energy += float(np.square(frame).sum())
+            self.noise.add(each)
+            small = self.stack[each.row, :, each.column]
+            small[:] = left.T @ frame @ right
+            kept.append(Measurement(small, each.row, each.column, small, each.shots, 0))
+        self.frames = tuple(kept)
+        self.outside = self.energy - sum(float(np.square(each.frame).sum()) for each in kept)
+        self.data = len(kept) * len(left) * len(right)
+        self.part = len(left) * len(right) / (sensor[0] * sensor[1])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Scene pixels along both axes."""
+        return len(self.patterns[0]), len(self.patterns[1])
+
+    def side(self, axis: int, shift: float | FloatArray, margin: int = 0) -> FloatArray:
+        """Return the factor (r, n) of an ``axis`` on its basis, with 1/z changed by ``shift`` [1/mm].
+
+        A ``margin`` adds as many columns a side, of the outermost pixels at other depths.
+        """
+        columns = self._columns(axis, shift)
+        if margin:
+            before, beyond = (self._columns(axis, away / self.sides[axis].edges) for away in (-margin, margin))
+            columns = np.hstack([before[:, :margin], columns, beyond[:, columns.shape[1] - margin :]])
+        return np.asarray(self._bases[axis].T @ self._centred(columns))
+
+    def smoothing(self, shift: float) -> float:
+        """Return the variance of noise in the factors at 1/z changed by ``shift``, over that of the calibrated ones."""
+        return float(np.mean([side.noise(shift) ** 2 for side in self.sides]))
+
+    def _columns(self, axis: int, shift: float | FloatArray) -> FloatArray:
+        return self.sides[axis].at(shift)[0][self._parts[axis]]
+
+    def _centred(self, columns: FloatArray) -> FloatArray:
+        return centre_columns(columns) if self._centre else columns
+
+
+# ---- Parallax, dots and chance ---------------------------------------------------------------------------------------
+
+_STEP = 0.5
+"""Projector pixels of parallax between tried displacements; a dot's image is about two wide."""
+
+
+def chance_difference(difference: float, variance: float, unknowns: int) -> float:
+    """Return the energy by which noise may make the residuals of two models differ.
+
+    Light of energy D (``difference``) that the wrong model does not explain meets noise of variance v: 4 v D. Noise
+    that only one of the models takes up has the variance 4 v^2 times the ``unknowns``, or less.
+    """
+    return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
+
+
+def _shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the least and largest change of 1/z [1/mm] of the searched depths."""
+    parallax = parallax_of(factors)
+    if depth_range is None:
+        return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
+    near, far = depth_range
+    if near <= parallax.mask_distance_mm:
+        raise ArgumentError(
+            "depth_range", f"{near:g} to {far:g} mm: begin above {parallax.mask_distance_mm:g} mm, where the mask is"
+        )
+    return 1 / far - 1 / parallax.depth_mm, 1 / near - 1 / parallax.depth_mm
+
+
+def _moves(factors: Factors) -> FloatArray:
+    """Return the projector pixels (2,) that a change of 1/z by 1/mm moves light along rows and along columns."""
+    counts = factors.left.shape[1], factors.right.shape[1]
+    ends = [pixels_of_parallax(parallax_of(factors), axis, count)[:2] for axis, count in enumerate(counts)]
+    return np.array([max(map(abs, each)) for each in ends])
+
+
+def _are_dots(patterns: FloatArray) -> bool:
+    values = np.sort(patterns, axis=1)
+    return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
+
+
+def _period(moves: FloatArray, patterns: Sequence[FloatArray]) -> float:
+    """Return the change of 1/z [1/mm] that moves the light of dots onto another dot of the same frame.
+
+    ``moves`` are the projector pixels along both axes for a change by 1/mm.
+    """
+    periods, pixel = [lit.shape[1] for lit in patterns], 1 / moves.max()
+    for parallax in np.arange(1.0, np.prod(periods) + 1, _STEP / 4):
+        turns = moves * pixel * parallax / periods
+        if np.round(turns).any() and (np.abs(turns - np.round(turns)) * periods < _STEP / 2).all():
+            return float(np.ceil(parallax) * pixel)
+    return np.inf
+
+
+# ---- The search for the depth that leaves least ----------------------------------------------------------------------
+
+
+@single_threaded_blas()
+def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float] | None = None) -> Depth:
+    """Return the depth whose factors explain most of the measurements.
+
+    ``depth_range`` are the nearest and farthest tried depth [mm], by default a quarter of 1/z either way. Raises
+    MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
+    """
+    search = _Search(shots, factors, depth_range)
+    basis, ends, pixel, inverse = search.basis, search.ends, search.pixel, 1 / parallax_of(factors).depth_mm
+    valleys = sorted(search.valleys(*ends))
+    valleys = sorted([*valleys, *search.beyond(valleys[0][1])])
+    (least, shift), unknowns = valleys[0], basis.shape[0] * basis.shape[1]
+    mm, range_mm = 1 / (inverse + shift), (1 / (inverse + ends[1]), 1 / (inverse + ends[0]))
+    # The standard error follows from the curvature of the valley.
+    near, far, before, after = (search.left_over(shift + part * pixel) for part in (1, -1, -0.25, 0.25))
+    curvature, variance = (before - 2 * least + after) / (pixel / 4) ** 2, least / max(basis.data - unknowns, 1)
+    error = float(np.sqrt(2 * variance / curvature)) if curvature > 0 else float("inf")
+    rise = min(near, far) - least
+
+    def indifferent(difference: float) -> float:
+        """Return the energy by which two depths may differ of which either is the right one."""
+        return max(chance_difference(difference, variance, unknowns), _OPPOSED * misfit)
+
+    def ties() -> list[tuple[float, float]]:
+        return [each for each in valleys[1:] if each[0] - least < indifferent(each[0] - least)]
+
+    misfit = search.misfit(shift, least)
+    if misfit and (ties() or rise < indifferent(rise)):
+        # Print finer than a pixel is no sign of another depth.
+        there = move_factors(factors, mm)
+        lit = LitFrames(there.factors.sides, basis.patterns)
+        for each in there.of(shots).pattern_measurements():
+            frame = centre_frame(each.frame) if there.factors.manifest.centre else each.frame
+            lit.collect(each, frame, float(basis.noise.variance[each.row, each.column]))
+        misfit *= 1 - float(np.nan_to_num(lit.print_part()))
+    others = [
+        Alternative(1 / (inverse + other), float(np.sqrt((left - least) / basis.energy))) for left, other in ties()
+    ]
+    at_end, doubt = min(abs(end - shift) for end in (*ends, *search.tried)) < search.margin, ""
+    if at_end or not ends[0] < shift < ends[1]:
+        doubt = (
+            f"End of range: {mm:.1f} mm explains most, and depths from {range_mm[0]:.0f} to {range_mm[1]:.0f} mm "
+            "were tried, so the scene may lie beyond; give a range of depths that holds it, with --depth-range "
+            "NEAR:FAR or depth_range, or calibrate nearer to it."
+        )
+    elif not (error < pixel and rise > max(indifferent(rise), _LEAST_RISE * basis.energy)):
+        doubt = "These patterns hardly tell depth: use shifting dots."
+    elif others:
+        named = " and ".join(f"{other.mm:.1f} mm (by {other.difference:.1e} of them less, rms)" for other in others)
+        doubt = (
+            f"Depth may be another by whole periods of the dots: {mm:.1f} mm explains the measurements no better "
+            f"than {named}, within chance and what no depth explains; use dots of a longer period, or give the "
+            "range of depths."
+        )
+    local = float(np.hypot(error, _RESOLUTION * pixel)) * mm**2
+    error_mm = float(np.hypot(local, max((abs(other.mm - mm) for other in others), default=0.0)))
+    return Depth(mm, error_mm, doubt, range_mm, tuple(others), at_end)
+
+
+class _Search:
+    """Energy that factors of one depth leave, by the change of 1/z."""
+
+    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
+        self.ends, self._period, beyond = _shifts_searched(factors, depth_range), np.inf, 0.0
+        if depth_range is None:
+            # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
+            moves = _moves(factors)
+            if moves.any() and all(map(_are_dots, shots.patterns)):
+                self._period = _period(moves, shots.patterns)
+            beyond = min(self._period, self.ends[1])
+        self.tried = self.ends[0] - beyond, self.ends[1] + beyond
+        self.basis, self._stated = CommonBasis(shots, factors, self.tried), factors.manifest.noise
+        self._groups = [group_pixels(patterns) for patterns in shots.patterns]
+        self.pixel = 1 / max(side.reach for side in self.basis.sides)
+        self.margin = 2 * _RESOLUTION * self.pixel
+
+    def left_over(self, shift: float) -> float:
+        left, right = (
+            factorise(self.basis.side(axis, shift), patterns, groups)
+            for axis, (patterns, groups) in enumerate(zip(self.basis.patterns, self._groups, strict=True))
+        )
+        measured = np.outer(left.singular, right.singular) > 0
+        return self.basis.energy - float(np.square(project_frames(left, right, self.basis.stack)[measured]).sum())
+
+    def valleys(self, first: float, last: float) -> Iterator[tuple[float, float]]:
+        """Yield energy and place of the bottom of each valley that may be the lowest."""
+        steps = max(int(np.ceil((last - first) / self.pixel)), _FEWEST)
+        shifts = np.linspace(first, last, steps + 1)
+        scores = np.array([self.left_over(shift) for shift in shifts])
+        beside = np.minimum(np.append(scores[1:], np.inf), np.append(np.inf, scores[:-1]))
+        lows = sorted(map(int, np.flatnonzero(scores <= beside)), key=lambda index: float(scores[index]))
+        least = below = np.inf
+        for index in lows:
+            if scores[index] - _SIMILAR * below > least:
+                break
+            left, shift = self._bottom(shifts[max(index - 1, 0)], shifts[min(index + 1, steps)])
+            if left < least:
+                half = shifts[1] - shifts[0]
+                around = [self.left_over(float(np.clip(shift + part * half, first, last))) for part in (-0.5, 0.5)]
+                least, below = left, max(around) - left
+            yield left, shift
+
+    def beyond(self, shift: float) -> Iterator[tuple[float, float]]:
+        """Yield valleys beyond the range, whole periods of the dots from the best ``shift`` or beside it at an end."""
+        for end, tried, step in zip(self.ends, self.tried, (-self._period, self._period), strict=True):
+            if tried == end:
+                continue
+            if abs(shift - end) < self.margin:
+                yield from self.valleys(*sorted((end, tried)))
+            elif np.isfinite(self._period):
+                away = shift + step
+                while self.ends[0] <= away <= self.ends[1]:
+                    away += step
+                if abs(away) < abs(tried):
+                    yield self._bottom(away - self.pixel, away + self.pixel)
+
+    def misfit(self, shift: float, least: float) -> float:
+        """Return the energy beyond noise, rendering and errors of the factors; 0 where these are not stated."""
+        basis, noise = self.basis, self.basis.noise
+        if not (noise.stated and self._stated):
+            return 0.0
+        prepared = prepare(basis.side(0, shift), basis.side(1, shift), *basis.patterns)
+        sums = prepared.accumulator()
+        for each in basis.frames:
+            sums.add(each.frame, each.row, each.column)
+        image = prepared.solve(sums, _LAMBDA * prepared.problem(sums).scale).image
+        expected = float(noise.variance.mean()) * (basis.data - image.size) + basis.part * noise.rendering
+        of_factors = basis.smoothing(shift) * factor_energy(prepared, basis.patterns, self._stated, image)
+        return float(max(least - expected - of_factors, 0.0))
+
+    def _bottom(self, first: float, last: float) -> tuple[float, float]:
+        options = {"xatol": _RESOLUTION * self.pixel}
+        least = minimize_scalar(self.left_over, bounds=(first, last), method="bounded", options=options)
+        return float(least.fun), float(least.x)
+
+
+# ---- The search for a depth of each projector pixel ------------------------------------------------------------------
+
+_STEPS, _STEP_POOLED = 4, 3.0
+"""Largest number of Gauss-Newton steps, and the standard deviation [pixels] over which changes of depth are pooled."""
+_ROUNDS, _BESIDE = 4, 5
+"""Largest number of rounds in which single pixels take another depth of the 5 x 5 around them."""
+_SURE = 25.0
+"""Variances of a datum that a pixel must explain more to take another depth: 5 standard deviations."""
+_RIVAL, _ASTRAY = 2.0, 0.05
+"""Starts that leave less than twice as much as the best one may place at most this part of the reliable pixels half a
+period beside it."""
+_RELIABLE = 0.5
+"""Least confidence of a reliable depth: twice as much light arrives there as anywhere else."""
+SPARE = 2.0
+"""Projector pixels of the period that reliable depths must leave free, as many as a dot's image is wide."""
+_MEDIAN = 5
+"""Width of the median of places [projector pixels]."""
+
+
 @single_threaded_blas()
 def depth_map(
     shots: Capture,
@@ -558,117 +491,107 @@ def depth_map(
     ``depth_range`` are the nearest and farthest searched depth [mm], by default a quarter of 1/z either way. Raises
     MitsimError for other patterns, and without parallax.
     """
-    return _MapSearch(shots, factors, depth_range).find(lam)
+    # Dots of any period determine the depth of a flat scene, however far from the calibrated one.
+    ends, inverse = _shifts_searched(factors, depth_range), 1 / parallax_of(factors).depth_mm
+    range_mm, centre = (1 / (inverse + ends[1]), 1 / (inverse + ends[0])), (ends[0] + ends[1]) / 2
+    plane = best_depth(shots, factors, range_mm)
+    # Any of several depths will do for a start, but the end of a range is the depth of nothing.
+    start = centre if plane.at_end else 1 / plane.mm - inverse
+    arrivals = Arrivals(shots, factors, ends, max(abs(start), abs(centre)))
+    basis, width, pixel = arrivals.basis, arrivals.width, arrivals.pixel
+    pixels = PixelDepths(basis, arrivals.reach, _STEP * pixel)
 
+    def left_over(look: float, offset: float) -> float:
+        return pixels.solve(arrivals.most(look, offset)[0]).left_over
 
-class _MapSearch:
-    def __init__(self, shots: Capture, factors: Factors, depth_range: tuple[float, float] | None) -> None:
-        # Of a flat scene far from the calibrated depth dots of any period tell the rest.
-        self._ends = shifts_searched(factors, depth_range)
-        self._inverse = 1 / parallax_of(factors).depth_mm
-        self._range_mm = 1 / (self._inverse + self._ends[1]), 1 / (self._inverse + self._ends[0])
-        self._plane = best_depth(shots, factors, self._range_mm)
-        self._middle = (self._ends[0] + self._ends[1]) / 2
-        # A start, so in doubt any of several depths will do; but an end of the range is the depth of nothing.
-        self._start = self._middle if self._plane.at_end else 1 / self._plane.mm - self._inverse
-        self._arrivals = Arrivals(shots, factors, self._ends, max(abs(self._start), abs(self._middle)))
-        self._all, self.width, self.pixel = self._arrivals.depths, self._arrivals.width, self._arrivals.pixel
-        self._pixels = PixelDepths(self._all, self._arrivals.reach, STEP * self.pixel)
-
-    def find(self, lam: float | Literal["auto"]) -> DepthMap:
-        middle = self._middle / self.pixel
-        tried = {(look, middle): self._left_over(self._arrivals.most(look, middle)[0]) for look in LAMBDAS}
-        if self._arrivals.limited:
-            look = min(tried, key=lambda start: tried[start])[0]
-            plane = self._start / self.pixel
-            offsets = {start + offset for start in (middle, plane) for offset in (0.0, *OFFSETS)} - {middle}
-            tried |= {(look, offset): self._left_over(self._arrivals.most(look, offset)[0]) for offset in offsets}
-        start = min(tried, key=lambda start: tried[start])
-        rivals = [other for other, left_over in tried.items() if left_over < _RIVAL * tried[start]]
-        shift, confidence = self._arrivals.most(*start)
-        shift = self._sharpen(self._refine(shift, start[1] * self.pixel, tried[start]))
-        doubt = self._doubt(shift, confidence, rivals)
-        if doubt:
-            shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
-        solved = self._pixels.solve(shift, None if lam == "auto" else lam)
-        solved = self._pixels.final(shift, solved) if lam == "auto" else solved
-        return DepthMap(
-            solved.image,
-            1 / (self._inverse + shift),
-            confidence,
-            solved.lam,
-            solved.left_over,
-            *(self._all.energy, self._all.data, self._all.part),
-            doubt,
-            self._range_mm,
-            self._all.smoothing(float(np.median(shift))),
-        )
-
-    def _doubt(self, shift: FloatArray, confidence: FloatArray, rivals: Sequence[tuple[float, float]]) -> str:
-        reliable = confidence >= _RELIABLE
-        found = self._pixels.solve(shift)
-        variance, unknowns = self._pixels.variance(found), 2 * shift.size
-        less = found.left_over - self._left_over(np.zeros(shift.shape))
-        # Of a sheet at the calibrated depth either may leave more.
-        if not reliable.any() or less > chance_difference(less, variance, unknowns):
-            return "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
+    middle = centre / pixel
+    tried = {(look, middle): left_over(look, middle) for look in LAMBDAS}
+    if arrivals.limited:
+        look = min(tried, key=lambda begin: tried[begin])[0]
+        offsets = {begin + offset for begin in (middle, start / pixel) for offset in (0.0, *_OFFSETS)} - {middle}
+        tried |= {(look, offset): left_over(look, offset) for offset in offsets}
+    best = min(tried, key=lambda begin: tried[begin])
+    rivals = [other for other, left in tried.items() if left < _RIVAL * tried[best]]
+    shift, confidence = arrivals.most(*best)
+    shift = _sharpen(pixels, _refine(pixels, shift, best[1] * pixel, width, pixel))
+    # The depths are doubted where they explain no more than the calibrated one, or where others explain as much.
+    reliable, found, doubt = confidence >= _RELIABLE, pixels.solve(shift), ""
+    variance, unknowns = pixels.variance(found), 2 * shift.size
+    less = found.left_over - pixels.solve(np.zeros(shift.shape)).left_over
+    # Of a sheet at the calibrated depth either may leave more.
+    if not reliable.any() or less > chance_difference(less, variance, unknowns):
+        doubt = "Depths by pixel explain no more of the measurements than the calibrated one, which the image is of."
+    else:
         span = float(np.ptp(np.percentile(shift[reliable], (1, 99))))
-        astray = max(
-            float((np.abs(self._arrivals.most(*rival)[0] - shift)[reliable] > self.width / 2).mean())
-            for rival in rivals
-        )
-        spared = not self._arrivals.limited or self.width - span >= SPARE * self.pixel
-        if not spared or astray > _ASTRAY:
-            period = self.width / self.pixel
+        away = (np.abs(arrivals.most(*rival)[0] - shift)[reliable] > width / 2 for rival in rivals)
+        spared = not arrivals.limited or width - span >= SPARE * pixel
+        ties = [(other.mm, other.difference**2 * basis.energy) for other in plane.alternatives]
+        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
+        if max(float(each.mean()) for each in away) > _ASTRAY or not spared:
+            period = width / pixel
             why = f"Depths a period of the dots away, {period:.0f} projector pixels, explain nearly as much"
             if not spared:
-                why = f"Parallax seems to span {span / self.pixel:.1f} of the {period:.0f} pixels of a period"
-            return (
+                why = f"Parallax seems to span {span / pixel:.1f} of the {period:.0f} pixels of a period"
+            doubt = (
                 f"{why}: depths may be off by a whole period, so the image is that of the calibrated one. Use dots of "
                 f"a period of {2 * period:.0f} along the baseline, and of a short one across it."
             )
-        ties = [(other.mm, other.difference**2 * self._all.energy) for other in self._plane.alternatives]
-        others = [f"{mm:.1f}" for mm, more in ties if more < chance_difference(more, variance, unknowns)]
-        if others:
-            return (
-                f"Depths may be off by a whole period of the dots: {self._plane.mm:.1f} or {' or '.join(others)} mm "
+        elif others:
+            doubt = (
+                f"Depths may be off by a whole period of the dots: {plane.mm:.1f} or {' or '.join(others)} mm "
                 "explain a flat scene as well, so the image is that of the calibrated one. Use dots of a longer period "
                 "along the baseline, or give the range of depths."
             )
-        return ""
-
-    def _left_over(self, shift: FloatArray) -> float:
-        return self._pixels.solve(shift).left_over
-
-    def _refine(self, shift: FloatArray, offset: float, left_over: float) -> FloatArray:
-        for _ in range(_STEPS):
-            image, moved = self._pixels.step(shift, self.pixel)
-            weight = gaussian_filter(np.square(image), _STEP_POOLED)
-            change = gaussian_filter(image * moved, _STEP_POOLED) / np.maximum(weight, np.finfo(float).tiny)
-            half = self.width / 2
-            ahead = np.clip(shift + self.pixel * np.clip(change, -1, 1), offset - half, offset + half)
-            ahead = median_filter(ahead, MEDIAN)
-            now = self._left_over(ahead)
-            if now >= left_over:
-                break
-            shift, left_over = ahead, now
-        return shift
-
-    def _sharpen(self, shift: FloatArray) -> FloatArray:
-        solved = self._pixels.solve(shift)
-        for _ in range(_ROUNDS):
-            others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
-            gains = self._pixels.gains(shift, solved.image, others)
-            sure = gains.max(axis=0) > _SURE * self._pixels.variance(solved)
-            ahead = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
-            now = self._pixels.solve(ahead)
-            if now.left_over >= solved.left_over:
-                break
-            shift, solved = ahead, now
-        return shift
+    if doubt:
+        shift, confidence = np.zeros(shift.shape), np.zeros(shift.shape)
+    solved = pixels.solve(shift, None if lam == "auto" else lam)
+    solved = pixels.final(shift, solved) if lam == "auto" else solved
+    sizes, smoothing = (basis.energy, basis.data, basis.part), basis.smoothing(float(np.median(shift)))
+    return DepthMap(
+        solved.image,
+        1 / (inverse + shift),
+        confidence,
+        solved.lam,
+        solved.left_over,
+        *sizes,
+        doubt,
+        range_mm,
+        smoothing,
+    )
 
 
-# -------- Measurements and a depth for each projector pixel in, the image out
+def _refine(pixels: PixelDepths, shift: FloatArray, offset: float, width: float, pixel: float) -> FloatArray:
+    """Take Gauss-Newton steps, with the change of neighbours pooled, while these explain more."""
+    left_over = pixels.solve(shift).left_over
+    for _ in range(_STEPS):
+        image, moved = pixels.step(shift, pixel)
+        weight = gaussian_filter(np.square(image), _STEP_POOLED)
+        change = gaussian_filter(image * moved, _STEP_POOLED) / np.maximum(weight, np.finfo(float).tiny)
+        ahead = np.clip(shift + pixel * np.clip(change, -1, 1), offset - width / 2, offset + width / 2)
+        ahead = median_filter(ahead, _MEDIAN)
+        now = pixels.solve(ahead).left_over
+        if now >= left_over:
+            break
+        shift, left_over = ahead, now
+    return shift
+
+
+def _sharpen(pixels: PixelDepths, shift: FloatArray) -> FloatArray:
+    """Give single pixels the nearest, farthest or median depth around them where that explains clearly more."""
+    solved = pixels.solve(shift)
+    for _ in range(_ROUNDS):
+        others = [of(shift, _BESIDE) for of in (minimum_filter, maximum_filter, median_filter)]
+        gains = pixels.gains(shift, solved.image, others)
+        sure = gains.max(axis=0) > _SURE * pixels.variance(solved)
+        ahead = np.where(sure, np.choose(gains.argmax(axis=0), others), shift)
+        now = pixels.solve(ahead)
+        if now.left_over >= solved.left_over:
+            break
+        shift, solved = ahead, now
+    return shift
+
+
+# -------- The image at a depth for each pixel
 
 _SMALL = 1e-3
 """Lambda over the mean diagonal of the normal matrix while depths are searched."""
@@ -680,8 +603,7 @@ _CUBIC = np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]
 """Lagrange cubic through -1, 0, 1, 2: weight of each by power of the place."""
 
 
-@dataclass(frozen=True, eq=False)
-class Solved:
+class Solved(NamedTuple):
     """Image (n, n') at given depths, its lambda, and the residual energy."""
 
     image: FloatArray
@@ -696,11 +618,11 @@ class PixelDepths:
     computed at.
     """
 
-    def __init__(self, depths: CommonBasis, limit: float, step: float) -> None:
-        self._all = depths
+    def __init__(self, basis: CommonBasis, limit: float, step: float) -> None:
+        self._basis = basis
         self._shifts = np.linspace(-limit, limit, max(2 * int(np.ceil(limit / step)) + 1, len(_CUBIC)))
-        self._tables = [np.stack([depths.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
-        self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in depths.patterns]
+        self._tables = [np.stack([basis.side(axis, shift).T for shift in self._shifts], axis=1) for axis in (0, 1)]
+        self._lit = [[np.flatnonzero(column) for column in patterns.T] for patterns in basis.patterns]
         most = max(len(row) for row in self._lit[0]) * max(len(column) for column in self._lit[1])
         if most > _MOST_LIT:
             raise MitsimError(
@@ -713,19 +635,17 @@ class PixelDepths:
     def solve(self, shift: FloatArray, lam: float | None = None) -> Solved:
         """Return the image with 1/z of each pixel changed by ``shift`` (n, n') [1/mm]; ``lam`` None: a small one."""
         lam = _SMALL * self._scale if lam is None else lam
-        image, left_over = np.zeros(shift.shape), self._all.outside
-        for frame in self._all.frames:
-            lit = self._pixels(frame)
-            left, right = (self._columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
-            normal, data = (left @ left.T) * (right @ right.T), ((left @ frame.frame) * right).sum(axis=1)
+        image, left_over = np.zeros(shift.shape), self._basis.outside
+        for frame, lit, left, right in self._columns_of_frames(shift):
+            normal, data = (left @ left.T) * (right @ right.T), ((left @ frame) * right).sum(axis=1)
             found = np.linalg.solve(normal + lam * np.eye(len(data)), data)
             image[lit] = found
-            left_over += float(np.square(frame.frame).sum() + found @ (normal @ found - 2 * data))
+            left_over += float(np.square(frame).sum() + found @ (normal @ found - 2 * data))
         return Solved(image, lam, left_over)
 
     def variance(self, solved: Solved) -> float:
         """Return the variance of a datum from the residual of a ``solved`` image."""
-        return float(solved.left_over / max(self._all.data - 2 * solved.image.size, 1))
+        return float(solved.left_over / max(self._basis.data - 2 * solved.image.size, 1))
 
     def final(self, shift: FloatArray, solved: Solved) -> Solved:
         """Return the image at the lambda of its own residual: variance of a datum over the mean square of pixels."""
@@ -735,21 +655,16 @@ class PixelDepths:
     def step(self, shift: FloatArray, unit: float) -> tuple[FloatArray, FloatArray]:
         """Return X and X o d, both (n, n'), that explain most together; d changes ``shift``, in ``unit`` [1/mm]."""
         lam, image, moved = _SMALL * self._scale, np.zeros(shift.shape), np.zeros(shift.shape)
-        for frame in self._all.frames:
-            lit = self._pixels(frame)
-            (u, du), (v, dv) = (
-                (self._columns(axis, place, shift[lit]), unit * self._columns(axis, place, shift[lit], slope=True))
-                for axis, place in enumerate(lit)
-            )
+        for frame, lit, u, v in self._columns_of_frames(shift):
+            du, dv = (unit * self._columns(axis, place, shift[lit], slope=True) for axis, place in enumerate(lit))
             # Columns of the model are u v^T, and by d du v^T + u dv^T.
             uu, uv, vv = u @ u.T, (u @ du.T, v @ dv.T), v @ v.T
             across = uv[0] * vv + uu * uv[1]
             own = (du @ du.T) * vv + uu * (dv @ dv.T) + uv[0].T * uv[1] + uv[0] * uv[1].T
             normal = np.block([[uu * vv, across], [across.T, own]])
-            seen, slid = u @ frame.frame, du @ frame.frame
+            seen, slid = u @ frame, du @ frame
             data = np.concatenate([(seen * v).sum(axis=1), (slid * v + seen * dv).sum(axis=1)])
-            both = np.linalg.solve(normal + lam * np.eye(len(data)), data)
-            image[lit], moved[lit] = np.split(both, 2)
+            image[lit], moved[lit] = np.split(np.linalg.solve(normal + lam * np.eye(len(data)), data), 2)
         return image, moved
 
     def gains(self, shift: FloatArray, image: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
@@ -757,48 +672,44 @@ class PixelDepths:
 
         Pixels of a frame are a period apart and hardly share measurements, so that each is judged with all else fixed.
         """
-        gains = np.zeros((len(others), *shift.shape))
-        for frame in self._all.frames:
-            lit = self._pixels(frame)
-            left, right = self._columns(0, lit[0], shift[lit]), self._columns(1, lit[1], shift[lit])
-            rest = frame.frame - (left * image[lit][:, None]).T @ right
-            for index, other in enumerate((shift, *others)):
-                u, v = self._columns(0, lit[0], other[lit]), self._columns(1, lit[1], other[lit])
-                own = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
+        explained = np.zeros((1 + len(others), *shift.shape))
+        for frame, lit, left, right in self._columns_of_frames(shift):
+            rest = frame - (left * image[lit][:, None]).T @ right
+            for own, other in zip(explained, (shift, *others), strict=True):
+                u, v = (self._columns(axis, place, other[lit]) for axis, place in enumerate(lit))
+                light = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
                 size = np.square(u).sum(axis=1) * np.square(v).sum(axis=1)
-                explained = np.square(((u @ rest) * v).sum(axis=1) + own) / size
-                if index == 0:
-                    gains[:, lit[0], lit[1]] -= explained
-                else:
-                    gains[index - 1][lit] += explained
-        return gains
+                own[lit] = np.square(((u @ rest) * v).sum(axis=1) + light) / size
+        return explained[1:] - explained[0]
 
-    def _pixels(self, frame: Measurement) -> tuple[np.ndarray, np.ndarray]:
-        rows, columns = np.meshgrid(self._lit[0][frame.row], self._lit[1][frame.column], indexing="ij")
-        return rows.ravel(), columns.ravel()
+    def _columns_of_frames(
+        self, shift: FloatArray
+    ) -> Iterator[tuple[FloatArray, tuple[npt.NDArray[np.intp], ...], FloatArray, FloatArray]]:
+        """Yield each frame, the places of its lit pixels, and their columns (k, r) of both factors."""
+        for each in self._basis.frames:
+            grid = np.meshgrid(self._lit[0][each.row], self._lit[1][each.column], indexing="ij")
+            lit = tuple(place.ravel() for place in grid)
+            left, right = (self._columns(axis, place, shift[lit]) for axis, place in enumerate(lit))
+            yield each.frame, lit, left, right
 
-    def _columns(self, axis: int, pixels: np.ndarray, shift: FloatArray, slope: bool = False) -> FloatArray:
+    def _columns(self, axis: int, pixels: npt.NDArray[np.intp], shift: FloatArray, slope: bool = False) -> FloatArray:
         """Return columns (k, r) of the ``pixels`` of an axis at changes ``shift`` (k,) of 1/z, or their derivatives."""
-        step = self._shifts[1] - self._shifts[0]
+        step, table = self._shifts[1] - self._shifts[0], self._tables[axis]
         place = (shift - self._shifts[0]) / step
         start = np.clip(np.floor(place).astype(np.intp), 1, len(self._shifts) - 3)
-        part = place - start
-        one, zero = np.ones_like(part), np.zeros_like(part)
-        powers = [zero, one / step, 2 * part / step, 3 * part**2 / step] if slope else [one, part, part**2, part**3]
-        weights = _CUBIC @ np.stack(powers)
-        table = self._tables[axis]
+        powers = (place - start) ** np.arange(4)[:, None]
+        if slope:
+            powers = np.arange(4)[:, None] / step * np.roll(powers, 1, axis=0)
+        weights = _CUBIC @ powers
         return np.asarray(sum(weight[:, None] * table[pixels, start + k - 1] for k, weight in enumerate(weights)))
 
 
 # ---- Where most light of each projector pixel arrives ----------------------------------------------------------------
 
-
 LAMBDAS = 1e-5, 1e-6, 1e-7
 """Tried lambdas over the largest sigma^2: smaller ones add noise, larger ones blur dots."""
-OFFSETS = -1.0, -0.5, 0.5, 1.0
+_OFFSETS = -1.0, -0.5, 0.5, 1.0
 """Projector pixels by which the range of displacements may be moved, because a surface at its end is ambiguous."""
-MEDIAN = 5
-"""Width of the median of places [projector pixels]."""
 _POOLED = 1.0
 """Standard deviation over which light is pooled [projector pixels]."""
 _BESIDE_LARGEST = 2
@@ -825,93 +736,86 @@ class Arrivals:
         Change of 1/z [1/mm] that moves light by one projector pixel.
     width, reach
         Distinguishable changes of 1/z, and the largest tried one, either way.
+    limited
+        Whether the dots' period limits the range of depths.
     """
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
-        self._classes = [_classes(patterns) for patterns in shots.patterns]
-        parallax, counts = parallax_of(factors), (factors.left.shape[1], factors.right.shape[1])
-        self._span = ends[1] - ends[0]
-        moves = [max(map(abs, pixels_of_parallax(parallax, axis, count)[:2])) for axis, count in enumerate(counts)]
-        self._open = [move * self._span > _LEAST_PARALLAX for move in moves]
+        if not all(map(_are_dots, shots.patterns)):
+            raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
+        moves, span = _moves(factors), ends[1] - ends[0]
+        self._open = [bool(move * span > _LEAST_PARALLAX) for move in moves]
         if not any(self._open):
             raise MitsimError(
                 f"focus map: camera and projector of calibration {factors.name} have no baseline, so depth moves no "
                 "light; give a depth, or auto"
             )
-        self.pixel = 1 / max(moves)
-        periods = [own.shape[1] for own in shots.patterns]
-        self.width = min(
-            self._span, unambiguous_parallax(np.where(self._open, moves, 0.0) * self.pixel, periods) * self.pixel
-        )
-        self.reach = beside + self.width / 2 + (max(OFFSETS) + _BESIDE_LARGEST) * self.pixel
-        self.depths = CommonBasis(shots, factors, (-self.reach, self.reach))
+        self.pixel = 1 / float(moves.max())
+        self.width = min(span, _period(np.where(self._open, moves, 0.0), shots.patterns))
+        self.limited = self.width < span
+        self.reach = beside + self.width / 2 + (max(_OFFSETS) + _BESIDE_LARGEST) * self.pixel
+        self.basis = CommonBasis(shots, factors, (-self.reach, self.reach))
         self._margin = int(np.ceil(self.reach / self.pixel)) + 1
+        # Along the baseline each dot's frames have an image of their own, of all pixels as if they were lit.
+        self._classes = [
+            own.argmax(axis=1) if opened else np.zeros(len(own), np.intp)
+            for own, opened in zip(shots.patterns, self._open, strict=True)
+        ]
+        self._images = self._class_images()
 
-    @property
-    def limited(self) -> bool:
-        """Whether the dots' period limits the range of depths."""
-        return self.width < self._span
+    def _class_images(self) -> dict[float, FloatArray]:
+        """Return the images (K or 1, K' or 1, n, n') of all frames of a class, by lambda."""
+        basis = self.basis
+        sides = [basis.side(axis, 0.0, self._margin if opened else 0) for axis, opened in enumerate(self._open)]
+        patterns, counts = list[FloatArray](), list[int]()
+        for side, own, opened in zip(sides, basis.patterns, self._open, strict=True):
+            patterns.append(np.ones((side.shape[1], 1)) if opened else own)
+            counts.append(own.shape[1] if opened else 1)
+        prepared = prepare(*sides, *patterns)
+        sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
+        for each in basis.frames:
+            (row, column), (down, across) = (each.row, each.column), self._open
+            own = sums[row if down else 0, column if across else 0]
+            own.add(each.frame, 0 if down else row, 0 if across else column)
+        scales = {key: prepared.problem(own).scale for key, own in sums.items()}
+        found = {}
+        for lam in LAMBDAS:
+            images = [prepared.solve(own, lam * scales[key]).image for key, own in sums.items()]
+            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
+        return found
 
     def most(self, lam: float, offset: float) -> tuple[FloatArray, FloatArray]:
         """Return changes of 1/z by pixel where most light arrives, and the confidence.
 
         ``lam`` is relative to the largest sigma^2, ``offset`` the middle of the displacements [projector pixels].
         """
-        count = 2 * int(np.ceil(self.width / self.pixel / STEP / 2)) + 1
+        count = 2 * int(np.ceil(self.width / self.pixel / _STEP / 2)) + 1
         shifts = np.linspace(-self.width / 2, self.width / 2, count) + offset * self.pixel
-        light = np.stack([self._arriving(self._class_images[lam], shift) for shift in shifts])
+        light = np.stack([self._arriving(self._images[lam], shift) for shift in shifts])
         light = np.maximum(gaussian_filter(light, (0, _POOLED, _POOLED)), 0.0)
-        place, step = light.argmax(axis=0), shifts[1] - shifts[0]
-        near = round(_NEIGHBOURHOOD * self.pixel / step)
+        place, step, peak = light.argmax(axis=0), shifts[1] - shifts[0], light.max(axis=0)
         beside = np.arange(count)[:, None, None] - place
-        own = np.where(np.abs(beside) <= near, light, 0.0)
-        other = np.where(np.abs(beside) <= near, 0.0, light).max(axis=0)
-        peak = light.max(axis=0)
+        near = np.abs(beside) <= round(_NEIGHBOURHOOD * self.pixel / step)
+        own, other = np.where(near, light, 0.0), np.where(near, 0.0, light).max(axis=0)
         dark = peak <= np.finfo(float).tiny
         centroid = (own * beside).sum(axis=0) / np.where(dark, 1.0, own.sum(axis=0))
-        found = median_filter(shifts[place] + step * centroid, MEDIAN)
+        found = median_filter(shifts[place] + step * centroid, _MEDIAN)
         elsewhere = np.maximum(other, np.median(other))  # of a dark pixel alone it would be small by chance
         return found, np.where(dark, 0.0, np.maximum(1 - elsewhere / np.where(dark, 1.0, peak), 0.0))
 
     def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
-        keys, places, parts = [], [], []
-        for axis, (classes, opened) in enumerate(zip(self._classes, self._open, strict=True)):
-            place = np.arange(classes.size) + (self.depths.edges(axis) * shift + self._margin if opened else 0.0)
+        """Return the light (n, n') where each pixel's would be at 1/z changed by ``shift``, linear between pixels."""
+        places, parts = [], []
+        for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True):
+            place = np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)
             whole = np.floor(place).astype(np.intp)
-            whole = np.clip(whole, 0, max(seen.shape[2 + axis] - 2, 0)) if opened else whole
-            keys.append(classes if opened else np.zeros_like(classes))
+            whole = np.clip(whole, 0, max(seen.shape[2 + len(places)] - 2, 0)) if opened else whole
             places.append(whole)
             parts.append(place - whole)
-        total = np.zeros(self.depths.shape)
+        total = np.zeros(self.basis.shape)
         for row in (0, 1) if self._open[0] else (0,):
             for column in (0, 1) if self._open[1] else (0,):
                 weights = [part if end else 1 - part for part, end in zip(parts, (row, column), strict=True)]
-                value = seen[keys[0][:, None], keys[1], (places[0] + row)[:, None], places[1] + column]
-                total += np.outer(*weights) * value
+                rows, columns = (places[0] + row)[:, None], places[1] + column
+                total += np.outer(*weights) * seen[self._classes[0][:, None], self._classes[1], rows, columns]
         return total
-
-    @cached_property
-    def _class_images(self) -> dict[float, FloatArray]:
-        sides, patterns = [], []
-        for axis, opened in enumerate(self._open):
-            side = self.depths.widen(axis, self._margin) if opened else self.depths.side(axis, 0.0)
-            sides.append(side)
-            patterns.append(np.ones((side.shape[1], 1)) if opened else self.depths.patterns[axis])
-        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
-        counts = [own.shape[1] if opened else 1 for own, opened in zip(self.depths.patterns, self._open, strict=True)]
-        sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
-        for each in self.depths.frames:
-            key = (each.row if self._open[0] else 0, each.column if self._open[1] else 0)
-            sums[key].add(each.frame, 0 if self._open[0] else each.row, 0 if self._open[1] else each.column)
-        problems = {key: prepared.problem(own) for key, own in sums.items()}
-        found = {}
-        for lam in LAMBDAS:
-            images = [prepared.solve(own, lam * problems[key].scale).image for key, own in sums.items()]
-            found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
-        return found
-
-
-def _classes(patterns: FloatArray) -> np.ndarray:
-    if not are_dots(patterns):
-        raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement tells depth")
-    return np.asarray(patterns.argmax(axis=1))

@@ -30,7 +30,7 @@ near 1 where the dots' shadows leave gaps. Global light that changes from frame 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -48,8 +48,6 @@ from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import check_parallax
 from mitsim.reconstruct.solver import Prepared
 
-STEP = 0.5
-"""Projector pixels of parallax between tried displacements; a dot's image is about two wide."""
 _NEIGHBOURS = 4
 """Columns of a cubic; fewer leave more of a sheet at 360 mm, more add noise."""
 _DEGREE = 4
@@ -62,12 +60,42 @@ LEAST_PART = 0.5
 """Least part of the sensor's rows that must remain."""
 
 
-# ---- Factors moved to another depth ----
+# ---- Captures of which something is changed --------------------------------------------------------------------------
+
+
+class DerivedCapture(Capture):
+    """The ``whole`` capture with other ``patterns``, or on a ``part`` of a ``sensor`` of that many rows and columns."""
+
+    def __init__(
+        self,
+        whole: Capture,
+        patterns: tuple[FloatArray, FloatArray] | None = None,
+        part: tuple[slice, slice] = (slice(None), slice(None)),
+        sensor: tuple[int, int] | None = None,
+    ) -> None:
+        super().__init__(whole.manifest, whole.folder)
+        self.whole, self._patterns, self._part, self._sensor = whole, patterns, part, sensor
+
+    @cached_property
+    def patterns(self) -> tuple[FloatArray, FloatArray]:
+        """P_L (n, K) and P_R (n', K')."""
+        return self._patterns or self.whole.patterns
+
+    @cached_property
+    def ambient(self) -> Ambient | None:
+        """Ambient frame that is subtracted from every frame."""
+        whole = self.whole.ambient
+        return whole and Ambient(whole.rate[self._part], whole.variance[self._part], whole.shots)
+
+    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
+        """Yield the measurements of the whole capture on this part of the sensor."""
+        for each in self.whole.pattern_measurements(self._sensor or shape):
+            yield replace(each, frame=each.frame[self._part], light=each.light[self._part])
 
 
 @dataclass(frozen=True, eq=False)
 class MovedFactors:
-    """Factors of a depth on the sensor's ``rows`` and ``columns`` where they are known.
+    """Factors of a depth or of a wider window, on the sensor's ``rows`` and ``columns`` where they are known.
 
     ``sensor`` is the shape of the whole sensor, and ``hidden`` the part of scene pixels whose light the field stop
     blocks.
@@ -81,7 +109,10 @@ class MovedFactors:
 
     def of(self, shots: Capture) -> Capture:
         """Return the part of ``shots`` on these rows and columns."""
-        return _Part(shots, self)
+        return DerivedCapture(shots, part=(self.rows, self.columns), sensor=self.sensor)
+
+
+# ---- Factors moved to another depth, or widened ----------------------------------------------------------------------
 
 
 def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
@@ -89,7 +120,7 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
 
     Raises ArgumentError for a depth where too little of them is known, and MitsimError without a stated parallax.
     """
-    parallax = parallax_of(factors)
+    parallax, sensor = parallax_of(factors), (len(factors.left), len(factors.right))
     if not (np.isfinite(depth_mm) and depth_mm > parallax.mask_distance_mm):
         raise ArgumentError(
             "focus", f"{depth_mm:g}: give a depth above {parallax.mask_distance_mm:g} mm, where the mask is"
@@ -97,11 +128,10 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
     shift = 1 / depth_mm - 1 / parallax.depth_mm
     if shift == 0:
         # The calibration's own, to the last bit.
-        shape = len(factors.left), len(factors.right)
-        return MovedFactors(replace(factors, lacking=()), slice(0, shape[0]), slice(0, shape[1]), shape)
+        return MovedFactors(replace(factors, lacking=()), slice(0, sensor[0]), slice(0, sensor[1]), sensor)
     sides = [FactorOfDepths(side, parallax, axis) for axis, side in enumerate((factors.left, factors.right))]
     (left, rows), (right, columns) = (side.at(shift) for side in sides)
-    for known, size in ((rows, len(factors.left)), (columns, len(factors.right))):
+    for known, size in zip((rows, columns), sensor, strict=True):
         if known.stop - known.start < LEAST_PART * size:
             raise ArgumentError(
                 "focus",
@@ -110,13 +140,52 @@ def move_factors(factors: Factors, depth_mm: float) -> MovedFactors:
             )
     manifest, noise = factors.manifest, factors.manifest.noise
     if noise:
-        less = {
-            name: getattr(noise, name) * side.noise(shift) for name, side in zip(("left", "right"), sides, strict=True)
-        }
+        less = {"left": noise.left * sides[0].noise(shift), "right": noise.right * sides[1].noise(shift)}
         manifest = manifest.model_copy(update={"noise": noise.model_copy(update=less)})
     moved = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
     seen = [float((side.hidden_part(shift) < _HIDDEN).mean()) for side in sides]
-    return MovedFactors(moved, rows, columns, (len(factors.left), len(factors.right)), 1 - seen[0] * seen[1])
+    return MovedFactors(moved, rows, columns, sensor, 1 - seen[0] * seen[1])
+
+
+def widen_factors(factors: Factors, cells: int) -> MovedFactors:
+    """Return ``factors`` with ``cells`` more columns a side, on the part of the sensor where these are known.
+
+    Raises MitsimError without a stated parallax, and for more cells than the window or the sensor covers.
+    """
+    parallax, sides = parallax_of(factors), (factors.left, factors.right)
+    if cells > (most := min(factor.shape[1] for factor in sides)):
+        raise ArgumentError("margin", f"{cells}: give at most {most}, the projector's pixels a side")
+    widened = [FactorOfDepths(factor, parallax, axis).beyond(cells) for axis, factor in enumerate(sides)]
+    part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
+    if part < LEAST_PART:
+        raise ArgumentError(
+            "margin", f"{cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer"
+        )
+    (left, rows), (right, columns) = widened
+    update = {}
+    for axis, factor in zip(("row", "column"), sides, strict=True):
+        for name in (f"{axis}_tan", f"{axis}_mm"):
+            first, last = getattr(parallax, name)
+            more = (last - first) * cells / factor.shape[1]
+            update[name] = first - more, last + more
+    manifest = factors.manifest.model_copy(update={"parallax": parallax.model_copy(update=update)})
+    wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
+    return MovedFactors(wider, rows, columns, (len(sides[0]), len(sides[1])))
+
+
+def light_margin(shots: Capture, cells: int) -> Capture:
+    """Return ``shots`` with patterns that always light a margin of ``cells``.
+
+    Raises MitsimError for patterns of -1.
+    """
+    if any(shot.sign for shot in shots.manifest.patterns.captures):
+        raise MitsimError(
+            f"margin {cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what is lit "
+            "always is not there; leave margin out"
+        )
+    pad = (cells, cells), (0, 0)
+    left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in shots.patterns)
+    return DerivedCapture(shots, patterns=(left, right))
 
 
 def parallax_of(factors: Factors) -> Parallax:
@@ -141,16 +210,31 @@ def pixels_of_parallax(parallax: Parallax, axis: int, count: int) -> tuple[float
     return edges[0] / pixel, edges[1] / pixel, 1 / pixel
 
 
-# ---- One factor at any depth ----
+# ---- One factor at any depth -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
 class FactorOfDepths:
-    """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth."""
+    """A calibrated ``factor`` (m, n) of the left (``axis`` 0) or right side (1), and how it moves with depth.
 
-    factor: FloatArray
-    parallax: Parallax
-    axis: int
+    Attributes
+    ----------
+    edges
+        Projector pixels (n,) that a change of 1/z by 1/mm moves the light of each pixel.
+    reach
+        Largest number of projector pixels that a change of 1/z by 1/mm moves what a sensor pixel sees.
+    """
+
+    def __init__(self, factor: FloatArray, parallax: Parallax, axis: int) -> None:
+        self.factor, self.parallax = factor, parallax
+        rows, count = factor.shape
+        first, last, self._by_place = pixels_of_parallax(parallax, axis, count)
+        pitch = parallax.pitch_mm(axis)
+        self._place: FloatArray = (np.arange(rows) - (rows - 1) / 2) * pitch
+        # Columns that one sensor pixel's step along the sensor makes up for.
+        self._step = pitch * (1 / parallax.mask_distance_mm - 1 / parallax.depth_mm) * self._by_place
+        self._first_tan = (parallax.row_tan if axis == 0 else parallax.column_tan)[0]
+        self.edges: FloatArray = np.linspace(first, last, 2 * count + 1)[1::2]
+        self.reach = float(max(abs(first), abs(last), self._by_place * rows * pitch / 2))
 
     def at(self, shift: float | FloatArray) -> tuple[FloatArray, slice]:
         """Return the factor at another depth, and the sensor rows where all of its columns are known.
@@ -159,11 +243,20 @@ class FactorOfDepths:
         """
         column = self._source_columns(shift)
         row, within, known = self._sources(column)
-        shadows = self._shadow.at(row, within) * self._own_brightness
+        shadows = self._shadow.at(row, within) * self.brightness(np.arange(self.factor.shape[1]))
         passed = self._transmission(column)
         mean = passed.mean(axis=0)
         # The image stays light relative to the board's, as the sensor as a whole sees it.
         return shadows * np.divide(passed, mean, out=np.zeros_like(passed), where=mean > 0), _whole(known)
+
+    def beyond(self, margin: int) -> tuple[FloatArray, slice]:
+        """Return the factor with ``margin`` more columns a side, and the sensor rows where all of them are known."""
+        rows, count = self.factor.shape
+        column = np.arange(-margin, count + margin)
+        row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
+        shadows = self._shadow.at(row, within) * self.brightness(column)
+        shadows[:, margin : margin + count] = self.factor
+        return shadows, _whole(known)
 
     def hidden_part(self, shift: float) -> FloatArray:
         """Return the part (n,) of each column's light that the field stop blocks at 1/z changed by ``shift`` [1/mm]."""
@@ -175,74 +268,41 @@ class FactorOfDepths:
         row, within, _ = self._sources(self._source_columns(shift))
         return float(np.sqrt(np.mean(np.square(ColumnSpline(white, self._step).at(row, within)))))
 
+    def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
+        """Return the brightness at each ``column`` without the mask's shadow; 1 in the window's middle."""
+        return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
+
     def _source_columns(self, shift: float | FloatArray) -> FloatArray:
-        return np.arange(self.factor.shape[1]) + (self.edges - self._parallax_pixels[2] * self._place[:, None]) * shift
-
-    def _transmission(self, column: FloatArray) -> FloatArray:
-        stop = self.parallax.stop_tan
-        if stop is None:
-            return np.ones_like(column)
-        pixel = 1 / self._parallax_pixels[2]
-        first = (self.parallax.row_tan if self.axis == 0 else self.parallax.column_tan)[0]
-        ends = first + (np.array([0.5, self.factor.shape[1] - 0.5])) * pixel
-        from_edge = np.abs(self._place).max() / self.parallax.depth_mm
-        if np.abs(ends).max() + from_edge + pixel / 2 > stop:
-            return np.ones_like(column)  # the calibrated columns are cut themselves, nobody knows how far
-        tangent = first + (column + 0.5) * pixel - self._place[:, None] / self.parallax.depth_mm
-        return np.clip((stop - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
-
-    # ---- Columns beside the window, and shadows between columns ----
-
-    def beyond(self, margin: int) -> tuple[FloatArray, slice]:
-        """Return the factor with ``margin`` more columns a side, and the sensor rows where all of them are known."""
-        rows, count = self.factor.shape
-        column = np.arange(-margin, count + margin)
-        row, within, known = self._sources(np.broadcast_to(column, (rows, column.size)))
-        shadows = self._shadow.at(row, within) * self.brightness(column)
-        shadows[:, margin : margin + count] = self.factor
-        return shadows, _whole(known)
+        return np.arange(self.factor.shape[1]) + (self.edges - self._by_place * self._place[:, None]) * shift
 
     def _sources(
         self, column: npt.NDArray[np.floating | np.integer]
     ) -> tuple[npt.NDArray[np.intp], FloatArray, npt.NDArray[np.bool_]]:
+        """Return rows, columns within the window and whether these are known, for sources at any ``column``."""
         rows, count = self.factor.shape
-        # Columns that one sensor pixel's step along the sensor makes up for.
-        step = self._step
         within, row = np.array(column, dtype=np.float64), np.repeat(np.arange(rows)[:, None], column.shape[1], axis=1)
         known = np.ones(within.shape, dtype=np.bool_)
         outside = (within < 0) | (within > count - 1)
         away, own = within[outside], row[outside]
-        steps = np.where(away < 0, -np.ceil((1 - away) / step), np.ceil((away - count + 2) / step)).astype(np.intp)
-        away, own = away - steps * step, own + steps
+        steps = np.where(away < 0, -np.ceil((1 - away) / self._step), np.ceil((away - count + 2) / self._step))
+        away, own = away - steps * self._step, own + steps.astype(np.intp)
         known[outside] = (own >= 0) & (own < rows) & (away >= 0) & (away <= count - 1)
         within[outside], row[outside] = np.clip(away, 0.0, count - 1.0), np.clip(own, 0, rows - 1)
         return row, within, known
 
+    def _transmission(self, column: FloatArray) -> FloatArray:
+        stop, pixel = self.parallax.stop_tan, 1 / self._by_place
+        if stop is None:
+            return np.ones_like(column)
+        ends = self._first_tan + (np.array([0.5, self.factor.shape[1] - 0.5])) * pixel
+        if np.abs(ends).max() + np.abs(self._place).max() / self.parallax.depth_mm + pixel / 2 > stop:
+            return np.ones_like(column)  # the calibrated columns are cut themselves, nobody knows how far
+        tangent = self._first_tan + (column + 0.5) * pixel - self._place[:, None] / self.parallax.depth_mm
+        return np.clip((stop - np.abs(tangent)) / pixel + 0.5, 0.0, 1.0)
+
     @cached_property
     def _shadow(self) -> ColumnSpline:
-        return ColumnSpline(self.factor / self._own_brightness, self._step)
-
-    # ---- Brightness of projector pixels ----
-
-    @cached_property
-    def _own_brightness(self) -> FloatArray:
-        return self.brightness(np.arange(self.factor.shape[1]))
-
-    @property
-    def edges(self) -> FloatArray:
-        """Projector pixels (n,) that a change of 1/z by 1/mm moves the light of each pixel."""
-        first, last, _ = self._parallax_pixels
-        return np.asarray(np.linspace(first, last, 2 * self.factor.shape[1] + 1)[1::2])
-
-    @property
-    def reach(self) -> float:
-        """Largest number of projector pixels that a change of 1/z by 1/mm moves what a sensor pixel sees."""
-        first, last, by_place = self._parallax_pixels
-        return float(max(abs(first), abs(last), by_place * len(self.factor) * self._pitch / 2))
-
-    def brightness(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
-        """Return the brightness at each ``column`` without the mask's shadow; 1 in the window's middle."""
-        return np.asarray(np.exp(np.polynomial.polynomial.polyval(self._across(column), self._falloff)))
+        return ColumnSpline(self.factor / self.brightness(np.arange(self.factor.shape[1])), self._step)
 
     def _across(self, column: npt.NDArray[np.floating | np.integer]) -> FloatArray:
         middle = (self.factor.shape[1] - 1) / 2
@@ -250,6 +310,7 @@ class FactorOfDepths:
 
     @cached_property
     def _falloff(self) -> FloatArray:
+        """Coefficients of the logarithm of brightness, by columns that see the same part of the mask."""
         rows, count = self.factor.shape
         unlike, changes = [np.zeros(1)], [np.zeros((1, _DEGREE + 1))]
         apart = np.arange(1, rows // 2, max(1, rows // _PAIRS))
@@ -257,37 +318,21 @@ class FactorOfDepths:
             column = np.arange(count) - offset * self._step
             to = np.flatnonzero((column >= 0) & (column <= count - 1))
             row = np.arange(max(0, -offset), min(rows, rows - offset))[:, None]
-            own, same = self.factor[row, to], _cubic(self.factor, row + offset, column[to])
+            start = np.clip(np.floor(column[to]).astype(np.intp) - 1, 0, count - _NEIGHBOURS)
+            t = column[to] - start
+            weights = (
+                -(t - 1) * (t - 2) * (t - 3) / 6,
+                t * (t - 2) * (t - 3) / 2,
+                -t * (t - 1) * (t - 3) / 2,
+                t * (t - 1) * (t - 2) / 6,
+            )  # of a cubic through four columns
+            own = self.factor[row, to]
+            same = sum(weight * self.factor[row + offset, start + k] for k, weight in enumerate(weights))
             weight = np.sqrt(np.maximum((own + same).sum(axis=0) / 2, 0.0))
-            difference = (own - same).sum(axis=0)
-            unlike.append(np.divide(difference, weight, out=np.zeros(to.size), where=weight > 0))
+            unlike.append(np.divide((own - same).sum(axis=0), weight, out=np.zeros(to.size), where=weight > 0))
             powers = [np.polynomial.polynomial.polyvander(self._across(place), _DEGREE) for place in (to, column[to])]
             changes.append(weight[:, None] * (powers[0] - powers[1]))
         return np.asarray(np.linalg.lstsq(np.concatenate(changes), np.concatenate(unlike), rcond=None)[0])
-
-    # ---- Parallax, and places on the sensor ----
-
-    @property
-    def _parallax_pixels(self) -> tuple[float, float, float]:
-        return pixels_of_parallax(self.parallax, self.axis, self.factor.shape[1])
-
-    @property
-    def _step(self) -> float:
-        parallax = self.parallax
-        inverse = 1 / parallax.mask_distance_mm - 1 / parallax.depth_mm
-        return self._pitch * inverse * self._parallax_pixels[2]
-
-    @cached_property
-    def _place(self) -> FloatArray:
-        rows = len(self.factor)
-        return np.asarray((np.arange(rows) - (rows - 1) / 2) * self._pitch)
-
-    @property
-    def _pitch(self) -> float:
-        return self.parallax.pitch_mm(self.axis)
-
-
-# ---- Interpolation between columns ----
 
 
 def _whole(known: npt.NDArray[np.bool_]) -> slice:
@@ -295,94 +340,7 @@ def _whole(known: npt.NDArray[np.bool_]) -> slice:
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
-def _cubic(factor: FloatArray, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
-    start = np.clip(np.floor(column).astype(np.intp) - 1, 0, factor.shape[1] - _NEIGHBOURS)
-    t = column - start
-    weights = (
-        -(t - 1) * (t - 2) * (t - 3) / 6,
-        t * (t - 2) * (t - 3) / 2,
-        -t * (t - 1) * (t - 3) / 2,
-        t * (t - 1) * (t - 2) / 6,
-    )
-    return np.asarray(sum(weight * factor[row, start + k] for k, weight in enumerate(weights)))
-
-
-# ---- Captures of which something is changed ----
-
-
-class DerivedCapture(Capture):
-    """Capture that differs from the ``whole`` capture in one respect."""
-
-    def __init__(self, whole: Capture) -> None:
-        super().__init__(whole.manifest, whole.folder)
-        self.whole = whole
-
-    @cached_property
-    def patterns(self) -> tuple[FloatArray, FloatArray]:
-        """P_L (n, K) and P_R (n', K')."""
-        return self.whole.patterns
-
-    @cached_property
-    def ambient(self) -> Ambient | None:
-        """Ambient frame that is subtracted from every frame."""
-        return self.whole.ambient
-
-    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """Return the measurements of the whole capture."""
-        return self.whole.pattern_measurements(shape)
-
-
-class _Part(DerivedCapture):
-    def __init__(self, whole: Capture, part: MovedFactors) -> None:
-        super().__init__(whole)
-        self._part = part
-
-    def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        for each in self.whole.pattern_measurements(self._part.sensor):
-            yield replace(each, frame=self._cut(each.frame), light=self._cut(each.light))
-
-    @cached_property
-    def ambient(self) -> Ambient | None:
-        whole = self.whole.ambient
-        return whole and Ambient(self._cut(whole.rate), self._cut(whole.variance), whole.shots)
-
-    def _cut(self, values: FloatArray) -> FloatArray:
-        return values[self._part.rows, self._part.columns]
-
-
-# ---- Dots whose light parallax moves onto another dot's place ----
-
-
-def parallax_period(patterns: tuple[FloatArray, FloatArray], parallax: Parallax) -> float:
-    """Return the change of 1/z [1/mm] that moves the light of dots onto other dots; inf for other patterns."""
-    ends = [pixels_of_parallax(parallax, axis, len(lit))[:2] for axis, lit in enumerate(patterns)]
-    moves = np.array([max(map(abs, each)) for each in ends])
-    if not (moves.any() and all(are_dots(lit) for lit in patterns)):
-        return np.inf
-    pixel = 1 / moves.max()
-    return float(unambiguous_parallax(moves * pixel, [lit.shape[1] for lit in patterns]) * pixel)
-
-
-def are_dots(patterns: FloatArray) -> bool:
-    """Return True if exactly one of the (n, K) ``patterns`` lights each pixel."""
-    values = np.sort(patterns, axis=1)
-    return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
-
-
-def unambiguous_parallax(moves: FloatArray, periods: list[int]) -> float:
-    """Return the parallax in projector pixels that moves light onto another dot of the same frame.
-
-    ``moves`` are the projector pixels along both axes for a parallax of one, and ``periods`` those of the dots.
-    """
-    for parallax in np.arange(1.0, np.prod(periods) + 1, STEP / 4):
-        turns = moves * parallax / periods
-        if np.round(turns).any() and (np.abs(turns - np.round(turns)) * periods < STEP / 2).all():
-            return float(np.ceil(parallax))
-    return np.inf
-
-
 # ---- A factor as a smooth function of the place between its columns --------------------------------------------------
-
 
 _SPLINE_ROWS = 5
 """Sensor rows to either side that a row's spline is fitted to: of 2, 3 and 5 the most leave least (1.9e-3, 1.7e-3,
@@ -400,52 +358,36 @@ class ColumnSpline:
 
     def __init__(self, factor: FloatArray, step: float) -> None:
         rows, count = factor.shape
-        self._last, self._step = (count - 1) * _SPLINE_KNOTS, step
-        reach = min(_SPLINE_ROWS, (rows - 1) // 2)
+        self._last, reach = (count - 1) * _SPLINE_KNOTS, min(_SPLINE_ROWS, (rows - 1) // 2)
         self._coefficients = np.empty((rows, self._last + 3))
-        inner, edges = np.arange(reach, rows - reach), np.array([*range(reach), *range(rows - reach, rows)], dtype=int)
-        self._coefficients[inner] = self._fit(factor, inner, np.arange(-reach, reach + 1))
-        nearest = np.clip(edges - reach, 0, rows - 2 * reach - 1)[:, None] + np.arange(2 * reach + 1)
-        self._coefficients[edges] = self._fit_each(factor[nearest], nearest - edges[:, None])
+        # Rows away from the edges have equal neighbours, and therefore one normal matrix.
+        groups = [(np.arange(reach, rows - reach), np.arange(-reach, reach + 1))]
+        for row in (*range(reach), *range(rows - reach, rows)):
+            first = min(max(row - reach, 0), rows - 2 * reach - 1)
+            groups.append((np.array([row]), np.arange(first, first + 2 * reach + 1) - row))
+        for own, neighbours in groups:
+            place = (np.arange(count) + neighbours[:, None] * step) * _SPLINE_KNOTS
+            start, parts = self._weights(place)
+            weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
+            normal, data = np.zeros((4, self._last + 3)), np.zeros((self._last + 3, len(own)))
+            for a, b in product(range(4), repeat=2):
+                if b >= a:
+                    both = (weights[a] * weights[b]).ravel()
+                    normal[b - a] += np.bincount((start + a).ravel(), both, self._last + 3)
+                    normal[b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
+            for k, first, parts in zip(neighbours, start, np.moveaxis(weights, 1, 0), strict=True):
+                seen = factor[own + k].T
+                for a, part in enumerate(parts):
+                    # Columns are whole knots apart, so no place is named twice but by those without weight.
+                    inside = part != 0
+                    data[first[inside] + a] += part[inside, None] * seen[inside]
+            self._coefficients[own] = solveh_banded(normal, data, lower=True).T
 
     def at(self, row: npt.NDArray[np.intp], column: FloatArray) -> FloatArray:
         """Return numbers of each ``row`` at each ``column``, from 0 to n - 1; the two broadcast."""
         start, weights = self._weights(column * _SPLINE_KNOTS)
         first, numbers = row * self._coefficients.shape[1] + start, self._coefficients.ravel()
         return np.asarray(sum(weight * numbers.take(first + k) for k, weight in enumerate(weights)))
-
-    def _fit(self, factor: FloatArray, rows: npt.NDArray[np.intp], neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        normal, start, weights = self._normal(neighbours[None])
-        data = np.zeros((self._last + 3, len(rows)))
-        for k, first, parts in zip(neighbours, start[0], np.moveaxis(weights[:, 0], 1, 0), strict=True):
-            seen = factor[rows + k].T
-            for a, part in enumerate(parts):
-                # Columns are whole knots apart, so no place is named twice but by those without weight.
-                inside = part != 0
-                data[first[inside] + a] += part[inside, None] * seen[inside]
-        return np.asarray(solveh_banded(normal[0], data, lower=True).T)
-
-    def _fit_each(self, seen: FloatArray, neighbours: npt.NDArray[np.intp]) -> FloatArray:
-        normal, start, weights = self._normal(neighbours)
-        data = np.sum([self._collect(start + a, weight * seen) for a, weight in enumerate(weights)], axis=0)
-        found = [solveh_banded(*each, lower=True) for each in zip(normal, data, strict=True)]
-        return np.array(found).reshape(len(seen), self._last + 3)
-
-    def _normal(self, neighbours: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
-        place = (np.arange(self._last // _SPLINE_KNOTS + 1) + neighbours[..., None] * self._step) * _SPLINE_KNOTS
-        start, parts = self._weights(place)
-        weights = np.where((place >= 0) & (place <= self._last), parts, 0.0)
-        normal = np.zeros((len(neighbours), 4, self._last + 3))
-        for a, b in product(range(4), repeat=2):
-            if b >= a:
-                normal[:, b - a] += self._collect(start + a, weights[a] * weights[b])
-                normal[:, b - a, a : self._last + a] += _STIFFNESS * _THIRD[a] * _THIRD[b]
-        return normal, start, weights
-
-    def _collect(self, place: npt.NDArray[np.intp], values: FloatArray) -> FloatArray:
-        fits, size = len(place), self._last + 3
-        own = (np.arange(fits) * size)[:, None, None] + place
-        return np.asarray(np.bincount(own.ravel(), values.ravel(), fits * size).reshape(fits, size), dtype=np.float64)
 
     def _weights(self, place: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
         start = np.clip(np.floor(place).astype(np.intp), 0, self._last - 1)
@@ -457,77 +399,7 @@ class ColumnSpline:
         return start, (first, 1 - first - third - last, third, last)
 
 
-# ---- A margin of cells beside the window -----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Margin:
-    """Additional ``cells`` on each side of the projector's window."""
-
-    cells: int
-
-    def factors(self, factors: Factors) -> MovedFactors:
-        """Return ``factors`` with columns of these cells, on the part of the sensor where they are known.
-
-        Raises MitsimError without a stated parallax, and for more cells than the window or the sensor covers.
-        """
-        parallax, sides = parallax_of(factors), (factors.left, factors.right)
-        if self.cells > (most := min(factor.shape[1] for factor in sides)):
-            raise ArgumentError("margin", f"{self.cells}: give at most {most}, the projector's pixels a side")
-        widened = [FactorOfDepths(factor, parallax, axis).beyond(self.cells) for axis, factor in enumerate(sides)]
-        part = min((known.stop - known.start) / len(factor) for factor, (_, known) in zip(sides, widened, strict=True))
-        if part < LEAST_PART:
-            raise ArgumentError(
-                "margin",
-                f"{self.cells}: {max(part, 0):.0%} of the sensor know the shadow of all these cells; give fewer",
-            )
-        (left, rows), (right, columns) = widened
-        sizes = factors.left.shape[1], factors.right.shape[1]
-        manifest = factors.manifest.model_copy(update={"parallax": _wider(parallax, sizes, self.cells)})
-        shape = len(factors.left), len(factors.right)
-        wider = replace(factors, left=left[rows], right=right[columns], manifest=manifest, lacking=())
-        return MovedFactors(wider, rows, columns, shape)
-
-    def of(self, shots: Capture) -> Capture:
-        """Return ``shots`` with patterns that always light these cells, or raise MitsimError for patterns of -1."""
-        if any(shot.sign for shot in shots.manifest.patterns.captures):
-            raise MitsimError(
-                f"margin {self.cells}: {shots.name} shows patterns of -1, as differences of two frames, in which what "
-                "is lit always is not there; leave margin out"
-            )
-        return _Padded(shots, self.cells)
-
-    def inside(self, image: FloatArray) -> FloatArray:
-        """Return the window's part of an ``image``."""
-        return image[self.cells : -self.cells, self.cells : -self.cells]
-
-
-class _Padded(DerivedCapture):
-    def __init__(self, whole: Capture, cells: int) -> None:
-        super().__init__(whole)
-        self._cells = cells
-
-    @cached_property
-    def patterns(self) -> tuple[FloatArray, FloatArray]:
-        pad = (self._cells, self._cells), (0, 0)
-        left, right = (np.pad(side.astype(np.float64), pad, constant_values=1.0) for side in self.whole.patterns)
-        return left, right
-
-
-def _wider(parallax: Parallax, sizes: tuple[int, int], cells: int) -> Parallax:
-    def extend(edges: tuple[float, float], size: int) -> tuple[float, float]:
-        more = (edges[1] - edges[0]) * cells / size
-        return edges[0] - more, edges[1] + more
-
-    names = ("row_tan", "row_mm"), ("column_tan", "column_mm")
-    update = {
-        name: extend(getattr(parallax, name), size) for size, own in zip(sizes, names, strict=True) for name in own
-    }
-    return parallax.model_copy(update=update)
-
-
 # ---- Global light, the same in all frames ----------------------------------------------------------------------------
-
 
 _LEAST_EIGENVALUE = 1e-3
 """Least part of a mode that must remain; noise in the mode is magnified by the root of its inverse."""
@@ -580,42 +452,26 @@ def separate(
     """
     if model.centre or any((side < 0).any() for side in patterns):
         raise MitsimError("separation: takes dots before a mask that is not centred; use dots:K")
-    nodes = [_hats(factor.shape[1], side.shape[1]) for factor, side in zip(seen, patterns, strict=True)]
-    bases, triangles = zip(*(np.linalg.qr(side @ hats) for side, hats in zip(seen, nodes, strict=True)), strict=True)
-    lit = [side.common.T @ basis for side, basis in zip((model.left, model.right), bases, strict=True)]
-    shape = bases[0].shape[1], bases[1].shape[1]
-    count = model.left.pattern_count * model.right.pattern_count
     measured = (model.sigma > 0).astype(np.float64)
+    bases, lit, images = [], [], []
+    for factor, lights, side in zip(seen, patterns, (model.left, model.right), strict=True):
+        # Functions linear between nodes a period of the dots apart, the outer ones at the window's ends.
+        pixels, margin = factor.shape[1], (factor.shape[1] - len(lights)) // 2
+        count = max(2, 1 + -(-(pixels - 1) // lights.shape[1]))
+        place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
+        hats = np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count)))
+        basis, triangle = np.linalg.qr(factor @ hats)
+        bases.append(basis)
+        lit.append(side.common.T @ basis)
+        images.append(hats[margin : margin + len(lights)] @ np.linalg.inv(triangle))
+    (rows, columns), frames = (each.shape[1] for each in lit), model.left.pattern_count * model.right.pattern_count
+    pairs = [(each[:, :, None] * each[:, None, :]).reshape(len(each), -1) for each in lit]
+    explained = (pairs[0].T @ measured @ pairs[1]).reshape(rows, rows, columns, columns).transpose(0, 2, 1, 3)
     target = bases[0].T @ total @ bases[1] - lit[0].T @ (measured * weights) @ lit[1]
-    unexplained: FloatArray = np.eye(target.size) - _explained_matrix(lit, measured) / count
-    reported, modes = np.linalg.eigh(unexplained)
+    reported, modes = np.linalg.eigh(np.eye(target.size) - explained.reshape(target.size, target.size) / frames)
     if reported[-1] < _LEAST_EIGENVALUE:
         raise MitsimError("separation: these patterns light all pixels in each frame; use dots:K with K of 2 or more")
-    inverse = np.divide(1.0, count * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
-    found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(shape)
-    left, right = (
-        _inside(hats, len(side)) @ np.linalg.inv(triangle)
-        for hats, side, triangle in zip(nodes, patterns, triangles, strict=True)
-    )
+    inverse = np.divide(1.0, frames * reported, out=np.zeros_like(reported), where=reported > _LEAST_EIGENVALUE)
+    found = (modes @ (inverse * (modes.T @ target.ravel()))).reshape(rows, columns)
     part = float(np.prod([side.mean() for side in patterns]))
-    return Separation(bases[0] @ found @ bases[1].T, left @ found @ right.T / part, reported)
-
-
-def _inside(hats: FloatArray, pixels: int) -> FloatArray:
-    margin = (len(hats) - pixels) // 2
-    return hats[margin : margin + pixels]
-
-
-def _hats(pixels: int, period: int) -> FloatArray:
-    """Return (pixels, J) functions linear between J nodes ``period`` apart, the outer ones at the window's ends."""
-    count = max(2, 1 + -(-(pixels - 1) // period))
-    place = np.arange(pixels) * (count - 1) / max(pixels - 1, 1)
-    return np.asarray(np.maximum(0.0, 1 - np.abs(place[:, None] - np.arange(count))))
-
-
-def _explained_matrix(lit: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
-    pairs = [(side[:, :, None] * side[:, None, :]).reshape(len(side), -1) for side in lit]
-    sizes = [side.shape[1] for side in lit]
-    product = (pairs[0].T @ measured @ pairs[1]).reshape(sizes[0], sizes[0], sizes[1], sizes[1])
-    size = sizes[0] * sizes[1]
-    return np.asarray(product.transpose(0, 2, 1, 3).reshape(size, size))
+    return Separation(bases[0] @ found @ bases[1].T, images[0] @ found @ images[1].T / part, reported)

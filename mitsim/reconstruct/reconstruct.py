@@ -15,13 +15,14 @@ from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, chec
 from mitsim.core.exr import verify_files, write_frame
 from mitsim.core.files import output_folder, plain, read_json, remove_page, write_bytes, write_json
 from mitsim.core.images import card, from_above, normalise, png, span
-from mitsim.core.job import Clock, Cost, Job, Limits
+from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
 from mitsim.reconstruct.accumulation import Accumulation, accumulate, check_factorising, print_energy
+from mitsim.reconstruct.defects import LeftOut
 from mitsim.reconstruct.depth import Depth, DepthMap, best_depth, depth_map
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import Margin, move_factors
+from mitsim.reconstruct.focus import light_margin, move_factors, widen_factors
 from mitsim.reconstruct.misfit import Cause, Misfit, faulty_frames, find_misfit
 from mitsim.reconstruct.request import (
     IMAGE_FILE,
@@ -103,7 +104,7 @@ class Reconstruction(Solution):
     @property
     def depths(self) -> DepthMap | None:
         """Depth for each pixel, where it was requested and is reliable."""
-        return _by_pixel(self.focus)
+        return self.focus if isinstance(self.focus, DepthMap) and not self.focus.doubt else None
 
     @property
     def condition_whole(self) -> float | None:
@@ -328,34 +329,58 @@ def reconstruct_request(
     shots: Capture, factors: Factors, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
     """Recover the image of a request, see :func:`reconstruct`; the ``job`` gives clock and progress."""
-    method, asked, lam = request.method, request.inputs(shots, factors), request.lam
-    shots, factors, beside, solver = check_image(shots, factors, request)
+    asked, lam, doubts = request.inputs(shots, factors), request.lam, list[str]()
+    shots, factors, solver = check_image(shots, factors, request)
     # Depths that are looked for, and total variation, take as long as the data ask for.
-    cost = predict_cost(shots, factors) if method == TIKHONOV and not request.looks_for_depth else None
+    cost = predict_cost(shots, factors) if request.method == TIKHONOV and not request.looks_for_depth else None
     if cost:
         Cost(sum(cost.seconds.values()), cost.memory_bytes).check(f"{shots.name}: its image", Limits())
     clock = (job or Job()).apart("").clock
     clock.predict(cost.seconds if cost else {})
-    depth, shots, factors, doubts = _focus(shots, factors, request, clock)
+    focus: Depth | DepthMap | None = None
+    if request.focus is not None:
+        with clock.stage("focus"):
+            if request.focus == "map":
+                focus = depth_map(shots, factors, lam, request.depth_range)
+            elif request.focus == "auto":
+                focus = best_depth(shots, factors, request.depth_range)
+            else:
+                focus = Depth(float(request.focus))
+        doubts.append(focus.doubt)
+    if isinstance(focus, Depth):
+        of_depth = move_factors(factors, focus.mm)
+        shots, factors = of_depth.of(shots), of_depth.factors
+        if of_depth.hidden:
+            hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
+            doubts.append(f"At {focus.mm:.4g} mm the field stop takes most of the light of {hidden}.")
+    depths = focus if isinstance(focus, DepthMap) and not focus.doubt else None
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, solver, **request.iterative)
-    data, solution, misfit = _fit(data, depth, lam, clock)
+    with clock.stage("solve"):
+        solution = depths.solution if depths else data.solution(lam)
+    with clock.stage("misfit"):
+        data, solution, misfit = _judge(data, solution, depths, lam)
     with clock.stage("uncertainty"):
         shown = misfit.chi_square if misfit else 1.0
-        uncertainties = uncertainty(data, solution, shown) if solver.linear and not _by_pixel(depth) else None
+        uncertainties = uncertainty(data, solution, shown) if solver.linear and not depths else None
         if uncertainties and misfit and misfit.picture and shots.manifest.plan is None:
             # Of a simulated run the lamp and the place of every frame are known.
             frames = misfit.picture.uncertainty(solution.image)
             uncertainties = replace(uncertainties, sources={**uncertainties.sources, "frames": frames})
-    status = misfit.judge(solution.status) if misfit else solution.status
-    image = solution.image
-    if beside:
-        image = beside.inside(image)
+    status, image = misfit.judge(solution.status) if misfit else solution.status, solution.image
+    if request.margin:
+        inside = slice(request.margin, -request.margin)
+        image = image[inside, inside]
         uncertainties = uncertainties and replace(
-            uncertainties, sources={name: beside.inside(values) for name, values in uncertainties.sources.items()}
+            uncertainties, sources={name: values[inside, inside] for name, values in uncertainties.sources.items()}
         )
     doubts.append(uncertainties.loss(image) if uncertainties else "")
-    flags = (*status.flags, *(doubt for doubt in doubts if doubt), *_flags(data.shots, factors))
+    inherited = (
+        f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
+        for what, warnings in (("capture", data.shots.warnings), ("calibration", factors.warnings))
+        for warning in warnings
+    )
+    flags = (*status.flags, *filter(None, doubts), *inherited)
     left, right = data.model.sides
     return Reconstruction(
         **{**vars(solution), "image": image, "status": replace(status, flags=flags)},
@@ -367,107 +392,57 @@ def reconstruct_request(
         uncertainties=uncertainties,
         seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
         inputs=asked,
-        focus=depth,
+        focus=focus,
         predicted=cost,
     )
 
 
-def check_image(
-    shots: Capture, factors: Factors, request: ImageRequest
-) -> tuple[Capture, Factors, Margin | None, Solver]:
-    """Return shots, factors, margin and solver of a request, or refuse it before a frame is read."""
+def check_image(shots: Capture, factors: Factors, request: ImageRequest) -> tuple[Capture, Factors, Solver]:
+    """Return shots, factors and solver of a request, or refuse it before a frame is read."""
     solver = SOLVERS[request.method] if isinstance(request.method, str) else request.method
     factors.check_fit(shots)
     if request.focus is not None:
         check_parallax(factors.manifest.parallax, factors.name)
     if isinstance(request.focus, (int, float)):
         move_factors(factors, float(request.focus))
-    beside = Margin(request.margin) if request.margin else None
-    if beside:
-        wider = beside.factors(factors)
-        shots, factors = beside.of(wider.of(shots)), wider.factors
+    if request.margin:
+        wider = widen_factors(factors, request.margin)
+        shots, factors = light_margin(wider.of(shots), request.margin), wider.factors
     check_factorising(shots, factors, solver)
-    return shots, factors, beside, solver
+    return shots, factors, solver
 
 
-def _focus(
-    shots: Capture, factors: Factors, request: ImageRequest, clock: Clock
-) -> tuple[Depth | DepthMap | None, Capture, Factors, list[str]]:
-    if request.focus is None:
-        return None, shots, factors, []
-    depth: Depth | DepthMap
-    with clock.stage("focus"):
-        if request.focus == "map":
-            depth = depth_map(shots, factors, request.lam, request.depth_range)
-        elif request.focus == "auto":
-            depth = best_depth(shots, factors, request.depth_range)
+def _judge(
+    data: Accumulation, solution: Solution, depths: DepthMap | None, lam: float | Literal["auto"]
+) -> tuple[Accumulation, Solution, Misfit | None]:
+    """Return the misfit, and data and solution without defective pixels where frames fit better without them."""
+    if depths:
+        image = depths.image
+        misfit = depths.misfit(data.noise, data.factor_energy(image), print_energy(data.model, image))
+        # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
+        most = move_factors(data.factors, float(np.median(depths.mm)))
+        faults = faulty_frames(accumulate(most.of(data.shots), most.factors), image, depths.lam)
+        return data, solution, replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
+    found = find_misfit(data, solution)
+    if found and found.defects:
+        defects, now, whole = None, found, data
+        for _ in range(_DEFECT_ROUNDS):
+            if now.defects is None:
+                break
+            defects = now.defects.with_others(defects)
+            data = accumulate(LeftOut(whole, defects), whole.factors, whole.solver, **whole.iterative)
+            solution = data.solution(lam)
+            now = find_misfit(data, solution) or now
+        if now.flagged:
+            now = find_misfit(data, solution, with_defects=False) or now
+        if now.flagged and now.unexplained > _BETTER * found.unexplained:
+            data, solution = whole, whole.solution(lam)
+            found = find_misfit(data, solution, with_defects=False)
         else:
-            depth = Depth(float(request.focus))
-    doubts = [depth.doubt]
-    if isinstance(depth, Depth):
-        of_depth = move_factors(factors, depth.mm)
-        shots, factors = of_depth.of(shots), of_depth.factors
-        if of_depth.hidden:
-            hidden = f"{of_depth.hidden:.1%} of the scene's pixels, which come out dark"
-            doubts.append(f"At {depth.mm:.4g} mm the field stop takes most of the light of {hidden}.")
-    return depth, shots, factors, doubts
-
-
-def _by_pixel(depth: Depth | DepthMap | None) -> DepthMap | None:
-    return depth if isinstance(depth, DepthMap) and not depth.doubt else None
-
-
-def _fit(
-    data: Accumulation, depth: Depth | DepthMap | None, lam: float | Literal["auto"], clock: Clock
-) -> tuple[Accumulation, Solution, Misfit | None]:
-    by_pixel = _by_pixel(depth)
-    with clock.stage("solve"):
-        solution = by_pixel.solution if by_pixel else data.solution(lam)
-    with clock.stage("misfit"):
-        misfit = _misfit_at(data, by_pixel) if by_pixel else find_misfit(data, solution)
-        if misfit and misfit.defects:
-            data, solution, misfit = _without_defects(data, lam, misfit)
-        separable = data.factors.status.verdict is not Verdict.NOT_SEPARABLE
-        explained = separable and (misfit is None or not misfit.flagged)
-        if data.solver.linear and not by_pixel and lam == "auto" and (data.factors.lacking or not explained):
-            lack = data.lack(solution.image)
-            known = (lack.struck, lack.energy) if lack else None
-            solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
-    return data, solution, misfit
-
-
-def _misfit_at(data: Accumulation, depths: DepthMap) -> Misfit:
-    """Return the misfit with a depth for each pixel."""
-    misfit = depths.misfit(data.noise, data.factor_energy(depths.image), print_energy(data.model, depths.image))
-    # At the depth of most of the scene a frame that is not what it says is off by more than depth puts it.
-    most = move_factors(data.factors, float(np.median(depths.mm)))
-    faults = faulty_frames(accumulate(most.of(data.shots), most.factors), depths.image, depths.lam)
-    return replace(misfit, flagged=True, cause=Cause.FRAMES, faults=faults) if faults else misfit
-
-
-def _without_defects(
-    data: Accumulation, lam: float | Literal["auto"], misfit: Misfit
-) -> tuple[Accumulation, Solution, Misfit | None]:
-    """Return data, solution and misfit without defective pixels, or unchanged where the frames fit no better."""
-    found, now, without = None, misfit, data
-    for _ in range(_DEFECT_ROUNDS):
-        if now.defects is None:
-            break
-        found = now.defects.with_others(found)
-        without = accumulate(found.left_out(data), data.factors, data.solver, **data.iterative)
-        solution = without.solution(lam)
-        now = find_misfit(without, solution) or now
-    if now.flagged:
-        now = find_misfit(without, solution, with_defects=False) or now
-    if now.flagged and now.unexplained > _BETTER * misfit.unexplained:
-        solution = data.solution(lam)
-        return data, solution, find_misfit(data, solution, with_defects=False)
-    return without, solution, replace(now, defects=found)
-
-
-def _flags(shots: Capture, factors: Factors) -> tuple[str, ...]:
-    return tuple(
-        f"The {what} was flagged: {' '.join(warning.split()).rstrip('.')}."
-        for what, warnings in (("capture", shots.warnings), ("calibration", factors.warnings))
-        for warning in warnings
-    )
+            found = replace(now, defects=defects)
+    explained = data.factors.status.verdict is not Verdict.NOT_SEPARABLE and not (found and found.flagged)
+    if data.solver.linear and lam == "auto" and (data.factors.lacking or not explained):
+        lack = data.lack(solution.image)
+        known = (lack.struck, lack.energy) if lack else None
+        solution = data.prepared.solve(data.frames, lam, explained=explained, lack=known)
+    return data, solution, found

@@ -20,13 +20,11 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
-from mitsim.reconstruct.depth import CommonBasis, Depth, best_depth
-from mitsim.reconstruct.factorisation import group_pixels
+from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import ColumnSpline, FactorOfDepths, move_factors
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
-from mitsim.reconstruct.solver import prepare, project_frames
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_faults import dark, with_frames
 
@@ -395,22 +393,6 @@ def test_a_depth_without_factors_is_refused() -> None:
     small = replace(calibrated(), left=np.ones((PIXELS, 3)))
     with pytest.raises(MitsimError, match="3 x 40 projector pixels"):
         move_factors(small, 380.0)
-
-
-@pytest.mark.parametrize(("patterns", "own"), [("dots:4", True), ("hadamard:4", False)])
-def test_dots_own_basis_leaves_as_much_as_the_common_one(patterns: str, own: bool) -> None:
-    """Depth moves rows by less than a pixel here, and their dots' shadows span little."""
-    level = replace(calibrated(), manifest=calibrated().manifest.model_copy(update={"parallax": LEVEL}))
-    run, ends = shots(400.0, patterns), (-2e-4, 2e-4)
-    groups = tuple(group_pixels(each) for each in run.patterns)
-    one, each = CommonBasis(run, level, ends), CommonBasis(run, level, ends, (groups[0], groups[1]))
-    assert (each.stack.shape[1] < one.stack.shape[1] / 2) == own
-    for shift in (-2e-4, -0.7e-4, 0.0, 1.3e-4):
-        left = []
-        for depths in (one, each):
-            sides = prepare(depths.side(0, shift), depths.side(1, shift), *run.patterns)
-            left.append(depths.energy - float(np.square(project_frames(sides.left, sides.right, depths.stack)).sum()))
-        assert left[1] == pytest.approx(left[0], abs=1e-7 * one.energy)
 
 
 def test_a_part_of_an_oblong_sensor() -> None:

@@ -14,7 +14,7 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.focus import Margin
+from mitsim.reconstruct.focus import widen_factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
 from tests.unit.reconstruct.test_focus import PARALLAX, WINDOW, N, shadow
@@ -66,7 +66,7 @@ def test_a_margin_takes_up_light_from_outside_the_window(patterns: str, bright: 
 def test_a_margins_factors_are_those_of_a_wider_window() -> None:
     """With its parallax: cells are as wide as the window's, and move as they would. (Planted: the parallax as it was;
     one side's cells.)"""
-    found = Margin(4).factors(calibrated())
+    found = widen_factors(calibrated(), 4)
     known, rows = found.factors.manifest.parallax, found.rows.stop - found.rows.start
     assert PIXELS - 12 < rows < PIXELS and found.factors.left.shape == (rows, N + 8)
     cell = WINDOW / N
