@@ -680,7 +680,7 @@ class PixelDepths:
                 light = image[lit] * (left * u).sum(axis=1) * (right * v).sum(axis=1)
                 size = np.square(u).sum(axis=1) * np.square(v).sum(axis=1)
                 own[lit] = np.square(((u @ rest) * v).sum(axis=1) + light) / size
-        return explained[1:] - explained[0]
+        return np.asarray(explained[1:] - explained[0])
 
     def _columns_of_frames(
         self, shift: FloatArray
@@ -771,16 +771,16 @@ class Arrivals:
         for side, own, opened in zip(sides, basis.patterns, self._open, strict=True):
             patterns.append(np.ones((side.shape[1], 1)) if opened else own)
             counts.append(own.shape[1] if opened else 1)
-        prepared = prepare(*sides, *patterns)
+        prepared = prepare(sides[0], sides[1], patterns[0], patterns[1])
         sums = {key: prepared.accumulator() for key in np.ndindex(*counts)}
         for each in basis.frames:
             (row, column), (down, across) = (each.row, each.column), self._open
-            own = sums[row if down else 0, column if across else 0]
-            own.add(each.frame, 0 if down else row, 0 if across else column)
-        scales = {key: prepared.problem(own).scale for key, own in sums.items()}
+            of_class = sums[row if down else 0, column if across else 0]
+            of_class.add(each.frame, 0 if down else row, 0 if across else column)
+        scales = {key: prepared.problem(each).scale for key, each in sums.items()}
         found = {}
         for lam in LAMBDAS:
-            images = [prepared.solve(own, lam * scales[key]).image for key, own in sums.items()]
+            images = [prepared.solve(each, lam * scales[key]).image for key, each in sums.items()]
             found[lam] = np.stack(images).reshape(*counts, *images[0].shape)
         return found
 
@@ -805,7 +805,7 @@ class Arrivals:
 
     def _arriving(self, seen: FloatArray, shift: float) -> FloatArray:
         """Return the light (n, n') where each pixel's would be at 1/z changed by ``shift``, linear between pixels."""
-        places, parts = [], []
+        places, parts = list[npt.NDArray[np.intp]](), list[FloatArray]()
         for side, classes, opened in zip(self.basis.sides, self._classes, self._open, strict=True):
             place = np.arange(classes.size) + (side.edges * shift + self._margin if opened else 0.0)
             whole = np.floor(place).astype(np.intp)
