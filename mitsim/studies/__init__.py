@@ -35,6 +35,7 @@ and torch, which may be missing."""
 SHARED = {
     **dict.fromkeys(("distance", "binning", "resolution", "depth"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient", "reflectivity"), "light_studies"),
+    **dict.fromkeys(("multishot", "convolutional"), "other_cameras"),
 }
 """Modules of several studies of many points, whose ``STUDIES`` have each by its name."""
 GONE = {

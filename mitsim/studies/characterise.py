@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,9 +29,8 @@ from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, TITLE_L
 from mitsim.sensor.camera_fit import FoundCamera, Stated, find_camera
 from mitsim.sensor.chain import mean_dark_current
 from mitsim.sensor.emva import LEAST_DARK, LINE, LINEAR, MOST_FITTED, QUANTISATION, SPLIT, Alike, Session, figures
-from mitsim.studies.emva_frames import Frames, draw_sessions
+from mitsim.studies.camera_frames import Frames, draw_sessions, mean_image, read_again, read_sets, remarks
 from mitsim.studies.emva_options import Procedure
-from mitsim.studies.flat_frames import read_again, read_sets, remarks
 from mitsim.studies.framework.page import Part, build_findings, text_table
 from mitsim.studies.framework.run import study_folder, write_figures
 
@@ -48,8 +47,7 @@ _WHOLE = 1e4
 # ---- tables of the measured numbers ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class EmvaFigure:
+class EmvaFigure(NamedTuple):
     """A figure of EMVA 1288, which `mitsim.sensor.emva.figures` finds by its name.
 
     `set` is the value that a camera sets, `root` is True if a variance is found, and `method` if no file sets the
@@ -88,15 +86,6 @@ def _nonuniformity(frames: Frames, kind: str, part: str) -> float:
     return float(dict(zip(SPLIT, (values.sum(), *values), strict=True))[part])
 
 
-def _split(kind: str, unit: str) -> dict[str, EmvaFigure]:
-    return {
-        f"{kind}_{part}": EmvaFigure(
-            f"{kind.upper()}1288.{part}", unit, partial(_nonuniformity, kind=kind, part=part), root=True
-        )
-        for part in SPLIT
-    }
-
-
 FIGURES: Mapping[str, EmvaFigure] = {
     "system_gain": EmvaFigure("K", "DN/e-", lambda frames: frames.sensor.gain_dn_per_e),
     "quantum_efficiency": EmvaFigure(
@@ -111,8 +100,12 @@ FIGURES: Mapping[str, EmvaFigure] = {
     "linearity_max": EmvaFigure("LE_max", "%", lambda frames: 0.0, method=True),
     "dark_current": EmvaFigure("mu_I.mean", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
     "dark_current_by_variance": EmvaFigure("mu_I.var", "e-/s", lambda frames: mean_dark_current(frames.sensor)),
-    **_split("dsnu", "e-"),
-    **_split("prnu", "%"),
+    **{
+        f"{kind}_{part}": EmvaFigure(
+            f"{kind.upper()}1288.{part}", unit, partial(_nonuniformity, kind=kind, part=part), root=True
+        )
+        for kind, unit in (("dsnu", "e-"), ("prnu", "%")) for part in SPLIT
+    },
 }  # fmt: skip
 FIELDS: Mapping[str, tuple[str, Callable[[SensorModel], float | None]]] = {
     "gain_dn_per_e": ("DN/e-", lambda model: model.gain_dn_per_e),
@@ -235,14 +228,14 @@ class Characterisation:
                 f"{noise:.2g} DN; raise black_level_dn or gain_dn_per_e"
             )
         for row in (*self.rows, *self.fields):
-            if row.deviations is None or abs(row.deviations) <= MOST_OFF:
-                continue
-            off = f"{row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off"
-            if row.symbol:
+            if row.deviations is not None and abs(row.deviations) > MOST_OFF:
+                off = f"{row.found:.5g} {row.unit}, {abs(row.deviations):.1f} standard errors off"
                 against = row.set if row.expected is None else row.expected
-                lines.append(f"{row.name}: found {off} {against:.5g}; the procedure does not fit this camera")
-            else:
-                lines.append(f"{row.name} of the camera found: {off} {row.set:.5g}, which is set")
+                lines.append(
+                    f"{row.name}: found {off} {against:.5g}; the procedure does not fit this camera"
+                    if row.symbol
+                    else f"{row.name} of the camera found: {off} {row.set:.5g}, which is set"
+                )
         return tuple(lines)
 
     def payload(self) -> dict[str, Any]:
@@ -264,9 +257,8 @@ class Characterisation:
 
     @property
     def message(self) -> str:
-        found = {row.name: row for row in self.fields}
-        named = {"Gain": "gain_dn_per_e", "read noise": "read_noise_e", "full well": "full_well_e"}
-        rows = {name: found[each] for name, each in named.items() if each in found}
+        named = {"gain_dn_per_e": "Gain", "read_noise_e": "read noise", "full_well_e": "full well"}
+        rows = {named[row.name]: row for row in self.fields if row.name in named}
         return ", ".join(
             f"{name} {row.found:{'.4g' if row.found < _WHOLE else '.0f'}} {row.unit}" for name, row in rows.items()
         )
@@ -280,13 +272,20 @@ class Characterisation:
     def parts(self) -> tuple[Part, Part]:
         """Tables and plots of the page."""
 
-        def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
-            return tuple(columns), tuple(tuple(_cell(row, name) for name in columns.values()) for row in rows)
+        def cell(row: Row, name: str) -> str:
+            value = getattr(row, name)
+            if name in ("found", "standard_error"):
+                return round_to_error(value, row.standard_error)
+            if value is None or isinstance(value, str):
+                return value or ""
+            return f"{value:{'.1f' if name == 'deviations' else '.5g'}}"
 
-        found = {"found": "found", "std. error": "standard_error"}
-        off, given = {"off by": "deviations"}, {} if self.real else {"set": "set"}
+        def table(rows: Sequence[Row], columns: Mapping[str, str]) -> tuple[Any, Any]:
+            return tuple(columns), tuple(tuple(cell(row, name) for name in columns.values()) for row in rows)
+
+        found, off = {"found": "found", "std. error": "standard_error"}, {"off by": "deviations"}
         figure = {"figure": "name", "symbol": "symbol", "unit": "unit", "camera" if self.real else "set": "set"}
-        camera = {"camera found": "name", "unit": "unit", **given, **found, **({} if self.real else off)}
+        compared = {**found} if self.real else {"set": "set", **found, **off}
         which = "the camera has" if self.real else "the one set"
         note = f"expected: where the procedure finds another figure than {which}, at these steps and frames"
         return (
@@ -299,7 +298,8 @@ class Characterisation:
             ),
             Part(
                 "The camera that explains the frames", "The fields of camera.toml, which --camera takes.",
-                *table(self.fields, camera), notes=tuple(self.found.notes),
+                *table(self.fields, {"camera found": "name", "unit": "unit", **compared}),
+                notes=tuple(self.found.notes),
             ),
         )  # fmt: skip
 
@@ -312,15 +312,6 @@ class Characterisation:
         return lines[:-1]
 
 
-def _cell(row: Row, name: str) -> str:
-    value = getattr(row, name)
-    if name in ("found", "standard_error"):
-        return round_to_error(value, row.standard_error)
-    if value is None or isinstance(value, str):
-        return value or ""
-    return f"{value:{'.1f' if name == 'deviations' else '.5g'}}"
-
-
 # ---- plots -----------------------------------------------------------------------------------------------------------
 
 
@@ -329,10 +320,9 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
     rows, saturates = {row.name: row for row in done.rows}, done.session.saturates
 
     def text(row: Row) -> str:
-        error = round_to_error(row.standard_error, row.standard_error)
+        found, error = (round_to_error(each, row.standard_error) for each in (row.found, row.standard_error))
         unit = row.unit.replace("e-", "e\N{SUPERSCRIPT MINUS}")
-        beside = f"{'camera found' if done.real else 'set'} {row.set:.5g}"
-        return typeset(f"{round_to_error(row.found, row.standard_error)} +- {error} {unit}, {beside}")
+        return typeset(f"{found} +- {error} {unit}, {'camera found' if done.real else 'set'} {row.set:.5g}")
 
     def chart(points: Callable[[Session], tuple[FloatArray, FloatArray]], title: str, x: str, y: str) -> Axes:
         axes = figure_of(3.3, COLUMN)[1]
@@ -342,9 +332,6 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
         axes.set_title(fill(title, TITLE_LETTERS), fontsize=FONT)
         label_axes(axes, x, y)
         return axes
-
-    def transfer(session: Session) -> tuple[FloatArray, FloatArray]:
-        return session.transfer()[1:]
 
     def straightness(session: Session) -> tuple[FloatArray, FloatArray]:
         photons, signal, noise = session.transfer()
@@ -358,8 +345,13 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
         return session.exposure_s[session.unlit], signal / rows["system_gain"].found
 
     title = f"Photon transfer: EMVA 1288 finds a gain of {text(rows['system_gain'])}"
-    axes = chart(transfer, title, "signal less dark signal [DN]", "variance less dark variance [DN$^2$]")
-    signal, noise = transfer(done.session)
+    axes = chart(
+        lambda session: session.transfer()[1:],
+        title,
+        "signal less dark signal [DN]",
+        "variance less dark variance [DN$^2$]",
+    )
+    _, signal, noise = done.session.transfer()
     full = float(signal[int(noise.argmax())]) if saturates else float(signal.max())
     line = np.array([0.0, MOST_FITTED * full if saturates else full])
     label = "fit to 70 %" if saturates else "fit"
@@ -380,28 +372,22 @@ def figures_of(done: Characterisation) -> Mapping[str, Figure]:
         charts["dark_current.png"] = chart(darkness, title, "exposure time [s]", y)
     for name, axes in charts.items():
         axes.legend(fontsize=FONT - 1, frameon=False, loc="upper left" if name == "photon_transfer.png" else "best")
-    drawn = {name: axes.figure for name, axes in charts.items()}
-    return {"deviations.png": _deviations(done), **drawn}
 
-
-def _deviations(done: Characterisation) -> Figure:
     figure, axes = figure_of(0.9 + 0.26 * len(done.rows), COLUMN)
-    place = np.arange(len(done.rows))[::-1]
     off = np.clip([row.deviations for row in done.rows], -2 * MOST_OFF, 2 * MOST_OFF)
+    place = np.arange(len(off))[::-1]
     axes.axvspan(-MOST_OFF, MOST_OFF, color="#eef2f7", zorder=0)
     axes.axvline(0, color=BLACK, lw=1)
     axes.plot(off, place, "o", color=BLUE, ms=7)
     names = [row.name.replace("_", " ").replace("dsnu", "DSNU").replace("prnu", "PRNU") for row in done.rows]
     axes.set_yticks(place, names, fontsize=FONT - 1)
-    far = sum(not abs(row.deviations or 0.0) <= MOST_OFF for row in done.rows)
+    far = int(np.count_nonzero(np.abs(off) > MOST_OFF))
     verdict = f"{far} of {len(names)} figures are" if far else f"None of {len(names)} figures is"
     axes.set_title(f"{verdict}\nmore than {MOST_OFF:g} standard errors off", fontsize=FONT)
-    most = 1.2 * max(MOST_OFF, float(np.abs(off).max()))
-    axes.set_xlim(-most, most)
+    axes.set_xlim(-1.2 * max(MOST_OFF, float(np.abs(off).max())), 1.2 * max(MOST_OFF, float(np.abs(off).max())))
     of = "the camera's" if done.real else "set"
-    label = f"found less {of} or expected\n[standard errors]; shaded: within {MOST_OFF:g}"
-    label_axes(axes, label, "", grid="x")
-    return figure
+    label_axes(axes, f"found less {of} or expected\n[standard errors]; shaded: within {MOST_OFF:g}", "", grid="x")
+    return {"deviations.png": figure, **{name: each.figure for name, each in charts.items()}}
 
 
 # ---- characterisation ------------------------------------------------------------------------------------------------
@@ -415,7 +401,7 @@ def characterise(
     `output` is a folder for page, plots, JSON and the camera file: new, empty, or of an earlier characterisation.
     """
     procedure, job = procedure or Procedure(), job or Job()
-    frames = Frames.of(sensor, procedure, capacity_of(sensor))
+    frames = Frames.of(sensor, procedure)
     bits = None if sensor.largest_dn is None else int(sensor.largest_dn).bit_length()
     source = f"simulated frames of {sensor.name}"
     stated = Stated(f"{sensor.name}, found", sensor.superpixel_pitch_um, source, bits, sensor.states_efficiency)
@@ -439,14 +425,13 @@ def characterise_frames(
     stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
 
     def measure(folder: str | None) -> Characterisation:
-        sets = read_sets(listed, job)
-        taken = [each.taken for each in sets]
+        taken = read_sets(listed, job)
         shape = taken[0].shape
         found = find_camera(
-            taken, lambda index: sets[index].mean_image(), stated, lambda places: read_again(listed, places, shape)
+            taken, partial(mean_image, listed), stated, lambda places: read_again(listed, places, shape)
         )
-        asked = {"folder": str(listed.folder), "shape": shape, "sets": len(sets)}
-        frames, about = Frames.as_taken(taken, found), remarks(sets, found)
+        asked = {"folder": str(listed.folder), "shape": shape, "sets": len(taken)}
+        frames, about = Frames.as_taken(taken, found), remarks(listed, found)
         return _compare(frames, taken, found, asked=asked, camera=facts.name, output=folder, real=True, about=about)
 
     return _write(measure, output)

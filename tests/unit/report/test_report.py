@@ -18,7 +18,7 @@ from mitsim.metrics import Quality
 from mitsim.report import demo_page as R
 from mitsim.report.demo_page import Trust
 from mitsim.report.pages import page_figure, stages_of
-from mitsim.studies.demo import _no_image
+from mitsim.studies.demo import doubts
 from mitsim.studies.framework.page import Part, build_findings
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
@@ -308,7 +308,7 @@ def test_a_gain_over_nothing_is_no_gain(decibel: float, headline: str) -> None:
         for name, value in (("49 dots", decibel), ("B", -65.3))
     )
     assert R.verdict(ours, theirs)[0].startswith(headline)
-    assert bool(_no_image(ours)) == ("no image" in headline)
+    assert bool(doubts(ours)) == ("no image" in headline)
 
 
 def test_refuses_what_it_cannot_show() -> None:

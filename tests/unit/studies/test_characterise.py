@@ -151,7 +151,7 @@ def test_few_bits_and_clipped_darks_leave_the_predicted_spread(name: str) -> Non
 
 
 def test_a_camera_that_is_not_as_its_file_says_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mitsim.studies import emva_frames as module
+    from mitsim.studies import camera_frames as module
 
     frames = module.expose
     monkeypatch.setattr(module, "expose", lambda light, *rest: np.rint(60 + 1.2 * (frames(light, *rest) - 60.0)))

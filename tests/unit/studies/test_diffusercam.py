@@ -13,7 +13,7 @@ from mitsim.metrics import psnr
 from mitsim.reconstruct.convolution import Classes
 from mitsim.reconstruct.point_spread import ShiftedLight
 from mitsim.report import CONVENTIONS
-from mitsim.studies.convolutional_study import best_image, race, take
+from mitsim.studies.other_cameras import best_image, race, take
 
 N = 12
 SENSOR = load_sensor(shipped_path("calibration", "imx249.toml"))
@@ -30,24 +30,23 @@ def test_exposure_follows_the_convention_and_noise_the_light(convention: str) ->
     0 to 5 / sqrt(4950), mean square 1 to 5 sqrt(2 / 4950). Dark current adds some electrons at most.
     """
     family = parse_patterns("dots:3", N)
-    shots = take(CAMERA, family, TRUTH, SENSOR, convention)
+    frames, _ = take(CAMERA, family, TRUTH, SENSOR, convention)
     own = CAMERA.under(family).image_of(TRUTH)
     uniform = CAMERA.image_of(TRUTH)
     peak = own.max() if convention == "equal peak" else uniform.max()
     electrons = own * 0.8 * 4 * 32360 / peak / (9 if convention == "equal total" else 1)
     unit = electrons.max() / own.max()
     deviation = np.sqrt(electrons + (2 * 6.7) ** 2 + 1 / 12 / 0.125**2)
-    residual = (shots.frames * unit - electrons) / deviation
+    residual = (frames * unit - electrons) / deviation
     assert abs(residual.mean()) < 5 / np.sqrt(residual.size)
     assert np.mean(residual**2) == pytest.approx(1, abs=5 * np.sqrt(2 / residual.size))
-    assert shots.saturated == 0
 
 
 def test_the_best_lambda_is_found_to_a_tenth_of_a_decibel() -> None:
     classes = Classes(CAMERA, 1)
-    shots = take(CAMERA, parse_patterns("uniform", N), TRUTH, SENSOR)
-    solution, db = best_image(classes, shots, TRUTH)
-    projected = classes.project(shots.frames)
+    frames, _ = take(CAMERA, parse_patterns("uniform", N), TRUTH, SENSOR)
+    solution, db = best_image(classes, frames, TRUTH)
+    projected = classes.project(frames)
     fine = [
         psnr(classes.factorise(classes.largest * 10**exponent).solve(projected).image, TRUTH)
         for exponent in np.arange(-9, 0.01, 0.05)
@@ -71,6 +70,6 @@ def test_both_solvers_come_to_one_image(sensor: tuple[int, int] | None, k: int) 
 
 
 def test_iterations_that_do_not_arrive_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsim.studies.convolutional_study._MOST_STEPS", 2)
+    monkeypatch.setattr("mitsim.studies.other_cameras._MOST_STEPS", 2)
     with pytest.raises(MitsimError, match=r"^iterations did not come to the direct solution at lambda [^\n]+$"):
         race(Classes(CAMERA, 3), Classes(CAMERA, 3), TRUTH, SENSOR, 0)

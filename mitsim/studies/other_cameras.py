@@ -1,0 +1,556 @@
+"""Studies of cameras that the paper compares with: a mask that moves in place of the light, and a diffuser for a mask.
+
+*multishot*, section IV-D: the mask moves by -15 to +15 of its features, and there are as many frames as patterns. The
+paper does not name the axes; a grid of k x k places has as many frames as dots of period k, and is taken here. A line
+of 49 places along the rows, as a mask on one slide would go, is idealised only, because it would take 49 calibrations.
+Frames through a mask at rest share the error of one calibration, those through a moved one have seven.
+
+SweepCam (Hua, Nakamura, Asif & Sankaranarayanan, TPAMI 2020) moves the mask instead of the light. Moved by a along the
+rows and by b along the columns, a separable mask casts Y_ab = Phi_L(a) X Phi_R(b)^T. For places on a grid, all frames
+side by side are one frame of a separable camera whose factors are those of the places on top of each other,
+
+    [Y_ab]_ab = [Phi_L(a)]_a X [Phi_R(b)]_b^T,
+
+so that :mod:`mitsim.reconstruct.solver` solves them exactly, as it does one frame. Light is traced up to the mask, so
+one scene's light serves all places.
+
+*convolutional*, section V-E and figure 12: a DiffuserCam under uniform light and 4 to 49 dots. A convolutional camera
+has "no simple closed form", and its iterative reconstruction takes ten times as long as the separable one. The point
+spread function is that of a rendered diffuser (:mod:`mitsim.transport.plugins.diffuser`) and, with `-D psf=FILE`, also
+a measured one: the picture of DiffuserCam's tutorial, which mitsim does not ship. The sensor gets all light; the speed
+of both solvers is measured also on a sensor that ends where the picture does. Lambda is the best one. Times are CPU
+seconds on one thread, and equal error is an error within 1 % of the direct solution's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
+from mitsim.acquire.reference import rendered_psf
+from mitsim.bench.apparatus import Apparatus
+from mitsim.bench.request import Exposure
+from mitsim.calibrate.board_session import Session
+from mitsim.calibrate.calibrate import estimate
+from mitsim.calibrate.lit_session import LitSession
+from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
+from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import integer, stream
+from mitsim.devices.mask_profile import load_psf
+from mitsim.devices.patterns import PatternFamily, parse_patterns
+from mitsim.devices.sensor import SensorModel
+from mitsim.devices.session import load_recipe
+from mitsim.metrics import psnr, relative_error
+from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.reconstruct.convolution import Classes, solve_iteratively
+from mitsim.reconstruct.point_spread import ShiftedLight
+from mitsim.reconstruct.solution import Solution
+from mitsim.reconstruct.solver import centre_columns, centre_frame, prepare
+from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, MODELS, RENDERED
+from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
+from mitsim.report.pages import Mean
+from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
+from mitsim.studies.framework.claims import Gain, Holds, Judged, stated, within
+from mitsim.studies.framework.experiment import QUICK_IMAGES, SIDE, Axes, Found, Point, Scope, Study, picture
+from mitsim.studies.framework.panels import Images, Lines
+from mitsim.studies.framework.studio import Image, Studio, flags_of, image_arrays
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+EXPOSURES = (EQUAL_PEAK, EQUAL_FRAME)
+
+# -------- A camera whose mask moves
+
+Places = Mapping[float, Pair]
+"""Left and right factor, (pixels, n) each, of the camera with its mask moved so far [mm] along both axes."""
+
+
+def move_mask(bench: Apparatus, row_mm: float, column_mm: float) -> Apparatus:
+    """Return a bench whose mask has its centre so far off the axis; only for what is made of traced light."""
+    offset = {"mask_offset_row": row_mm, "mask_offset_column": column_mm}
+    return replace(bench, devices=replace(bench.devices, camera=bench.geometry.model_copy(update=offset)))
+
+
+def ideal_places(bench: Apparatus, places_mm: Iterable[float], board_flux: float) -> Places:
+    """Return factors of the paper's model; a pixel of a white board puts ``board_flux`` on the sensor [W m^-2]."""
+
+    def camera(row: float, column: float) -> IdealCamera:
+        return IdealCamera(move_mask(bench, row, column), bench.geometry.mask)
+
+    def white(row: float, column: float) -> Frame:
+        (frame,) = camera(row, column).frames(bench.family("uniform"), np.full((bench.n, bench.n), board_flux))
+        return frame
+
+    return _consistent({place: camera(place, place).calibrated(board_flux) for place in places_mm}, bench, white)
+
+
+def calibrated_places(bench: Apparatus, places_mm: Sequence[float], seed: int, accuracy: float = 1e-3) -> Places:
+    """Return factors as sessions with the mask at each place estimate them, all in one board's light.
+
+    One place a side needs one session, not each frame, because a mask that has moved along both axes determines the
+    left factor of its row and the right one of its column. The sessions are rendered without the sensor's noise, whose
+    effect on factors is added in closed form (:func:`mitsim.reconstruct.factors.predicted_error`): seven times 512
+    noisy frames take four times as long. ``seed`` and ``accuracy`` are those of
+    :meth:`mitsim.bench.apparatus.Bench.calibrate`; every place has noise of its own.
+    """
+    recipe, job = load_recipe(), Job()
+    session = Session(bench, recipe, seed)
+    light = session.trace(session.plan(accuracy, job), job)
+
+    def lit(row: float, column: float) -> LitSession:
+        own = Session(move_mask(bench, row, column), recipe, seed)
+        return LitSession.of(own, light.behind(own.board), Job())
+
+    def calibrate(place: float) -> Pair:
+        own = lit(place, place)
+        clean, _ = estimate(own, Job(), noise_free=True)
+        count, sides = np.sqrt(session.signs.shape[1]), (clean.left, clean.right)
+        noisy = []
+        for name, side, other in zip(("left", "right"), sides, sides[::-1], strict=True):
+            deviation = own.response_noise / (count * np.linalg.norm(other.sum(axis=1)))
+            noise = stream(seed, "mask", name, f"{place:g}").standard_normal(side.shape)
+            noisy.append(side + deviation * noise)
+        return noisy[0], noisy[1]
+
+    return _consistent({place: calibrate(place) for place in places_mm}, bench, lambda *at: lit(*at).white)
+
+
+def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float], Frame]) -> Places:
+    """Return factors whose products hold between places as well.
+
+    A session does not determine how its product is shared between left and right, not even their sign. One frame of the
+    board in uniform light through the mask at each place's row and the first one's column does (``white``, at row and
+    column [mm]).
+    """
+    first, found = next(iter(factors)), {}
+    for place, (left, right) in factors.items():
+        modelled = np.outer(left.sum(axis=1), factors[first][1].sum(axis=1))
+        measured = Exposer(bench.devices, 1.0, 0).electrons(white(place, first))
+        if bench.geometry.centred:
+            modelled, measured = centre_frame(modelled), centre_frame(measured)
+        share = float(np.vdot(modelled, measured) / np.vdot(measured, measured))
+        found[place] = left / share, right * share
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMask:
+    """Uniform frames of a scene through a mask at several places, by one of :data:`mitsim.report.MODELS`."""
+
+    lit: LitScene
+    model: str
+    factors: Places
+    seed: int
+    _formed: dict[tuple[float, float], ExpectedFrames] = field(default_factory=dict)
+
+    def expected_frames(self, row_mm: float, column_mm: float) -> ExpectedFrames:
+        """Return the frame through the mask at one place, without noise."""
+        place = row_mm, column_mm
+        if place not in self._formed:
+            bench = move_mask(self.lit.bench, *place)
+            self._formed[place] = self.lit.expected_frames(self.model, bench.family("uniform"), bench=bench)
+        return self._formed[place]
+
+    def seconds(self, rows_mm: Sequence[float], columns_mm: Sequence[float], exposure: str) -> float:
+        """Return the exposure time [s] of each frame of a grid by one of :data:`mitsim.report.CONVENTIONS`."""
+        places = list(product(rows_mm, columns_mm))
+        if exposure == EQUAL_PEAK:
+            brightest = max(peak_irradiance(self.expected_frames(*place)) for place in places)
+            return Exposure().choose(self.lit.bench.devices, brightest)
+        return self.lit.uniform_s(self.model) / (len(places) if exposure == EQUAL_TOTAL else 1)
+
+    def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
+        """Solve one exposure of so many ``seconds`` at each place of a grid, at automatic lambda."""
+        left = np.concatenate([self.side(0, place) for place in rows_mm])
+        right = np.concatenate([self.side(1, place) for place in columns_mm])
+        uniform = np.ones((self.lit.bench.n, 1))
+        model = prepare(left, right, uniform, uniform)
+        sums = model.accumulator()
+        with single_threaded_blas():
+            sums.add(np.block([[self.measure(row, column, seconds) for column in columns_mm] for row in rows_mm]), 0, 0)
+            return model.solve(sums)
+
+    def side(self, axis: int, place: float) -> FloatArray:
+        """Return a factor as the solver takes it: each loses its means by itself, as frames do."""
+        factor = self.factors[place][axis]
+        return centre_columns(factor) if self.lit.bench.geometry.centred else factor
+
+    def measure(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
+        """Return the noisy frame at one place [electrons/s], less ambient light as a user subtracts it."""
+        bench, expected = self.lit.bench, self.expected_frames(row_mm, column_mm)
+        speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
+        exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
+        family = bench.family("uniform")
+        ((frame, _, _),) = exposer.measurements(family, expected)
+        frame = frame - taken_off(exposer, family, expected)
+        return centre_frame(frame) if bench.geometry.centred else frame
+
+
+REACH = 15.0
+"""Features that the mask moves either way."""
+GRIDS = {2: (0, 6), 3: (0, 3, 6), 4: (0, 2, 4, 6), 7: tuple(range(7))}
+"""Indices along an axis of the seven places between both ends, by their number: all are calibrated once."""
+UNIFORM, SWEPT, LINE, DOTS = "uniform frames", "SweepCam", "SweepCam, along rows alone", "shifting dots"
+_FRAMES = 49
+_COUNTS_DB = 0.5
+"""A gain that counts: a tenth of the squared error."""
+
+
+def _multishot_measure(studio: Studio, point: Point) -> Found:
+    model, method, seed, count = point["model"], point["patterns"], int(point["seed"]), int(point["frames"])
+    lit, side = studio.lit_scene(point.setup), round(count**0.5)
+    bench, noise_seed = lit.bench, seed if model == RENDERED else seed + 1
+
+    def spread(number: int) -> tuple[float, ...]:
+        return tuple(float(place) for place in np.linspace(-REACH, REACH, number) * bench.geometry.mask_feature)
+
+    def factors() -> Places:
+        """Return those of seven places, the middle one on the axis."""
+        places = spread(7)
+        if model == IDEALISED:
+            return ideal_places(bench, places, lit.board_flux)
+        key = bench.devices_digest, places, seed  # what a session sees, whatever is printed
+        return studio.once("places", 1, key, lambda: calibrated_places(bench, places, seed))
+
+    images: dict[str, Image] = {}
+    if method in (SWEPT, LINE):
+        rows = spread(_FRAMES) if method == LINE else tuple(spread(7)[index] for index in GRIDS[side])
+        columns = (0.0,) if method == LINE else rows
+        known = ideal_places(bench, (*rows, *columns), lit.board_flux) if method == LINE else factors()
+        mask = MovedMask(lit, model, known, noise_seed)
+        for exposure in EXPOSURES:
+            seconds = mask.seconds(rows, columns, exposure)
+            found = mask.solve(rows, columns, seconds)
+            flags = flags_of(found.status)
+            images[exposure] = Image(found.image, lit.quality(found.image), found.lam, count, seconds, flags)
+    else:
+        ones = np.ones((bench.n, 1), np.int8)
+        still = PatternFamily(UNIFORM, ones.repeat(count, axis=1), ones)
+        family = bench.family(f"dots:{side}") if method == DOTS else still
+        frames = Unexposed(lit, model, family, factors()[0.0], bench.geometry.centred, noise_seed)
+        images = {exposure: Image.of(frames, frames.seconds(exposure)) for exposure in EXPOSURES}
+    kept = point.setup.picture in (*QUICK_IMAGES, None) and side in (1, 7) and method != LINE
+    arrays = image_arrays(images[EQUAL_FRAME].image, lit.truth) if kept else {}
+    return Found(tuple(point.row(exposure=exposure, **image.row()) for exposure, image in images.items()), arrays)
+
+
+def _is_measured(values: Mapping[str, object]) -> bool:
+    if values["patterns"] == LINE:
+        return values["model"] == IDEALISED and values["frames"] == _FRAMES
+    return values["frames"] != 1 or values["patterns"] == UNIFORM
+
+
+_gain = partial(Gain, where={"frames": _FRAMES}, at_least=_COUNTS_DB)
+MULTISHOT = Study(
+    "multishot",
+    "The mask moved, or the light",
+    "Do dots beat as many uniform frames through a mask that moves?",
+    points=Axes(
+        {"patterns": (UNIFORM, SWEPT, DOTS, LINE), "frames": (1, *(side**2 for side in GRIDS)), "model": MODELS},
+        quick={"frames": (1, _FRAMES)},
+        quick_prints=1,
+        kept=_is_measured,
+    ),
+    measure=_multishot_measure,
+    claims=(
+        stated("One uniform frame gives 21.3 to 22.9 dB", 21.3, 22.9, patterns=UNIFORM, frames=1),
+        stated("SweepCam with 49 frames gives 24.9 to 26.8 dB, here on a grid", 24.9, 26.8, patterns=SWEPT, frames=49),
+        stated("The same on a line along the rows, idealised", 24.9, 26.8, patterns=LINE),
+        stated("49 shifting dots give 34 to 35.5 dB", 34.0, 35.5, patterns=DOTS, frames=_FRAMES),
+        _gain("49 dots beat SweepCam's 49 frames", DOTS, SWEPT, paper="higher"),
+        _gain("SweepCam's 49 frames beat 49 frames through a mask at rest", SWEPT, UNIFORM),
+    ),
+    panels=(
+        Lines(
+            "frames",
+            "number of frames [1]",
+            where={"patterns": (UNIFORM, SWEPT, DOTS)},
+            each="exposure",
+            shared={"patterns": UNIFORM, "frames": 1},
+            log=True,
+        ),
+        Images(
+            "patterns",
+            title=f"Images of 49 frames, exposure {EQUAL_FRAME}",
+            where={"exposure": EQUAL_FRAME, "frames": _FRAMES},
+            columns=(UNIFORM, SWEPT, DOTS),
+        ),
+    ),
+)
+
+# -------- A diffuser for a mask: noisy frames, the image nearest to the truth, and the speed of both solvers
+
+MEASURED, TRACED = "measured", "rendered"
+WHOLE, CROPPED = "all light", "cropped"
+PERIODS = (1, 2, 3, 4, 5, 7)
+"""The paper's numbers of patterns: 1 to 49."""
+_N = 128
+"""Pixels a side of the images of test pictures, as the paper's."""
+_REDUCE, _SHAPE, _PITCH_MM = 4, (300, 400), 4 * 5.86e-3
+"""The public picture, 1200 x 1600, in pixels of four; the traced one has the same, as large as IMX249's."""
+WHITE_W_M2, WAVELENGTH_NM = 0.3, 550.0
+"""Irradiance where all light of a white, uniformly lit scene falls: the paper's projector (0.14 W over 120 mm square
+at 400 mm) on a bare sensor, 9.7 W m^-2 / pi x 0.0144 m^2 / 0.16 m^2; in green. Exposure follows the peak, so both
+only set how much dark current there is."""
+_LEAST_LAMBDA = 1e-9
+"""Lambda over the largest of S at which the search for the best one ends: shot noise of full wells calls for 1e-7."""
+_BEYOND_DB = 2.0
+"""Fall of PSNR below the best so far at which the search, from large lambda to small, is over."""
+_FINER = (0.5, 0.25)
+"""Steps [decades] by which the search then moves: a quarter of a decade changes PSNR by 0.1 dB at most."""
+_EQUAL_ERROR, _EQUAL_ANSWER = 1.01, 1e-6
+"""Where iterations have come as far as a direct solution: an error against the truth within 1 % of its own, 0.09 dB;
+and their relative difference, which no image shows."""
+_LOOSE, _TIGHT = 1e-6, 1e-12
+"""Residuals at which conjugate gradients within the direct solver end, for either."""
+_MOST_STEPS = 1000
+"""Iterations at most: 170 were seen to the equal answer."""
+
+
+def take(
+    camera: ShiftedLight, family: PatternFamily, reflectance: FloatArray, sensor: SensorModel,
+    convention: str = EQUAL_PEAK, seed: int = 0,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """Return noisy frames of an (n, n) reflectance under a family of 0/1 patterns, and the exposure of each [s].
+
+    The frames are (patterns, rows, columns) in the unit of ``ShiftedLight.image_of``: a white scene is 1. The exposure
+    follows one of :data:`mitsim.report.CONVENTIONS`.
+    """
+    expected = np.maximum(camera.under(family).image_of(reflectance), 0.0)  # transforms leave 1e-17 below zero
+    peak = float(expected.max())
+    if convention != EQUAL_PEAK:
+        peak = float(camera.under(parse_patterns("uniform", family.n)).image_of(reflectance).max())
+    seconds = exposure_for_peak(peak * WHITE_W_M2, Exposure().fraction, sensor, WAVELENGTH_NM)
+    if convention == EQUAL_TOTAL:
+        seconds /= len(expected)
+    unit = float(electrons_from_irradiance(WHITE_W_M2, seconds, sensor, WAVELENGTH_NM))
+    dark, frames = sensor.superpixel_dark_current_e_per_s * seconds, np.empty_like(expected)
+    for index, frame in enumerate(expected):
+        shot, read = (stream(seed, "diffuser camera", noise, family.name, index) for noise in ("shot", "read"))
+        frames[index] = (dn_to_electrons(expose(frame * unit, seconds, sensor, shot, read), sensor) - dark) / unit
+    return frames, seconds
+
+
+def best_image(classes: Classes, frames: FloatArray, truth: FloatArray) -> tuple[Solution, float]:
+    """Return the direct solution nearest to the truth over lambda, to a quarter of a decade, and its PSNR [dB]."""
+    projected = classes.project(frames)
+
+    def solve(lam: float) -> tuple[Solution, float]:
+        solution = classes.factorise(lam).solve(projected)
+        return solution, psnr(solution.image, truth)
+
+    relative, best = 1.0, solve(classes.largest)
+    while relative > _LEAST_LAMBDA:
+        relative /= 10
+        found = solve(relative * classes.largest)
+        if found[1] < best[1] - _BEYOND_DB:
+            break
+        best = max(best, found, key=lambda each: each[1])
+    for step in _FINER:
+        beside = [solve(best[0].lam * 10**move) for move in (-step, step)]
+        best = max([best, *beside], key=lambda each: each[1])
+    return best
+
+
+def race(classes: Classes, whole: Classes, truth: FloatArray, sensor: SensorModel, seed: int) -> dict[str, float]:
+    """Time conjugate gradients on all frames and the direct solver, from the same frames at equal peak [CPU seconds].
+
+    Parameters
+    ----------
+    classes
+        Camera and period of the dots.
+    whole
+        The same camera with a sensor that gets all light, whose best lambda both solvers take.
+
+    Returns
+    -------
+    ``prepare_s`` once for a camera, dots and lambda; ``direct_s`` and ``iterative_s`` for every image, to equal error;
+    ``direct_exact_s`` and ``iterative_exact_s`` to equal answers; ``iterations`` and ``iterations_exact``; ``psnr_db``
+    of the direct solution; ``difference`` of both, relative.
+
+    Raises
+    ------
+    MitsimError
+        Where iterations do not come to the direct solution.
+    """
+    camera, clock = classes.camera, time.process_time
+    family = parse_patterns(f"dots:{classes.k}", len(truth))
+    lam = best_image(whole, take(whole.camera, family, truth, sensor, seed=seed)[0], truth)[0].lam
+    frames, _ = take(camera, family, truth, sensor, seed=seed)
+    start = clock()
+    factorised = Classes(camera, classes.k).factorise(lam)
+    prepare_s = clock() - start
+    images, seconds = [], []
+    for tolerance in (_LOOSE, _TIGHT):
+        start = clock()
+        images.append(factorised.solve(factorised.classes.project(frames), tolerance).image)
+        seconds.append(clock() - start)
+    direct, exact = images
+    enough = _EQUAL_ERROR * relative_error(exact, truth)
+    reached: dict[str, tuple[float, int]] = {}
+    steps, start = 0, clock()
+
+    def watch(image: FloatArray) -> bool:
+        """Note when the iterations come within the error of the exact image, and near it."""
+        nonlocal steps
+        steps, spent = steps + 1, clock() - start
+        if relative_error(image, truth) <= enough:
+            reached.setdefault("error", (spent, steps))
+        if relative_error(image, exact) <= _EQUAL_ANSWER:
+            reached.setdefault("answer", (spent, steps))
+        return len(reached) == 2
+
+    iterative = solve_iteratively(camera.under(family), frames, lam, 0.0, _MOST_STEPS, watch)
+    if len(reached) < 2:
+        raise MitsimError(f"iterations did not come to the direct solution at lambda {lam:g}: {iterative.status}")
+    return {
+        "prepare_s": prepare_s, "direct_s": seconds[0], "direct_exact_s": seconds[1],
+        "iterative_s": reached["error"][0], "iterative_exact_s": reached["answer"][0],
+        "iterations": reached["error"][1], "iterations_exact": reached["answer"][1],
+        "psnr_db": psnr(direct, truth), "difference": relative_error(iterative.image, exact),
+    }  # fmt: skip
+
+
+def separable_seconds(bench: Apparatus, k: int) -> float:
+    """Time the separable closed form for dots of period ``k`` with prepared factors, which depends on sizes alone."""
+    family, (left, right) = bench.family(f"dots:{k}"), IdealCamera(bench, bench.geometry.mask).factors
+    model = prepare(left, right, family.left, family.right)
+    frames = stream(0, "separable frames").random((k, k, len(left), len(right)))
+    start = time.process_time()
+    sums = model.accumulator()
+    for row, column in product(range(k), repeat=2):
+        sums.add(frames[row, column], row, column)
+    model.solve(sums, model.problem(sums).scale * _LEAST_LAMBDA)
+    return time.process_time() - start
+
+
+@cache
+def _psf(file: str | None, variant: str) -> FloatArray:
+    return rendered_psf(_SHAPE, _PITCH_MM, variant) if file is None else load_psf(file, _REDUCE)
+
+
+def _convolutional_points(scope: Scope) -> Sequence[Point]:
+    parameters = dict(scope.setup.parameters)
+    measured = parameters.pop("psf", None)
+    setup, found = replace(scope.setup, parameters=tuple(sorted(parameters.items()))), []
+    psfs = [(MEASURED, measured)] * (measured is not None) + [(TRACED, None)]
+    for name, (psf, file), seed, k in product(scope.pictures, psfs, scope.seeds, scope.choose(PERIODS, (1, 7))):
+        at = partial(Point.of, setup.with_print(name), psf=psf, file=file, patterns=k * k, seed=seed)
+        raced = name == scope.pictures[0] and seed == scope.seeds[0]
+        sensors = scope.choose((WHOLE, CROPPED), (WHOLE,)) if raced else ()
+        found += [at(part="quality"), *(at(part="speed", sensor=sensor) for sensor in sensors)]
+    return found
+
+
+def _convolutional_measure(studio: Studio, point: Point) -> Found:
+    name, k, seed = point.setup.picture, round(point["patterns"] ** 0.5), int(point["seed"])
+    psf, bench = _psf(point["file"], point.setup.variant), studio.bench(point.setup)
+    if name is None:
+        truth = studio.lit_scene(point.setup).truth
+    else:
+        block = SIDE // _N
+        truth = np.asarray(picture(name).reshape(_N, block, _N, block).mean(axis=(1, 3)) / 255)
+    whole = ShiftedLight.of(psf, len(truth))
+    with single_threaded_blas():
+        if point["part"] == "speed":
+            camera = replace(whole, sensor=psf.shape) if point["sensor"] == CROPPED else whole
+            measured = race(Classes(camera, k), Classes(whole, k), truth, bench.sensor, seed)
+            if point["sensor"] == WHOLE:
+                measured["separable_s"] = separable_seconds(bench, k)
+            return Found((point.row(**measured),))
+        rows, arrays = [], {}
+        for exposure in EXPOSURES:
+            frames, seconds = take(whole, bench.family(f"dots:{k}"), truth, bench.sensor, exposure, seed)
+            solution, psnr_db = best_image(Classes(whole, k), frames, truth)
+            rows.append(point.row(exposure=exposure, psnr_db=psnr_db, exposure_s=seconds, **flags_of(solution.status)))
+            if name in (*QUICK_IMAGES, None) and exposure == EQUAL_FRAME:
+                arrays = image_arrays(solution.image, truth)
+    return Found(tuple(rows), arrays)
+
+
+def _times(rows: DataFrame, column: str, over: str, least: float) -> tuple[str, Holds]:
+    """Judge whether a ``column`` of seconds is at least so many times another; patterns serve as repeats."""
+    times = rows[column].astype(float) / rows[over].astype(float)
+    ends = dict.fromkeys(f"{float(f'{each:.2g}'):g}" for each in (times.min(), times.max()))
+    # Seconds vary by factors.
+    ratio = Mean.of_numbers(np.log(times).tolist(), f"{column} over {over}")
+    return f"{' to '.join(ends)} times as long", within(ratio, low=float(np.log(least)))
+
+
+_MODELS = ("psf", MEASURED, TRACED)
+_QUALITY, _SPEED = {"part": "quality", "exposure": EXPOSURES}, {"part": "speed", "sensor": WHOLE}
+_SPEED_OF_DOTS = {"part": "speed", "patterns": lambda patterns: patterns != 1}
+_SOLVERS = {"iterative_s": "iterative", "direct_s": "direct", "separable_s": "separable camera"}
+_by_frames = partial(Lines, "patterns", "number of frames [1]", log=True)
+_iterations_over_direct = partial(_times, column="iterative_s", over="direct_s", least=10.0)
+
+CONVOLUTIONAL = Study(
+    "convolutional",
+    "A diffuser for a mask",
+    "What do dots bring to a DiffuserCam, and is there no direct solution?",
+    points=_convolutional_points,
+    measure=_convolutional_measure,
+    claims=(
+        replace(stated("Uniform light: 19 to 24.6 dB", 19.0, 24.6, part="quality", patterns=1), models=_MODELS),
+        replace(stated("49 dots: 38.5 to 44.5 dB", 38.5, 44.5, part="quality", patterns=49), models=_MODELS),
+        *(
+            # A quick study has no cropped sensor.
+            Judged(claim, decide, where=where, paper=paper, models=_MODELS, optional=where.get("sensor") == CROPPED)
+            for claim, decide, where, paper in (
+                (
+                    "Iterations take an order of magnitude longer than the separable closed form",
+                    partial(_times, column="iterative_s", over="separable_s", least=5.0),
+                    _SPEED,
+                    "10 times as long",
+                ),
+                (
+                    "Dots can be solved directly, and iterations to equal error take ten times as long",
+                    _iterations_over_direct,
+                    _SPEED_OF_DOTS | {"sensor": WHOLE},
+                    "no closed form",
+                ),
+                (
+                    "The same where the sensor ends at the picture's edge, prepared once",
+                    _iterations_over_direct,
+                    _SPEED_OF_DOTS | {"sensor": CROPPED},
+                    "no closed form",
+                ),
+                (
+                    "Even so, it takes longer than the separable closed form",
+                    partial(_times, column="direct_s", over="separable_s", least=1.0),
+                    _SPEED,
+                    "",
+                ),
+            )
+        ),
+    ),
+    panels=(
+        _by_frames(title="PSNR, best lambda", where=_QUALITY, each="exposure", colour="psf", facet=""),
+        _by_frames(
+            file="seconds", y_label="processor time to equal error [s]", where=_SPEED, colour=_SOLVERS, facet="psf"
+        ),
+        Images(
+            "patterns",
+            title=f"Images by the number of frames, exposure {EQUAL_FRAME}, best lambda",
+            where={"part": "quality", "exposure": EQUAL_FRAME, "patterns": (1, 9, 49)},
+            down=("picture", "psf"),
+        ),
+    ),
+    heads=("Paper", "Measured", "Rendered"),
+    note="A frame is the scene convolved with the camera's point spread function (PSF), that of a rendered diffuser "
+    "and, with -D psf=FILE, a measured one besides; no light of a scene is traced. The sensor gets all light. Best "
+    "lambda: that of the highest PSNR. Times are processor seconds on one thread.",
+    traced=False,
+)
+
+STUDIES = {each.name: each for each in (MULTISHOT, CONVOLUTIONAL)}
