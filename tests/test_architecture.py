@@ -574,7 +574,7 @@ SIZES = {
     "scene": (10, 1873),
     "sensor": (5, 1257),
     "sessions": (4, 1101),
-    "studies": (44, 9220),
+    "studies": (42, 9044),
     "transport": (22, 4609),
     "verbs": (1, 369),
     "version": (1, 1),
