@@ -8,8 +8,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -21,24 +23,17 @@ from pydantic import (
     ValidationInfo,
     field_validator,
     model_validator,
-)
+)  # fmt: skip
 
 from mitsim.core.configuration import LARGEST, NonNegative, Positive, validate
-from mitsim.core.errors import MitsimError, cut
+from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.files import plain, read_json, write_json
+from mitsim.core.imagelist import PLANES
 
 if TYPE_CHECKING:  # and where it computes: numpy takes 0.1 s to import, and a refusal needs none of it
-    import numpy as np
     import numpy.typing as npt
 
     from mitsim.core.arrays import FloatArray
-
-
-from dataclasses import dataclass
-from importlib.util import find_spec
-
-from mitsim.core.errors import ArgumentError
-from mitsim.core.imagelist import PLANES
 
 MANIFEST = "manifest.json"
 SIDES = ("left", "right")
@@ -162,19 +157,6 @@ class ShotFile(_Part):
     """0, or the half (1 + P)/2 or (1 - P)/2 of a signed pattern P."""
 
 
-class _Family(Protocol):
-    """Patterns of :mod:`mitsim.devices.patterns`."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def left(self) -> npt.NDArray[np.int8]: ...
-    @property
-    def right(self) -> npt.NDArray[np.int8]: ...
-    @property
-    def shots(self) -> Sequence[Any]: ...
-
-
 class Patterns(_Part):
     """Factors of the patterns, and the shots that show them."""
 
@@ -190,8 +172,8 @@ class Patterns(_Part):
     """Every shot; each pattern (i, j) once, or as its two halves."""
 
     @classmethod
-    def of(cls, family: _Family, files: Sequence[str]) -> Patterns:
-        """Patterns of a ``family`` (:class:`mitsim.devices.patterns.PatternFamily`), its shots in ``files`` by index.
+    def of(cls, family: Any, files: Sequence[str]) -> Patterns:
+        """Return the patterns of a :class:`mitsim.devices.patterns.PatternFamily`, its shots in ``files`` by index.
 
         MitsimError when there are more pixels or shots than a reader takes.
         """
@@ -200,11 +182,8 @@ class Patterns(_Part):
             for file, shot in zip(files, family.shots, strict=True)
         ]
         matrices = {"P_L": family.left.tolist(), "P_R": family.right.tolist()}
-        return validate(
-            cls,
-            {"family": family.name, "n": len(family.left), **matrices, "captures": shots},
-            f"patterns {family.name!r}",
-        )
+        data = {"family": family.name, "n": len(family.left), **matrices, "captures": shots}
+        return validate(cls, data, f"patterns {family.name!r}")
 
     @property
     def matrices(self) -> tuple[FloatArray, FloatArray]:
@@ -241,12 +220,9 @@ class Patterns(_Part):
             signs.setdefault((shot.row, shot.column), []).append(shot.sign)
         for index, halves in signs.items():
             if sorted(halves) not in ([0], [-1, 1]):
-                raise ValueError(
-                    f"captures: pattern {index} has frames of signs {halves}; "
-                    "give one of sign 0, or one of +1 and one of -1"
-                )
-        missing = rows * columns - len(signs)
-        if missing:
+                allowed = "give one of sign 0, or one of +1 and one of -1"
+                raise ValueError(f"captures: pattern {index} has frames of signs {halves}; {allowed}")
+        if missing := rows * columns - len(signs):
             first = next((i, j) for i in range(rows) for j in range(columns) if (i, j) not in signs)
             raise ValueError(
                 f"captures: {missing} of {rows * columns} patterns have no frame, first {first}; capture them all"
@@ -497,19 +473,18 @@ Manifest = TypeVar("Manifest", RunManifest, CalibrationManifest)
 
 
 def read_manifest(folder: Path, model: type[Manifest]) -> Manifest:
-    """The manifest of a finished run or calibration in ``folder``, by its ``model``.
+    """Return the manifest of a finished run or calibration in ``folder``, by its ``model``.
 
     MitsimError when there is none, or it is of another kind, unfinished, or breaks a rule of its format.
     """
-    kind = model.model_fields["kind"].default
     if not folder.is_dir():
-        command = {"capture": "capture", "calibration": "calibrate"}[kind]
+        command = "capture" if model is RunManifest else "calibrate"
         raise MitsimError(f"{folder}: no such folder; give the output of `mitsim {command}`")
     return checked_manifest(read_json(folder / MANIFEST), model, folder)
 
 
 def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
-    """The manifest of a finished run or calibration.
+    """Return the manifest of a finished run or calibration.
 
     Parameters
     ----------
@@ -527,15 +502,19 @@ def checked_manifest(data: Any, model: type[Manifest], place: Path) -> Manifest:
     """
     kind = model.model_fields["kind"].default
     if not isinstance(data, dict) or data.get("kind") != kind:
-        actual = data.get("kind") if isinstance(data, dict) else type(data).__name__
-        raise MitsimError(f"{place}: holds a {cut(str(actual))}, not a {kind}; give the right folder")
+        raise MitsimError(f"{place}: holds a {cut(_kind(data))}, not a {kind}; give the right folder")
     if data.get("status") != "complete":
         raise MitsimError(f"{place}: the {kind} is {cut(str(data.get('status')))}; finish it with resume=True")
     return validate(model, data, f"{place}/{MANIFEST}", None if "format" in data else _UNVERSIONED)
 
 
+def _kind(data: Any) -> str:
+    """Return the kind of folder that the ``data`` of a manifest or colour.json states."""
+    return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
+
+
 def resumable(folder: Path, kind: str) -> dict[str, Any]:
-    """The manifest in ``folder``, of work of a ``kind`` that is finished or not; MitsimError when it holds none."""
+    """Return the manifest of work of a ``kind`` in ``folder``, finished or not; MitsimError when it holds none."""
     data = read_json(folder / MANIFEST)
     if not isinstance(data, dict) or data.get("kind") != kind:
         raise MitsimError(f"resume=True: {folder}/{MANIFEST} is not that of a {kind}; use another folder")
@@ -543,7 +522,7 @@ def resumable(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def read_head(folder: Path) -> RunHead:
-    """The head of the run in ``folder``, finished or not; MitsimError when it holds none."""
+    """Return the head of the run in ``folder``, finished or not; MitsimError when it holds none."""
     data = resumable(folder, "capture")
     return validate(RunHead, data, f"{folder}/{MANIFEST}", _UNVERSIONED)
 
@@ -656,11 +635,10 @@ class MosaicManifest(ColourManifest):
 
     @model_validator(mode="after")
     def _a_weight_for_each_line(self) -> MosaicManifest:
-        if any(len(row) != len(self.channels) for row in self.weights):
-            raise ValueError(
-                f"weights have {', '.join(str(len(row)) for row in self.weights)} numbers; give each of the four "
-                f"pixels one for each of {len(self.channels)} lines"
-            )
+        counts = [len(row) for row in self.weights]
+        if {*counts} != {len(self.channels)}:
+            told = f"weights have {', '.join(map(str, counts))} numbers"
+            raise ValueError(f"{told}; give each of the four pixels one for each of {len(self.channels)} lines")
         return self
 
 
@@ -725,8 +703,8 @@ def open_lines(folder: Path | str, *kinds: str) -> SpectralFolder:
     if not is_coloured(folder):
         return SpectralFolder(Path(folder), None)
     data = read_json(Path(folder) / COLOUR)
-    kind = _kind(data)
-    return SpectralFolder(Path(folder), checked_colours(data, kind if kind in kinds else kinds[0], Path(folder)))
+    kind = _kind(data) if _kind(data) in kinds else kinds[0]
+    return SpectralFolder(Path(folder), checked_colours(data, kind, Path(folder)))
 
 
 def read_colours(folder: Path | str, kind: str) -> ColourManifest:
@@ -757,11 +735,6 @@ def checked_colours(data: Any, kind: str, place: Path) -> ColourManifest:
     return validate(MosaicManifest if kind == MOSAIC else ColourManifest, data, f"{place}/{COLOUR}")
 
 
-def _kind(data: Any) -> str:
-    """Return the kind of folder that the ``data`` of a colour.json states."""
-    return str(data.get("kind") if isinstance(data, dict) else type(data).__name__)
-
-
 def installed_ways() -> tuple[str, ...]:
     """Return the :data:`WAYS` that are installed, because demosaicing is an extra."""
     return WAYS if find_spec("colour_demosaicing") else WAYS[:-1]
@@ -769,13 +742,14 @@ def installed_ways() -> tuple[str, ...]:
 
 def check_way(way: str) -> str:
     """Return the ``way``, one of :data:`WAYS`; ArgumentError for another, and for one that is not installed."""
+    installed = installed_ways()
     if way not in WAYS:
         raise ArgumentError("mosaic", f"{way!r}: use {', '.join(WAYS[:-1])} or {WAYS[-1]}")
-    if way not in installed_ways():
+    if way not in installed:
         raise ArgumentError(
             "mosaic",
             f"{way}: colour-demosaicing is not installed; pip install 'mitsim[mosaic]' (Python 3.11 or newer), or use "
-            f"{' or '.join(installed_ways())}",
+            f"{' or '.join(installed)}",
         )
     return way
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
+import threading
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,17 +18,8 @@ import numpy as np
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
-from mitsim.core.exr import (
-    Channel,
-    Channels,
-    Metadata,
-    checksum,
-    finite_channel,
-    read_frame,
-    verify,
-    write_frame,
-)
-from mitsim.core.files import output_folder
+from mitsim.core.exr import Channel, Channels, Metadata, checksum, finite_channel, read_frame, verify, write_frame
+from mitsim.core.files import output_folder, remove_page
 from mitsim.core.images import card, from_above, normalise, span
 from mitsim.core.manifests import (
     MANIFEST,
@@ -34,27 +27,21 @@ from mitsim.core.manifests import (
     ClosingKind,
     Digital,
     MosaicManifest,
+    RunHead,
     RunManifest,
     read_colours,
+    read_head,
     read_manifest,
     write_colours,
+    write_manifest,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
-
-import threading
-from contextlib import contextmanager
-
-from mitsim.core.exr import Value
-from mitsim.core.files import remove_page
-from mitsim.core.manifests import RunHead, read_head, write_manifest
-
 _SHOWN = 3
 """Frames that a notebook shows: with the truth they fill a line."""
-
 _EVERY = 8
 """Rows and columns that tell frames apart: 4096 numbers with noise of 512 x 512, 64 of the smallest sensors."""
 _CLIPPED, _UNLIKELY, _LEVELS = 10, 20.0, 16
@@ -82,7 +69,7 @@ class Capture:
         folder: Path | None = None,
         memory: Mapping[str, tuple[Channels, Metadata]] | None = None,
     ) -> None:
-        """Channels and metadata of a capture's files, by ``manifest``.
+        """Make a capture of the channels and metadata of its files, by ``manifest``.
 
         Parameters
         ----------
@@ -99,7 +86,7 @@ class Capture:
     @classmethod
     @check_arguments
     def from_recorder(cls, recorder: Recorder, manifest: RunManifest) -> Capture:
-        """The capture whose shots a ``recorder`` has, finished by its ``manifest``."""
+        """Return the capture whose shots a ``recorder`` has, finished by its ``manifest``."""
         return cls(recorder.finish(manifest), recorder.folder, dict(sorted(recorder.files.items())))
 
     @property
@@ -152,7 +139,7 @@ class Capture:
 
     @cached_property
     def ambient(self) -> Ambient | None:
-        """What is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
+        """Light that is taken off every frame but those of signed pairs; None where no ambient frame was taken."""
         if self.manifest.ambient_frame is None:
             return None
         block, digital = self.manifest.ambient_frame, self.manifest.digital
@@ -167,9 +154,9 @@ class Capture:
             return None
         digital = self.manifest.digital.model_copy(update={"exposure_s": block.exposure_s})
         dn = self._channel(block.file, "DN")
-        light = digital.rate(dn)
-        full = 0 if digital.saturation_dn is None else int(np.count_nonzero(dn >= digital.saturation_dn))
+        light, end = digital.rate(dn), digital.saturation_dn
         signed = any(shot.sign for shot in self.manifest.patterns.captures)
+        full = 0 if end is None else int(np.count_nonzero(dn >= end))
         own = light if signed else self._projector_part(light)
         return ClosingFrame(block.kind, own, np.maximum(digital.variance(light), 0.0), full)
 
@@ -179,12 +166,12 @@ class Capture:
         return self.manifest.patterns.matrices
 
     def measurements(self, shape: tuple[int, int] | None = None) -> Iterator[tuple[FloatArray, int, int]]:
-        """(frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
+        """Yield (frame, i, j) of every pattern; see :meth:`measured`, which also takes ``shape``."""
         for each in self.pattern_measurements(shape):
             yield each.frame, each.row, each.column
 
     def pattern_measurements(self, shape: tuple[int, int] | None = None) -> Iterator[Measurement]:
-        """What was measured under every pattern, read one at a time; the halves of a signed one come as their
+        """Yield the measurement of every pattern, read one at a time; the halves of a signed one come as their
         difference, others without the ambient frame, if one was taken. MitsimError for a frame that is missing,
         damaged, not finite or of another ``shape`` than is asked for."""
         digital = self.manifest.digital
@@ -199,20 +186,20 @@ class Capture:
                 )
             light = digital.rate(dn)
             own = light * shot.sign if shot.sign else self._projector_part(light)
-            factor, top = _common_factor(dn), float(dn.max())
-            full, cut = 0, 0
-            if digital.saturation_dn is not None and top >= digital.saturation_dn:
-                full = int(np.count_nonzero(dn >= digital.saturation_dn))
-            else:
-                cut = _clipped_readings(dn, top, digital, factor)
-            half = Measurement(own, *index, light, 1, full, factor, (_digest(dn),), (cut,))
+            factor, top, end = _common_factor(dn), float(dn.max()), digital.saturation_dn
+            full = int(np.count_nonzero(dn >= end)) if end is not None and top >= end else 0
+            clipped = 0 if full else _clipped_readings(dn, top, digital, factor)
+            # Frames that are one and the same have one digest; those of one number have none.
+            some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
+            digest = 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
+            half = Measurement(own, *index, light, 1, full, factor, (digest,), (clipped,))
             if shot.sign and index not in waiting:
                 waiting[index] = half
                 continue
             yield waiting.pop(index) + half if shot.sign else half
 
     def _projector_part(self, light: FloatArray) -> FloatArray:
-        """The projector's part of a shot's ``light``."""
+        """Return the projector's part of a shot's ``light``."""
         if self.ambient is None:
             return light
         ambient = self.ambient.rate
@@ -232,14 +219,12 @@ class Capture:
 
     @check_arguments
     def read(self, name: str) -> tuple[Channels, Metadata]:
-        """Channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is missing or
-        damaged."""
-        if self.folder is None:
-            if name not in self._memory:
-                raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
-            return self._memory[name]
-        if Path(name).name != name or "\0" in name:
+        """Return channels and metadata of one of the :attr:`files`, by its ``name``. MitsimError for one that is
+        missing or damaged."""
+        if name not in self._memory if self.folder is None else Path(name).name != name or "\0" in name:
             raise ArgumentError("name", f"{cut(repr(name))}: is no file of this capture; see files")
+        if self.folder is None:
+            return self._memory[name]
         verify(self.folder, name, self.manifest.checksums, "capture it again with resume=True")
         return read_frame(self.folder / name)
 
@@ -265,13 +250,15 @@ class Capture:
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:
-        """What the command line reports; fields of a real camera's capture that nobody knows are None."""
+        """Return the facts that the command line reports; None where they are unknown, as of a real camera."""
         manifest = self.manifest
+        planned = "accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour"
         known = (
             "mc_error", "total_error", "total_error_bound", "total_error_of_projector",
             "mc_to_sensor_noise", "sensor_noise", "heaviest_group", "truth_error", "lost_light",
             "seconds", "kernels", "predicted_memory_bytes", "warnings",
         )  # fmt: skip
+        others = {"ambient_frame": manifest.ambient_frame, "closing_frame": manifest.closing_frame}
         return {
             "frames": len(manifest.patterns.captures),
             "shape": self._channel(manifest.patterns.captures[0].file, "DN").shape,
@@ -279,12 +266,8 @@ class Capture:
             "seed": manifest.configuration.get("seed"),
             "output": None if self.folder is None else str(self.folder),
             "exposure_s": self.exposure_s,
-            **{
-                name: (manifest.plan or {}).get(name)
-                for name in ("accuracy", "asked_seconds", "predicted_seconds", "predicted_range", "colour")
-            },
-            "ambient_frame": None if manifest.ambient_frame is None else manifest.ambient_frame.model_dump(),
-            "closing_frame": None if manifest.closing_frame is None else manifest.closing_frame.model_dump(),
+            **{name: (manifest.plan or {}).get(name) for name in planned},
+            **{name: None if frame is None else frame.model_dump() for name, frame in others.items()},
             **{name: getattr(manifest, name) for name in known},
         }
 
@@ -335,26 +318,22 @@ class Capture:
         return from_above("exchange.labelled", "label_capture")(self)
 
     def __repr__(self) -> str:
-        return f"Capture({self._family}: {self._size}, {self.folder or 'in memory'})"
+        return f"Capture({self.manifest.patterns.family or 'patterns'}: {self._size}, {self.folder or 'in memory'})"
 
     def _repr_html_(self) -> str:
-        shots = self.manifest.patterns.captures[:_SHOWN]
-        frames = [self._channel(shot.file, "DN") for shot in shots]
-        pictures = {
-            f"shot {i}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}": normalise(frame)
-            for i, (shot, frame) in enumerate(zip(shots, frames, strict=True))
-        }
+        pictures = {}
+        for index, shot in enumerate(self.manifest.patterns.captures[:_SHOWN]):
+            frame = self._channel(shot.file, "DN")
+            caption = f"shot {index}, pattern ({shot.row}, {shot.column})\n{span(frame, 'DN')}"
+            pictures[caption] = normalise(frame)
         truth = {} if self.truth is None else {"truth\nreflectance 0 to 1": self.truth}
         facts = f"{self._size}, exposure {self.exposure_s:.3g} s a shot; {self.folder or 'in memory'}"
-        return card(f"Capture: {self._family}", {**pictures, **truth}, (facts, *self.warnings))
+        title = f"Capture: {self.manifest.patterns.family or 'patterns'}"
+        return card(title, {**pictures, **truth}, (facts, *self.warnings))
 
     @property
     def _has_truth(self) -> bool:
         return TRUTH in self._memory if self.folder is None else (self.folder / TRUTH).is_file()
-
-    @property
-    def _family(self) -> str:
-        return self.manifest.patterns.family or "patterns"
 
     @property
     def _size(self) -> str:
@@ -379,12 +358,12 @@ class Capture:
 
 @check_arguments
 def load_run(folder: Path | str) -> Capture:
-    """The capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
+    """Return the capture in the RUN folder ``folder``. MitsimError when it is not a complete one."""
     return Capture(read_manifest(Path(folder), RunManifest), Path(folder))
 
 
 def _common_factor(dn: FloatArray) -> int:
-    """Largest whole number that divides all numbers ``dn``; 1 where they are not whole."""
+    """Return the largest whole number that divides all numbers ``dn``; 1 where they are not whole."""
     for part in (dn.ravel()[:_SAMPLE], dn.ravel()):  # nearly always the first few tell
         if not np.array_equal(part, np.rint(part)):
             return 1
@@ -394,15 +373,8 @@ def _common_factor(dn: FloatArray) -> int:
     return factor
 
 
-def _digest(dn: FloatArray) -> int:
-    """A number by which frames that are one and the same are known, from some of their numbers ``dn``; 0 where these
-    are all equal."""
-    some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
-    return 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
-
-
 def _clipped_readings(dn: FloatArray, top: float, digital: Digital, factor: int) -> int:
-    """Readings at the largest of all numbers, ``top``, where noise does not leave so many; else 0.
+    """Return the number of readings at the largest number, ``top``, where noise does not leave so many; else 0.
 
     Of light that ends in noise alone, no number at its end is more frequent than those just below it.
 
@@ -590,12 +562,11 @@ class MosaicCapture:
 
     @check_arguments
     def save(self, folder: Path | str) -> Path:
-        """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; returns it.
+        """Write the folder that `mitsim capture --colour mosaic` writes, to a new or empty ``folder``; return it.
 
         MitsimError when it holds something, or cannot be written.
         """
-        path = self.shots.save(folder)
-        self.write_lines(path)
+        self.write_lines(path := self.shots.save(folder))
         return path
 
     def write_lines(self, folder: Path) -> None:
@@ -623,19 +594,14 @@ def load_mosaic(folder: Path | str) -> MosaicCapture:
     """The run behind colour filters in ``folder``. MitsimError when it is not a complete one."""
     folder = Path(folder)
     manifest = cast("MosaicManifest", read_colours(folder, MOSAIC))
-    files = {name: folder / name / TRUTH for name in manifest.names}
-    truths = {name: _truth(path) for name, path in files.items() if path.is_file()}
-    return MosaicCapture(load_run(folder), manifest, truths if len(truths) == len(files) else {})
-
-
-def _truth(path: Path) -> LineTruth:
-    channels, metadata = read_frame(path)
-    board = metadata.get("board_reflectance")
-    return LineTruth(
-        finite_channel(channels, "reflectance", path),
-        finite_channel(channels, "standard_error", path),
-        1.0 if board is None else float(board),
-    )
+    truths = {}
+    for name in manifest.names:
+        if (path := folder / name / TRUTH).is_file():
+            channels, metadata = read_frame(path)
+            image, error = (finite_channel(channels, key, path) for key in ("reflectance", "standard_error"))
+            board = metadata.get("board_reflectance")
+            truths[name] = LineTruth(image, error, 1.0 if board is None else float(board))
+    return MosaicCapture(load_run(folder), manifest, truths if len(truths) == len(manifest.names) else {})
 
 
 # -------- Shots of a run as they are exposed
@@ -649,7 +615,7 @@ def frame_name(index: int) -> str:
 
 
 class Recorder:
-    """Keeps what a run writes, file by file, from any thread: in memory, or, as :class:`RunFolder`, on disk.
+    """Keeps the files of a run, from any thread: in memory, or, as :class:`RunFolder`, on disk.
 
     Attributes
     ----------
@@ -668,32 +634,17 @@ class Recorder:
         """Begin to write: all input has been checked."""
 
     def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already; it then counts as written. Never in memory."""
+        """Return True if shot number ``index`` is there already, which then counts as written; never in memory."""
         return False
 
     def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run, whole or not at all.
-
-        Parameters
-        ----------
-        name
-            of the file.
-        channels, metadata
-            of it, (rows, columns) each.
-        """
+        """Write a file of the run by its ``name``, whole or not at all: its ``channels``, (rows, columns) each, and
+        ``metadata``."""
         self.files[name] = channels, metadata
 
     def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
-        """Write one shot.
-
-        Parameters
-        ----------
-        index
-            its number.
-        channels, metadata
-            of its file, (rows, columns) each.
-        """
-        self.write(frame_name(index), channels, {**self._identity(index, channels), **metadata})
+        """Write the shot number ``index``: its ``channels``, (rows, columns) each, and ``metadata``."""
+        self.write(frame_name(index), channels, metadata)
 
     def write_truth(self, reflectance: FloatArray, board: float, standard_error: FloatArray | None = None) -> None:
         """Write the truth.
@@ -710,12 +661,8 @@ class Recorder:
         self.write(TRUTH, channels, {"board_reflectance": board})
 
     def finish(self, manifest: RunManifest) -> RunManifest:
-        """The ``manifest`` of the finished run, with what only the recorder knows."""
+        """Return the ``manifest`` of the finished run, with what only the recorder knows."""
         return manifest
-
-    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
-        """What tells a frame on disk from others; nothing in memory."""
-        return {}
 
 
 class RunFolder(Recorder):
@@ -728,15 +675,8 @@ class RunFolder(Recorder):
     folder: Path
 
     def __init__(self, folder: Path, head: RunHead, known: Mapping[str, str]) -> None:
-        """A run in its folder.
-
-        Parameters
-        ----------
-        folder, head
-            where it lies, and the configuration.
-        known
-            checksums of an earlier, finished run, by file name.
-        """
+        """Make a run of the configuration in ``head``, in its ``folder``; checksums of an earlier, finished run by file
+        name are ``known``."""
         super().__init__()
         self.folder, self.head = folder, head
         self._known, self._checksums, self._lock = known, dict[str, str](), threading.Lock()
@@ -749,62 +689,56 @@ class RunFolder(Recorder):
         write_manifest(self.folder, head)
 
     def keeps(self, index: int) -> bool:
-        """Whether shot number ``index`` is there already; it then counts as written."""
+        """Return True if shot number ``index`` is there already; it then counts as written."""
         name = frame_name(index)
         path = self.folder / name
         if not path.is_file():
             return False
         actual = checksum(path)
-        same = self._known[name] == actual if name in self._known else self._is_ours(path, index)
+        if name in self._known:
+            same = self._known[name] == actual
+        else:
+            try:
+                channels, metadata = read_frame(path)
+            except MitsimError:
+                return False
+            same = self._identity(index, channels).items() <= dict(metadata).items()
         if same:
             self._note(name, actual)
         return same
 
+    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
+        """Write a file of the run, whole or not at all, as :meth:`Recorder.write`."""
+        self._note(name, write_frame(self.folder / name, channels, metadata))
+
+    def write_frame(self, index: int, channels: Channels, metadata: Metadata) -> None:
+        """Write one shot as :meth:`Recorder.write_frame`, with what tells it from other frames."""
+        super().write_frame(index, channels, {**self._identity(index, channels), **metadata})
+
     def finish(self, manifest: RunManifest) -> RunManifest:
-        """Write the ``manifest`` of the finished run, with checksums; returns it."""
+        """Write the ``manifest`` of the finished run, with checksums; return it."""
         checksums = dict(sorted(self._checksums.items()))
         manifest = manifest.model_copy(update={"status": "complete", "checksums": checksums})
         write_manifest(self.folder, manifest)
         return manifest
 
-    def write(self, name: str, channels: Channels, metadata: Metadata) -> None:
-        """Write a file of the run, whole or not at all.
-
-        Parameters
-        ----------
-        name, channels, metadata
-            as for :meth:`Recorder.write`.
-        """
-        self._note(name, write_frame(self.folder / name, channels, metadata))
-
     def _note(self, name: str, value: str) -> None:
         with self._lock:
             self._checksums[name] = value
 
-    def _is_ours(self, path: Path, index: int) -> bool:
-        try:
-            channels, metadata = read_frame(path)
-        except MitsimError:
-            return False
-        return all(metadata.get(key) == value for key, value in self._identity(index, channels).items())
-
-    def _identity(self, index: int, channels: Channels) -> dict[str, Value]:
-        """What tells a frame from one of another run, another place in this one, or one that was damaged."""
-        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": _pixels(channels)}
-
-
-def _pixels(channels: Channels) -> str:
-    """SHA-256 of the channels' names and values: in an interrupted run no manifest holds checksums of files yet."""
-    digest = hashlib.sha256()
-    for name, values in sorted(channels.items()):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(values).data)
-    return digest.hexdigest()
+    def _identity(self, index: int, channels: Channels) -> Metadata:
+        """Return what tells a frame from one of another run, another place in this one, or one that was damaged: in an
+        interrupted run no manifest holds checksums of files yet."""
+        digest = hashlib.sha256()
+        for name, values in sorted(channels.items()):
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(values).data)
+        return {"run": self.head.configuration_sha256, "index": index, "pixels_sha256": digest.hexdigest()}
 
 
 @contextmanager
 def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
-    """A folder for a run, checked before any work; if that fails before writing, a new folder is removed.
+    """Claim a folder for a run, checked before any work; if that fails before writing, a new folder is removed.
 
     Parameters
     ----------
@@ -823,21 +757,14 @@ def claim_run(path: Path, head: RunHead, resume: bool) -> Iterator[RunFolder]:
     known: Mapping[str, str] = {}
     again = resume and (path / MANIFEST).is_file()
     if again:
-        known = check_same(path, head)
+        before = read_head(path)
+        if before.configuration_sha256 != head.configuration_sha256:
+            changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
+            raise MitsimError(
+                f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
+                "use the same options, or another folder"
+            )
+        if before.status == "complete":
+            known = read_manifest(path, RunManifest).checksums
     with output_folder(path, overwrite=again) as folder:
         yield RunFolder(folder, head, known)
-
-
-def check_same(path: Path, head: RunHead) -> Mapping[str, str]:
-    """Checksums of the frames in ``path`` of a finished run that ``head`` begins; none of an interrupted one.
-
-    MitsimError for a run of another configuration.
-    """
-    before = read_head(path)
-    if before.configuration_sha256 != head.configuration_sha256:
-        changed = [key for key, value in head.configuration.items() if before.configuration.get(key) != value]
-        raise MitsimError(
-            f"resume=True: {path} holds a run of another configuration ({', '.join(changed) or 'unknown'} differ); "
-            "use the same options, or another folder"
-        )
-    return read_manifest(path, RunManifest).checksums if before.status == "complete" else {}
