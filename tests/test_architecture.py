@@ -73,8 +73,7 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
-    "mitsim.learn.pair_request",
-    "mitsim.learn.training_request",
+    "mitsim.learn.requests",
 )
 """What looks at words, manifests and lists before work begins."""
 

@@ -220,8 +220,8 @@ def stored_pairs() -> dict[str, object]:
     """The store that docs/learned.md reads."""
     from mitsim.api.bench import open_bench
     from mitsim.bench.request import Request, Task
-    from mitsim.learn.pair_request import PairsRequest
     from mitsim.learn.pairs import make_pairs
+    from mitsim.learn.requests import PairsRequest
 
     scene = write_small_scene(Path("scenes"))
     asked = PairsRequest(capture=Request.of(patterns="uniform", accuracy=0.1), count=2)

@@ -26,8 +26,7 @@ from mitsim.core.configuration import Options
 from mitsim.core.errors import ArgumentError
 from mitsim.exchange.capture_list import FrameKeys
 from mitsim.exchange.formats import ExportKeys, PictureKeys
-from mitsim.learn.pair_request import PairKeys
-from mitsim.learn.training_request import TrainingKeys
+from mitsim.learn.requests import PairKeys, TrainingKeys
 from mitsim.reconstruct.request import ImageKeys
 from mitsim.studies.emva_options import ProcedureKeys
 from mitsim.verbs import DemoKeys, RunKeys, StudyKeys

@@ -25,7 +25,7 @@ from PIL import Image
 
 from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness
-from mitsim.learn.pictures import DrawnPictures
+from mitsim.learn.pairs import DrawnPictures
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = {

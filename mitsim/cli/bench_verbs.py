@@ -40,7 +40,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import MONO, RUN
 from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
-from mitsim.learn.pair_request import PairOptions
+from mitsim.learn.requests import PairOptions
 from mitsim.studies import ALL, EXPERIMENTS, STUDIES
 from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
@@ -513,7 +513,7 @@ def pairs(
     """
     from mitsim.bench.request import Task
     from mitsim.core.files import PAIRS, check_output
-    from mitsim.learn.pair_request import PairsRequest
+    from mitsim.learn.requests import PairsRequest
 
     frames.refuse_idle()
     wanted = PairsRequest(capture=frames, **asked.given)

@@ -18,7 +18,7 @@ from mitsim.core.worker import RESUME, advise
 from mitsim.devices.patterns import pattern_names
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import Exported, Pictures
-from mitsim.learn.training_request import METHODS, Schedule, Training
+from mitsim.learn.requests import METHODS, Schedule, Training
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.studies.emva_options import Procedure
 

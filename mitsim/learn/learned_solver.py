@@ -23,7 +23,7 @@ from mitsim.core.files import check_plain, json_text, whole_file
 from mitsim.core.manifests import SIDES
 from mitsim.learn.methods import CLASSES, Binning, Data, Denoiser, Diagonal, Method, PlugAndPlay
 from mitsim.learn.pair_store import ModelManifest
-from mitsim.learn.training_request import PLUG_AND_PLAY, REFINED, UNROLLED
+from mitsim.learn.requests import PLUG_AND_PLAY, REFINED, UNROLLED
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV

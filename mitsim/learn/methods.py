@@ -31,7 +31,7 @@ from torch.nn import functional
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
-from mitsim.learn.training_request import FLATNET, PLUG_AND_PLAY, PREPROCESSED, REFINED, UNROLLED, Training
+from mitsim.learn.requests import FLATNET, PLUG_AND_PLAY, PREPROCESSED, REFINED, UNROLLED, Training
 from mitsim.reconstruct.factorisation import Side
 from mitsim.reconstruct.solver import Accumulator, Prepared
 

@@ -34,7 +34,6 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
-from mitsim.learn.pictures import WHITE
 from mitsim.optics.forming import AccumulatedLight
 from mitsim.optics.frames import ExpectedFrames
 from mitsim.optics.image_formation import FrameOptics
@@ -45,6 +44,8 @@ if TYPE_CHECKING:
     import h5py
 
 FORMAT = 1
+WHITE = 255
+"""Code of a picture that is reflectance 1."""
 _LIGHTS_KEPT = 32
 """Lights of shards in memory, some 10 MB each: as many as a network's batch meets."""
 Frames = npt.NDArray[np.float32]

@@ -4,6 +4,11 @@ Each cell of the light lies in one pixel of the picture. The light of a picture 
 the reflectance of each cell's pixel. That holds for light from one flat sheet straight to the sensor, however the
 projector blurs, scatters or leaks. Elsewhere (:func:`mitsim.bench.prints.traced_anew`) each picture's light is traced.
 Idealised frames follow the paper's separable model.
+
+Pictures are square, of eight bits, drawn from a seed or cut from a folder of files. Drawn pictures have the statistics
+of natural ones: leaves that hide each other (the dead leaves of Matheron, 1968), whose sizes follow a power law, with
+soft edges, shades and a texture of 1/f amplitude; some have lines of letters, and some stripes. A picture depends on
+the seed and its number alone. None is a photograph.
 """
 
 from __future__ import annotations
@@ -11,12 +16,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.acquire.capture import trace_request
@@ -30,15 +38,16 @@ from mitsim.bench.request import Task
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import PAIRS, output_folder, plain, write_json
+from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_json
 from mitsim.core.job import Cost, Job
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.core.seeds import integer
+from mitsim.core.prepare import read_reflectance
+from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift
-from mitsim.learn.pair_request import CALIBRATION, PairsRequest
 from mitsim.learn.pair_store import (
+    WHITE,
     Pair,
     PairsManifest,
     PairStore,
@@ -49,7 +58,7 @@ from mitsim.learn.pair_store import (
     read_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.pictures import WHITE, DrawnPictures, FolderPictures
+from mitsim.learn.requests import CALIBRATION, PairsRequest, picture_files
 from mitsim.light.light import SampledLight, Sampling, trace_light, traced_again
 from mitsim.light.memory import first_shadow, frames_cost
 from mitsim.light.plan import Plan
@@ -169,6 +178,167 @@ def electrons_per_joule(bench: Apparatus) -> float:
     return float(electrons_from_irradiance(1.0, 1.0, bench.sensor, wavelength))
 
 
+# -------- Pictures
+
+Codes = npt.NDArray[np.uint8]
+_OVER = 2
+"""Points per pixel and axis that a picture is drawn on; four show no difference, because edges are soft."""
+_RADII = 0.015, 0.35
+"""Smallest and largest leaf over the side: two pixels of 128, and a third of the picture."""
+_POWERS = 1.6, 3.2
+"""Power by which the number of leaves falls with their radius, drawn for each picture; natural pictures have about 3
+(Lee, Mumford and Huang, 2001), portraits and pictures of things have fewer small leaves."""
+_COVERED = 2.5
+_MOST_LEAVES = 600
+_SOFT = 0.3, 2.5
+"""Width of an edge in pixels, from sharp to out of focus, because a network learned nothing from hard ones."""
+_SHADE, _TEXTURE = 0.25, 0.12
+_DARKEST, _BRIGHTEST = (0.03, 0.15), (0.55, 0.95)
+_LETTERS, _STRIPES = 0.2, 0.15
+_TAILS = 0.002
+_SMALLEST_CROP = 0.5
+
+
+@dataclass(frozen=True)
+class DrawnPictures:
+    """Pictures drawn from a seed."""
+
+    seed: int
+    photographs: ClassVar[tuple[int, ...]] = ()
+    source: ClassVar[str] = "drawn by code: dead leaves with soft edges, shades and 1/f texture, letters, stripes"
+
+    def draw(self, number: int, n: int) -> Codes:
+        rng = stream(self.seed, "picture", number)
+        side = _OVER * n
+        texture = pink_noise(side, rng)
+        line, slopes = np.linspace(-0.5, 0.5, side), rng.uniform(-0.4, 0.4, 2)
+        canvas = np.asarray(rng.uniform(0.3, 0.7) + slopes[0] * line[:, None] + slopes[1] * line[None])
+        _lay_leaves(canvas, texture, rng)
+        kind = rng.random()
+        if kind < _LETTERS:
+            _lay_letters(canvas, rng)
+        elif kind < _LETTERS + _STRIPES:
+            _lay_stripes(canvas, rng)
+        small = canvas.reshape(n, _OVER, n, _OVER).mean(axis=(1, 3))
+        low, high = np.quantile(small, (_TAILS, 1 - _TAILS))
+        dark, bright = rng.uniform(*_DARKEST), rng.uniform(*_BRIGHTEST)
+        scaled = np.clip((small - low) / max(high - low, 1e-6), 0.0, 1.0)
+        return np.asarray(np.rint(WHITE * (dark + (bright - dark) * scaled)), np.uint8)
+
+
+def pink_noise(side: int, rng: np.random.Generator) -> FloatArray:
+    """Draw periodic noise (side, side) of mean 0 and rms 1 whose amplitude falls as one over the frequency."""
+    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
+    frequency[0, 0] = np.inf
+    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((side, side))) / frequency, (side, side))
+    return np.asarray(noise / noise.std())
+
+
+def _lay_leaves(canvas: FloatArray, texture: FloatArray, rng: np.random.Generator) -> None:
+    side = len(canvas)
+    power, roughness = rng.uniform(*_POWERS), rng.uniform(0.0, _TEXTURE)
+    soft = _OVER * math.exp(rng.uniform(math.log(_SOFT[0]), math.log(_SOFT[1])))
+    low, high = (limit ** (1 - power) for limit in _RADII)
+    radii = (low + (high - low) * rng.random(_MOST_LEAVES)) ** (1 / (1 - power))
+    covered = np.cumsum(math.pi * np.square(radii))
+    for radius in radii[: int(np.searchsorted(covered, _COVERED)) + 1] * side:
+        middle = rng.uniform(0, side, 2)
+        shape, turn = rng.uniform(0.4, 1.0), rng.uniform(0, math.pi)
+        boxed = rng.random() < 0.35  # rectangles; the others are ellipses
+        grey, slopes = rng.random(), rng.uniform(-_SHADE, _SHADE, 2) / (2 * radius)
+        reach = radius * (math.sqrt(2) if boxed else 1.0) + soft
+        (top, bottom), (left, right) = (
+            (max(0, math.floor(at - reach)), min(side, math.ceil(at + reach))) for at in middle
+        )
+        if top >= bottom or left >= right:
+            continue
+        down, across = np.arange(top, bottom)[:, None] - middle[0], np.arange(left, right)[None] - middle[1]
+        along = (math.cos(turn) * down + math.sin(turn) * across) / radius
+        beside = (math.cos(turn) * across - math.sin(turn) * down) / (radius * shape)
+        size = np.maximum(abs(along), abs(beside)) if boxed else np.hypot(along, beside)
+        cover = np.clip(0.5 + (1 - size) * radius * shape / soft, 0.0, 1.0)
+        patch = np.roll(texture, tuple(rng.integers(0, side, 2)), (0, 1))[: bottom - top, : right - left]
+        leaf = grey + slopes[0] * down + slopes[1] * across + roughness * patch
+        canvas[top:bottom, left:right] += cover * (leaf - canvas[top:bottom, left:right])
+
+
+def _lay_letters(canvas: FloatArray, rng: np.random.Generator) -> None:
+    from PIL import Image, ImageDraw, ImageFont  # here: most pictures need none
+
+    side = len(canvas)
+    size = int(side * rng.uniform(0.05, 0.14))
+    page = Image.new("L", (side, side))
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(max(size, 6))
+    first, last = sorted(rng.uniform(0, side, 2))
+    for top in range(int(first), int(max(last, first + 1.5 * size)), max(int(1.3 * size), 1)):
+        words = "".join(chr(code) for code in rng.choice([32, 32, *range(65, 91), *range(97, 123)], 60))
+        pen.text((int(rng.uniform(-size, size)), top), words, fill=WHITE, font=font)
+    cover = np.asarray(page, dtype=np.float64) / WHITE
+    canvas += cover * (rng.choice([0.02, 0.98]) - canvas)
+
+
+def _lay_stripes(canvas: FloatArray, rng: np.random.Generator) -> None:
+    side = len(canvas)
+    top, left = (int(at) for at in rng.uniform(0, 0.5 * side, 2))
+    box = canvas[top : top + int(rng.uniform(0.2, 0.5) * side), left : left + int(rng.uniform(0.2, 0.5) * side)]
+    width, turn = side * math.exp(rng.uniform(math.log(0.02), math.log(0.15))), rng.uniform(0, math.pi)
+    down, across = np.arange(box.shape[0])[:, None], np.arange(box.shape[1])[None]
+    phase = (math.cos(turn) * down + math.sin(turn) * across) / width
+    wave = np.clip(0.5 + np.sin(2 * math.pi * phase) * width / math.pi, 0.0, 1.0)
+    dark, bright = sorted(rng.random(2))
+    box[...] = dark + (bright - dark) * wave
+
+
+@dataclass(frozen=True)
+class FolderPictures:
+    """Grey pictures of the files in a folder, in the order of their names.
+
+    The first pictures are the middle squares of the files; further ones are squares drawn from them, turned and
+    mirrored.
+    """
+
+    folder: Path
+    seed: int
+
+    @cached_property
+    def files(self) -> tuple[Path, ...]:
+        return picture_files(self.folder)
+
+    @cached_property
+    def source(self) -> str:
+        """Number, folder and digest of the files, which a store states."""
+        digest = hashlib.sha256()
+        for path in self.files:
+            digest.update(f"{path.name} {check_plain(path, 'picture').st_size}\n".encode())
+        return f"{len(self.files)} files of {self.folder}, names and sizes {digest.hexdigest()[:16]}"
+
+    @cached_property
+    def photographs(self) -> tuple[int, ...]:
+        """Number of the first file that holds the same bytes as each file."""
+        digests = [hashlib.sha256(path.read_bytes()).digest() for path in self.files]
+        return tuple(map(digests.index, digests))
+
+    def draw(self, number: int, n: int) -> Codes:
+        """Cut a picture of n pixels along each axis; raise MitsimError for a file that is unreadable or smaller."""
+        path = self.files[number % len(self.files)]
+        grey = read_reflectance(path)
+        whole = min(grey.shape)
+        if whole < n:
+            raise MitsimError(f"picture {path}: has {whole} pixels on its shorter side, and {n} are shown; give larger")
+        if number < len(self.files):
+            side, places, turns, mirrored = whole, [(size - whole) // 2 for size in grey.shape], 0, False
+        else:
+            rng = stream(self.seed, "crop", number)
+            side = int(rng.uniform(max(n, _SMALLEST_CROP * whole), whole))
+            places = [int(rng.integers(0, size - side + 1)) for size in grey.shape]
+            turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
+        square = np.rot90(grey[places[0] : places[0] + side, places[1] : places[1] + side], turns)
+        square = square[:, ::-1] if mirrored else square
+        below = np.clip(np.arange(side + 1)[None] - np.linspace(0, side, n + 1)[:-1, None], 0, side / n)
+        weights = np.diff(below, axis=1) * n / side
+        return np.asarray(np.rint(WHITE * (weights @ square @ weights.T)), np.uint8)
+
+
 # -------- Making a store
 
 
@@ -182,45 +352,33 @@ class _Maker:
         self._open: tuple[dict[str, str], Bench, Plan] | None = None
         self._white: tuple[Bench, WhitePrints] | None = None
         self.bench, self._plan = self._bench_of(0)
-        self._family = self.bench.family(asked.capture.patterns, asked.capture.seed)
+        self._family = self.bench.family(asked.capture.patterns, seed)
         self.why_anew = self._why(self.bench)
 
     @property
     def configuration(self) -> dict[str, Any]:
         asked, bench = self._asked, self.bench
-        found: dict[str, Any] = plain(
-            {
-                **asked.capture.deciding,
-                "count": asked.count,
-                "idealised": asked.idealised,
-                "pictures": self._pictures.source,
-                "groups": self._groups,
-                "bench": {**bench.provenance(), **bench.identity()},
-                "versions": deciding_versions(),
-            }
-        )
-        return found
+        found = {**asked.capture.deciding, "count": asked.count, "idealised": asked.idealised}
+        found |= {"pictures": self._pictures.source, "groups": self._groups}
+        found |= {"bench": {**bench.provenance(), **bench.identity()}, "versions": deciding_versions()}
+        return dict(plain(found))
 
     def _why(self, bench: Bench) -> str:
         return "" if self._asked.idealised else traced_anew(bench)
 
-    def check_pictures(self, shards: Iterable[Shard]) -> None:
+    def check(self, shards: Sequence[Shard]) -> None:
+        """Read all pictures and open all benches before any light is traced.
+
+        Raise MitsimError if one cannot be read or opened, or if a bench's light must be traced for each picture and
+        that of the first bench need not.
+        """
         if isinstance(self._pictures, FolderPictures):
             files = len(self._pictures.files)
             for number in {index % files for each in shards for index in range(each.first, each.first + each.count)}:
                 self._pictures.draw(number, self.bench.n)
-
-    def check_benches(self, groups: Iterable[int]) -> None:
-        """Open all benches before any light is traced.
-
-        Raise MitsimError if one cannot be opened, or if its light must be traced for each picture and that of the first
-        bench need not.
-        """
-        if self.why_anew:
-            return
-        of_groups = {tuple(self._parameters(group).items()): group for group in groups}
+        of_groups = {tuple(self._parameters(each.group).items()): each.group for each in shards}
         for parameters, group in of_groups.items():
-            if parameters and (why := self._why(self._opening(dict(parameters)))):
+            if not self.why_anew and parameters and (why := self._why(self._opening(dict(parameters)))):
                 raise ArgumentError(
                     "vary",
                     f"bench {group} ({', '.join(f'{name} {value}' for name, value in parameters)}): {why}, other than "
@@ -254,8 +412,8 @@ class _Maker:
 
     def write(self, shard: Shard, path: Path, digest: str) -> None:
         bench, plan = self._bench_of(shard.group)
-        drawn = self._groups[shard.group]
-        mask = {name.partition(".")[2]: value for name, value in drawn.items() if name.startswith("mask.")}
+        drawn = self._groups[shard.group].items()
+        mask = {name.partition(".")[2]: value for name, value in drawn if name.startswith("mask.")}
         moved, idealised = drift_mask(bench, Drift(**mask)) if mask else bench, self._asked.idealised
         light: PrintLight | None = None
         if not self.why_anew:
@@ -269,9 +427,8 @@ class _Maker:
 
     def _pairs(self, shard: Shard, moved: Apparatus, light: PrintLight | None, keep: bool) -> Iterator[Pair]:
         (bench, plan), lighting, sensor = self._bench_of(shard.group), self._family.lighting, moved.sensor
-        timing = self._asked.capture.timing
+        timing, per_joule = self._asked.capture.timing, electrons_per_joule(moved)
         timing = replace(timing, fraction=self._groups[shard.group].get("exposure_fraction", timing.fraction))
-        per_joule = electrons_per_joule(moved)
         for index in range(shard.first, shard.first + shard.count):
             picture = self._pictures.draw(index, bench.n)
             reflectance = picture / WHITE
@@ -297,26 +454,23 @@ class _Maker:
 
     def cost(self, left: Sequence[Shard]) -> Cost:
         pairs, pixels, shots = sum(shard.count for shard in left), self.bench.n**2, len(self._family.shots)
-        of_benches = {tuple(sorted(self._groups[shard.group].items())) for shard in left}
+        geometry, taken, anew = self.bench.geometry, self._plan.predicted, bool(self.why_anew)
         varied = self._asked.vary is not None and bool(self._asked.vary.scene)
-        taken = self._plan.predicted
+        benches = len({tuple(sorted(self._groups[shard.group].items())) for shard in left}) if varied else 1
         tracing = taken["transport"] + taken["truth"]
         each = _FORMED * taken["optics"] + _PICTURE_S * pixels
-        few = not self.why_anew and not self.bench.geometry.is_correlated(self.bench.geometry.diffracts)
-        frames = 0 if few else _FRAME_BYTES * shots * math.prod(self.bench.geometry.frame_shape)
-        benches = len(of_benches) if varied else 1
-        seconds = pairs * (each + (tracing if self.why_anew else 0.0))
-        seconds += benches * (taken["plan"] + (0.0 if self.why_anew else tracing))
+        seconds = pairs * (each + tracing * anew) + benches * (taken["plan"] + tracing * (not anew))
+        few = not anew and not geometry.is_correlated(geometry.diffracts)
+        frames = 0 if few else _FRAME_BYTES * shots * math.prod(geometry.frame_shape)
+        shadow = len(left) * _SHADOW_BYTES * sum(geometry.frame_shape) * self.bench.n
         memory = frames_cost(self.bench, self._plan.settings, self._family.lighting).memory_bytes
-        shadow = len(left) * _SHADOW_BYTES * sum(self.bench.geometry.frame_shape) * self.bench.n
         return Cost(seconds, memory, pairs * (pixels * _PAIR_BYTES + frames) + shadow)
 
     def begin(self, configuration: Mapping[str, Any], shards: tuple[Shard, ...]) -> PairsManifest:
         bench, asked, capture = self.bench, self._asked, self._asked.capture
         lamps = "ambient" in self._plan.settings.effects and not asked.idealised
-        taken = capture.ambient_frame == "yes" or (
-            capture.ambient_frame == "auto" and lamps and not self._family.signed
-        )
+        auto = capture.ambient_frame == "auto" and lamps and not self._family.signed
+        taken = capture.ambient_frame == "yes" or auto
         return PairsManifest(
             status="incomplete",
             configuration=dict(configuration),
@@ -346,43 +500,27 @@ class _Maker:
         sides = camera.calibrated(float(self._white_of(0).light.apparent.board_flux.mean()))
         left, right = (side.astype(np.float32).astype(np.float64) for side in sides)
         status = Status(Verdict.CALIBRATED, "Exact factors of the idealised model")
-        manifest = CalibrationManifest(
-            camera=plain(self.bench.identity()),
-            centre=camera.centre,
-            estimate=str(status),
-            verdict=status.verdict.value,
-            versions=versions(),
-        )
-        return Factors(left, right, manifest, status)
+        about: dict[str, Any] = {"camera": plain(self.bench.identity()), "centre": camera.centre}
+        about |= {"estimate": str(status), "verdict": status.verdict.value, "versions": versions()}
+        return Factors(left, right, CalibrationManifest(**about), status)
 
     def finish(self, store: PairStore) -> PairsManifest:
         begun, facts = store.manifest, [store.facts(shard) for shard in store.manifest.shards]
         exposure_s = float(np.median(np.concatenate([exposures for exposures, _, _ in facts])))
-        saturated = sum(count for _, count, _ in facts)
         found = [text for _, _, warnings in facts for text in warnings]
-        if saturated:
+        if saturated := sum(count for _, count, _ in facts):
             found.append(f"saturation: {saturated} pairs are expected to fill the full well; expose for less")
         if self.bench.loaded.lamps and self._asked.capture.ambient_frame == "no" and not self._family.signed:
             found.append("light of lamps is not taken off (ambient_frame is no): frames have it, and truths have not")
         found += camera_warnings(self.bench.sensor, begun.m)
-        return begun.model_copy(
-            update={
-                "status": "complete",
-                "exposure_s": exposure_s,
-                "digital": digital_of(begun.sensor_model, exposure_s),
-                "warnings": tuple(dict.fromkeys(found)),
-            }
-        )
-
-
-def _shards(asked: PairsRequest) -> tuple[Shard, ...]:
-    found, groups = list[Shard](), 1 if asked.vary is None else asked.vary.groups
-    ends = [asked.count * (group + 1) // groups for group in range(groups)]
-    for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        for first in range(start, end, SHARD):
-            file = f"pairs_{len(found):05}.h5"
-            found.append(Shard(file=file, first=first, count=min(SHARD, end - first), group=group))
-    return tuple(found)
+        digital = digital_of(begun.sensor_model, exposure_s)
+        new = {
+            "status": "complete",
+            "exposure_s": exposure_s,
+            "digital": digital,
+            "warnings": tuple(dict.fromkeys(found)),
+        }
+        return begun.model_copy(update=new)
 
 
 def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairStore, Cost]:
@@ -409,15 +547,19 @@ def make_pairs(opening: Opening, asked: PairsRequest, task: Task) -> tuple[PairS
                 "the same options, or another folder"
             )
     digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest()
-    shards = _shards(asked)
+    shards, groups = list[Shard](), 1 if asked.vary is None else asked.vary.groups
+    ends = [asked.count * group // groups for group in range(groups + 1)]
+    for group, (start, end) in enumerate(pairwise(ends)):
+        for first in range(start, end, SHARD):
+            file = f"pairs_{len(shards):05}.h5"
+            shards.append(Shard(file=file, first=first, count=min(SHARD, end - first), group=group))
     with output_folder(task.output, overwrite=again) as folder:
         left = [shard for shard in shards if not is_shard(folder / shard.file, digest, shard.count)]
-        maker.check_pictures(left)
-        maker.check_benches(shard.group for shard in left)
+        maker.check(left)
         cost = maker.cost(left)
         cost.check(f"{asked.count} pairs", job.limits, folder)
         job.clock.predict({"pairs": cost.seconds})
-        begun = maker.begin(configuration, shards)
+        begun = maker.begin(configuration, tuple(shards))
         write_json(folder / PAIRS, begun)
         for shard in left:
             maker.write(shard, folder / shard.file, digest)

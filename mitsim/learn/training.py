@@ -28,7 +28,7 @@ from mitsim.core.seeds import integer, stream
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, on_device, relative_noise, write_tensors
 from mitsim.learn.methods import BIN, CLASSES, Binning, Critic, Data, Diagonal, Method, decibels, drawn_way, has_half
 from mitsim.learn.pair_store import ModelManifest, PairStore
-from mitsim.learn.training_request import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
+from mitsim.learn.requests import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.reconstruct.solver import Prepared
@@ -165,11 +165,11 @@ class Trainer:
         if self.critic is None:
             loss = self.network.loss(truths, data, self.model, noise)
             loss.backward()
-            return float(loss.detach())
-        images = self.network(data, self.model, drawn_way(noise))
-        loss = decibels(images, truths) + self.critic.loss(images, truths)
-        loss.backward()
-        self.critic.learn(images, truths)
+        else:
+            images = self.network(data, self.model, drawn_way(noise))
+            loss = decibels(images, truths) + self.critic.loss(images, truths)
+            loss.backward()
+            self.critic.learn(images, truths)
         return float(loss.detach())
 
     def batch(self, chosen: Any) -> tuple[Tensor, Data]:
@@ -338,15 +338,32 @@ def train_network(
     """
     job, output = job or Job(), Path(output)
     started = time.perf_counter()
-    _check(store, factors)
+    if len(store) < FEWEST_PAIRS:
+        raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
+    if (count := len(np.unique(store.photographs))) < FEWEST_PHOTOGRAPHS:
+        raise MitsimError(
+            f"{store.folder}: its pairs show {count} photographs; give at least {FEWEST_PHOTOGRAPHS}, because one "
+            "chooses the best step and one judges, and neither may teach"
+        )
+    frame, shape = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
+    found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
+    if (frame, shape) != found:
+        raise MitsimError(
+            f"calibration {factors.name}: has frames of {frame} and images of {shape} pixels, but {store.folder} "
+            f"{found[0]} and {found[1]}; calibrate this camera"
+        )
     with job.clock.stage("read"):
         prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
-        network = first_network(request, (factors.left.shape[1], factors.right.shape[1]))
-        _memory(store, network, request).check(f"{store.folder}: training {request.method}", job.limits)
+        network = first_network(request, shape)
+        half = has_half(next(network.parameters()).device)
+        bins = math.prod(-(-size // BIN) for size in frame) * store.manifest.frames if network.reads_frames else 0
+        pixels = math.prod(shape) * network.PASSES + bins // _FRAME_PIXELS
+        memory = _CHANNEL_BYTES * network.WIDTH * (_HALF if half else 1.0) * request.batch * pixels
+        memory += _BASE_BYTES + 4.0 * len(store) * (2 * math.prod(shape) + bins)
+        Cost(memory_bytes=memory).check(f"{store.folder}: training {request.method}", job.limits)
         sums = sums or Sums.of(store, prepared, job, network.reads_frames)
     trainer, first = Trainer(request, prepared, sums, network), _copy(network)
     about = store.manifest.model_dump(mode="json", exclude={"shards", "sensor"})
-    half = has_half(trainer.model.sigma.device)
     parts = request.model_dump(), factors.fingerprint, about, half
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
     unfinished = Path(f"{output}{_UNFINISHED}")
@@ -379,31 +396,3 @@ def first_network(request: Training, shape: tuple[int, int]) -> Method:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(integer(request.seed, "weights"))
         return on_device(CLASSES[request.method](shape), request.device)
-
-
-def _check(store: PairStore, factors: Factors) -> None:
-    if len(store) < FEWEST_PAIRS:
-        raise MitsimError(f"{store.folder}: holds {len(store)} pairs; give at least {FEWEST_PAIRS}")
-    if (count := len(np.unique(store.photographs))) < FEWEST_PHOTOGRAPHS:
-        raise MitsimError(
-            f"{store.folder}: its pairs show {count} photographs; give at least {FEWEST_PHOTOGRAPHS}, because one "
-            "chooses the best step and one judges, and neither may teach"
-        )
-    sizes = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
-    found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
-    if sizes != found:
-        raise MitsimError(
-            f"calibration {factors.name}: has frames of {sizes[0]} and images of {sizes[1]} pixels, but {store.folder} "
-            f"{found[0]} and {found[1]}; calibrate this camera"
-        )
-
-
-def _memory(store: PairStore, network: Method, request: Training) -> Cost:
-    pixels = network.shape[0] * network.shape[1] * network.PASSES
-    kept = 2 * network.shape[0] * network.shape[1]
-    if network.reads_frames:
-        bins = store.manifest.frames * math.prod(-(-size // BIN) for size in store.manifest.m)
-        pixels, kept = pixels + bins // _FRAME_PIXELS, kept + bins
-    sums = 4.0 * len(store) * kept
-    a_pixel = _CHANNEL_BYTES * network.WIDTH * (_HALF if has_half(next(network.parameters()).device) else 1.0)
-    return Cost(memory_bytes=_BASE_BYTES + sums + a_pixel * request.batch * pixels)

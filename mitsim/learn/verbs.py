@@ -13,18 +13,16 @@ from mitsim.core.configuration import takes
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import PAIRS, check_apart, check_output, check_plain, output_file
 from mitsim.core.job import Job
-from mitsim.learn.pair_request import CALIBRATION, PairOptions, PairsRequest
-from mitsim.learn.training_request import Schedule, Training
+from mitsim.learn.requests import CALIBRATION, PairOptions, PairsRequest, Schedule, Training
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from mitsim.api.bench import Bench
     from mitsim.learn.learned_solver import LearnedSolver
-    from mitsim.learn.pair_request import PairKeys
     from mitsim.learn.pair_store import PairStore
+    from mitsim.learn.requests import PairKeys, TrainingKeys
     from mitsim.learn.training import Trained
-    from mitsim.learn.training_request import TrainingKeys
 
 
 def check_torch() -> None:
@@ -118,7 +116,7 @@ def train(
     Parameters
     ----------
     method
-        one of :data:`mitsim.learn.training_request.METHODS`.
+        one of :data:`mitsim.learn.requests.METHODS`.
     pairs, output
         folder of `mitsim pairs`, and the file, which ends in ``.pt``.
     calibration

@@ -20,15 +20,16 @@ from mitsim.bench.request import Request, Task
 from mitsim.core.arrays import FloatArray, read_npz
 from mitsim.core.files import PAIRS
 from mitsim.core.manifests import CalibrationManifest
-from mitsim.learn.pair_request import PairsRequest, Variation
-from mitsim.learn.training_request import (
+from mitsim.learn.requests import (
     FLATNET,
     METHODS,
     PLUG_AND_PLAY,
     PREPROCESSED,
     REFINED,
     UNROLLED,
+    PairsRequest,
     Training,
+    Variation,
 )
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.request import TIKHONOV

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from mitsim.learn.training_request import FLATNET, REFINED
+from mitsim.learn.requests import FLATNET, REFINED
 from mitsim.report import IDEALISED, RENDERED, in_text
 from mitsim.report.pages import Mean, Table, Value
 from mitsim.studies.framework.claims import Holds, every, verdict, within

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from matplotlib.figure import Figure
 
 from mitsim.core.arrays import FloatArray
-from mitsim.learn.training_request import FLATNET
+from mitsim.learn.requests import FLATNET
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.request import TIKHONOV
 from mitsim.report import IDEALISED, RENDERED, in_text, label

@@ -16,7 +16,7 @@ from typing import Any
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.learn.training_request import PREPROCESSED
+from mitsim.learn.requests import PREPROCESSED
 from mitsim.learn.verbs import check_torch
 from mitsim.report import RENDERED
 from mitsim.report.pages import Value

@@ -23,8 +23,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
-from mitsim.learn.pictures import WHITE, DrawnPictures
-from mitsim.learn.training_request import REFINED, UNROLLED, Training
+from mitsim.learn.pair_store import WHITE
+from mitsim.learn.pairs import DrawnPictures
+from mitsim.learn.requests import REFINED, UNROLLED, Training
 from mitsim.learn.verbs import check_torch
 from mitsim.reconstruct.request import TIKHONOV, TV
 from mitsim.reconstruct.shifted_codes import TURNS

@@ -26,8 +26,8 @@ from mitsim.exchange import labelled
 from mitsim.learn import methods, training, verbs
 from mitsim.learn.learned_solver import LearnedSolver, datum_variance, read_network
 from mitsim.learn.methods import BIN, CLASSES, LEVELS, WAYS, Binning, Critic, Data, Diagonal, UNet, has_half
+from mitsim.learn.requests import METHODS, Training
 from mitsim.learn.training import train_network
-from mitsim.learn.training_request import METHODS, Training
 from mitsim.metrics import psnr
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solvers import SOLVERS

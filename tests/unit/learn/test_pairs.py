@@ -22,9 +22,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer
 from mitsim.devices.session import load_recipe
 from mitsim.learn import pairs as pairs_module
-from mitsim.learn.pair_request import PairsRequest, Variation
 from mitsim.learn.pair_store import PairStore, PrintPart
 from mitsim.learn.pairs import electrons_per_joule, make_pairs
+from mitsim.learn.requests import PairsRequest, Variation
 from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms

@@ -8,7 +8,7 @@ from PIL import Image
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.learn.pictures import DrawnPictures, FolderPictures, pink_noise
+from mitsim.learn.pairs import DrawnPictures, FolderPictures, pink_noise
 
 N = 64
 

@@ -1,6 +1,6 @@
-"""What pairs are asked for: options or arguments in, a checked request, or a refusal in one line, out.
+"""Requests for pairs and for trainings: options or arguments in, a checked request or a refusal in one line out.
 
-Nothing here imports numpy before work begins.
+Importing this file imports neither numpy nor torch.
 """
 
 from __future__ import annotations
@@ -10,19 +10,21 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from mitsim.bench.request import Exposure, ExposureKeys, Request
-from mitsim.core.configuration import Configuration, FilePath, Options, load_model, option, validate
-from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.bench.request import Exposure, ExposureKeys, Request, Seeded, SeedKeys
+from mitsim.core.configuration import LIMITS, QUALITY, Configuration, FilePath, Options, load_model, option, validate
+from mitsim.core.errors import ArgumentError, MitsimError, near_name
 from mitsim.core.imagelist import PRINTS
 from mitsim.core.seeds import stream
 from mitsim.devices.session import Drift
 
+# -------- Pairs
+
 MOST_PAIRS = 10**6
-"""Pairs that may be asked for: beyond what any network of these was trained on, and within five digits of shards."""
+"""Pairs that may be asked for: beyond what any of these networks was trained on, and within five digits of shards."""
 CALIBRATION = "calibration"
 """CAL folder in a folder of pairs of the idealised model, whose factors are known."""
 Between = Annotated[tuple[float, float], Field(strict=False)]
-"""Least and largest number that are drawn, all between them alike."""
+"""Least and largest number that are drawn, all between them with equal chance."""
 
 
 class Variation(Configuration):
@@ -55,10 +57,10 @@ class Variation(Configuration):
         return value
 
     def draw(self, seed: int, group: int) -> dict[str, float]:
-        """What is drawn for bench number ``group`` under a ``seed``, by `table.name`."""
+        """Return the numbers that are drawn for bench number ``group`` under a ``seed``, by `table.name`."""
         rng = stream(seed, "bench", group)
-        ranges = {f"scene.{name}": limits for name, limits in self.scene.items()}
-        ranges |= {f"mask.{name}": limits for name, limits in self.mask.items()}
+        tables = {"scene": self.scene, "mask": self.mask}
+        ranges = {f"{table}.{name}": limits for table, each in tables.items() for name, limits in each.items()}
         if self.exposure_fraction is not None:
             ranges["exposure_fraction"] = self.exposure_fraction
         return {name: float(rng.uniform(*limits)) for name, limits in sorted(ranges.items())}
@@ -90,28 +92,30 @@ class PairsRequest(PairOptions):
     """Request of each pair's frames; its seed is the root of all streams."""
 
     def check(self) -> None:
-        """MitsimError for a request that cannot be served, before any work."""
-        if self.capture.seconds is not None or self.capture.noise_fraction is not None:
+        """Refuse a request that cannot be served with a MitsimError, before any work."""
+        capture, vary = self.capture, self.vary
+        if capture.seconds is not None or capture.noise_fraction is not None:
             raise ArgumentError("seconds", "pairs share their light; give an accuracy")
-        if self.capture.closing_frame is not None:
+        if capture.closing_frame is not None:
             raise ArgumentError("closing_frame", "pairs have none; leave it out")
         if self.pictures is not None:
             picture_files(Path(self.pictures))
-        vary = self.vary
-        for limit in (vary and vary.exposure_fraction) or ():
+        if vary is None:
+            return
+        for limit in vary.exposure_fraction or ():
             Exposure(None, limit)
-        for name, limits in vary.mask.items() if vary else ():
+        for name, limits in vary.mask.items():
             for limit in limits:
                 validate(Drift, {name: limit}, "vary: [mask]")
-        if vary is not None and self.idealised:
+        if self.idealised:
             raise ArgumentError("vary", "the idealised model has no bench that varies; leave out one of the two")
-        if vary is not None and vary.groups > self.count:
+        if vary.groups > self.count:
             raise ArgumentError("vary", f"{vary.groups} groups of {self.count} pairs; give fewer groups or more pairs")
-        if vary is not None and vary.exposure_fraction and self.capture.exposure != "auto":
-            raise ArgumentError("exposure", f"{self.capture.exposure}: exposure_fraction varies; leave out one of both")
+        if vary.exposure_fraction and capture.exposure != "auto":
+            raise ArgumentError("exposure", f"{capture.exposure}: exposure_fraction varies; leave out one of both")
 
     def groups(self) -> list[dict[str, float]]:
-        """What is drawn for each bench."""
+        """Return the numbers that are drawn for each bench."""
         if self.vary is None:
             return [{}]
         return [self.vary.draw(self.capture.seed, group) for group in range(self.vary.groups)]
@@ -125,10 +129,67 @@ class PairKeys(ExposureKeys, total=False):
 
 
 def picture_files(folder: Path) -> tuple[Path, ...]:
-    """The pictures in a ``folder``, by their names. MitsimError where there are none."""
+    """Return the pictures in a ``folder`` by their names; MitsimError if there are none."""
     if not folder.is_dir():
         raise MitsimError(f"pictures {folder}: is no folder; give one of pictures")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PRINTS)
     if not found:
         raise MitsimError(f"pictures {folder}: holds no file that ends in {', '.join(PRINTS)}")
     return tuple(found)
+
+
+# -------- Trainings
+
+UNROLLED, REFINED, FLATNET, PLUG_AND_PLAY, PREPROCESSED = METHODS = (
+    "unrolled", "refined", "flatnet", "plug-and-play", "preprocessed",
+)  # fmt: skip
+"""Names of the classes of :mod:`mitsim.learn.methods`."""
+_LARGEST_BATCH, _LONGEST, _LARGEST_WEIGHT = 256, 1_000_000, 100
+"""Pairs a step, thirty times what is usual; steps, ten days of the smallest network on two processors; and weight of a
+loss beside the squared error, which then does not count."""
+FEWEST_PAIRS, FEWEST_PHOTOGRAPHS = 8, 3
+"""Least numbers that can be divided: one photograph teaches, one chooses the best step, and one judges."""
+
+
+class Schedule(Seeded):
+    """How a network is trained."""
+
+    PANEL = QUALITY
+
+    steps: int = option(4000, "of the optimiser", ge=1, le=_LONGEST)
+    batch: int = option(4, "pairs a step", ge=1, le=_LARGEST_BATCH)
+    rate: float = option(2e-3, "largest learning rate of the cycle", gt=0, le=1)
+    device: str = option("cpu", "that torch works on", metavar="NAME", panel=LIMITS)
+    feature_weight: float = option(
+        0.0, "of differences of features, beside the squared error", ge=0, le=_LARGEST_WEIGHT
+    )
+    adversary_weight: float = option(0.0, "of what an adversary tells from truths, beside it", ge=0, le=_LARGEST_WEIGHT)
+
+
+class Training(Schedule):
+    """Which network is trained, and how."""
+
+    VERB = "train"
+
+    method: str
+    """One of :data:`METHODS`."""
+
+    def model_post_init(self, _: object) -> None:
+        """Refuse what no network is trained by."""
+        if self.method not in METHODS:
+            near = near_name(str(self.method), METHODS)
+            raise MitsimError(f"method {self.method!r}: {near}use {', '.join(METHODS[:-1])} or {METHODS[-1]}")
+        for name in ("feature_weight", "adversary_weight"):
+            if (value := getattr(self, name)) and self.method == PLUG_AND_PLAY:
+                raise ArgumentError(name, f"{value}: {PLUG_AND_PLAY} learns from noise alone; leave it out")
+
+
+class TrainingKeys(SeedKeys, total=False):
+    """Keywords of :class:`Schedule`."""
+
+    steps: int
+    batch: int
+    rate: float
+    device: str
+    feature_weight: float
+    adversary_weight: float
