@@ -16,7 +16,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Literal, cast
@@ -86,33 +85,26 @@ _CHANNEL = "DN"
 """Channel of an OpenEXR file of several that is read."""
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What a file's header says: pages, size of the first, what reads the numbers of each page, and bytes of memory
-    that a pixel takes meanwhile."""
-
-    pages: int
-    size: tuple[int, int]
-    read: Callable[[], Iterator[Numbers]]
-    pixel_bytes: float = _PIXEL_BYTES
+_Reader = Iterator[Any]
+"""Yields what a header says - pages, size of the first, bytes of memory that a pixel takes while it is read -, and then
+the numbers of each page."""
 
 
 def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, int]]:
-    """How many pages a picture has, and rows and columns of the first, from its header.
+    """Return the number of pages of a picture, and rows and columns of the first, from its header.
 
     Parameters
     ----------
     path, wanted
         as for :func:`read_images`, whose errors it raises.
     """
-    path = Path(path)
-    with _one_line_refusals(path, wanted):
-        found = _read_header(path, wanted)
-        return found.pages, found.size
+    with _one_line_refusals(Path(path), wanted):
+        (pages, size, _), _ = _read_header(Path(path), wanted)
+        return pages, size
 
 
 def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
-    """Rows and columns of a picture, from its header; of several pages, of the first.
+    """Return rows and columns of a picture, from its header; of several pages, of the first.
 
     Parameters
     ----------
@@ -123,7 +115,7 @@ def image_size(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, int]:
 
 
 def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
-    """Numbers of a picture of one page.
+    """Return the numbers of a picture of one page.
 
     Parameters
     ----------
@@ -135,15 +127,14 @@ def read_image(path: Path | str, wanted: Wanted = FRAME) -> Numbers:
     MitsimError
         as there, and for several pages.
     """
-    path = Path(path)
     pages, _ = image_pages(path, wanted)
     if pages != 1:
-        raise wanted.refusal(path, f"has {pages} pages; give each {wanted.what} a file of its own")
+        raise wanted.refusal(Path(path), f"has {pages} pages; give each {wanted.what} a file of its own")
     return next(read_images(path, wanted))
 
 
 def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
-    """Numbers of every page of a picture as they are stored: no gamma, no scale.
+    """Yield the numbers of every page of a picture as they are stored: no gamma, no scale.
 
     PNG, TIFF (of one page or more), NPY of whole or real numbers (rows x columns, or pages before them), OpenEXR with a
     channel `DN` or one channel, and bare numbers.
@@ -163,9 +154,9 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
     """
     path = Path(path)
     with _one_line_refusals(path, wanted):
-        found = _read_header(path, wanted)
-        Cost(memory_bytes=found.pixel_bytes * math.prod(found.size)).check(f"{wanted.what} {path}", Limits())
-        for values in found.read():
+        (_, size, pixel_bytes), numbers = _read_header(path, wanted)
+        Cost(memory_bytes=pixel_bytes * math.prod(size)).check(f"{wanted.what} {path}", Limits())
+        for values in numbers:
             _check_size(path, wanted, values.shape[0], values.shape[1])
             bad = np.count_nonzero(~np.isfinite(values))
             if bad:
@@ -174,19 +165,21 @@ def read_images(path: Path | str, wanted: Wanted = FRAME) -> Iterator[Numbers]:
 
 
 def own_end(values: Numbers) -> float | None:
-    """Largest number that a file of such ``values`` can hold: 255 or 65535; None where cameras seldom reach it."""
+    """Return the largest number that a file of such ``values`` can hold: 255 or 65535; None where cameras seldom reach
+    it."""
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
-def _read_header(path: Path, wanted: Wanted) -> _Header:
-    """What the header of a file says, before pixels are read: what it claims is allocated."""
+def _read_header(path: Path, wanted: Wanted) -> tuple[tuple[int, tuple[int, int], float], Iterator[Numbers]]:
+    """Return what the header of a file says and an iterator over its pages: what it claims is allocated."""
     check_plain(path, wanted.what)
     ending = path.suffix.lower()
     if ending not in _READERS:
         raise wanted.refusal(path, f"ends in {ending or 'nothing'}; read are {', '.join(_READERS)}")
-    found = _READERS[ending](path, wanted)
-    _check_size(path, wanted, *found.size)
-    return found
+    numbers = _READERS[ending](path, wanted)
+    header = next(numbers)
+    _check_size(path, wanted, *header[1])
+    return header, numbers
 
 
 def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
@@ -196,7 +189,7 @@ def _check_size(path: Path, wanted: Wanted, rows: int, columns: int) -> None:
         raise wanted.refusal(path, f"{rows} x {columns} pixels; {FRAME_LIMITS} are read; bin it, or cut out a part")
 
 
-def _png(path: Path, wanted: Wanted) -> _Header:
+def _png(path: Path, wanted: Wanted) -> _Reader:
     from PIL.PngImagePlugin import PngImageFile
 
     with warnings.catch_warnings():
@@ -213,27 +206,19 @@ def _png(path: Path, wanted: Wanted) -> _Header:
     if bits not in wanted.bits and not (wanted.colour and stored in _COLOURS):
         known = (count for count in wanted.bits if count in _PNG_BITS.values())
         raise wanted.refusal(path, f"is no {_allowed_kinds('PNG', known, wanted)}")
-
-    def read() -> Iterator[Numbers]:
-        """Its one page."""
-        with _open_picture(path, "PNG") as picture:
-            if "transparency" in picture.info:
-                raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
-            # Some versions of Pillow give 16 bits of a PNG as 32.
-            values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
-            yield _upright(path, values, _orientation(picture), wanted)  # a PNG may say it behind its pixels
-
-    return _Header(1, (rows, columns), read)
-
-
-def _orientation(picture: Image) -> Any:
-    """How a ``picture`` is to be shown."""
-    return picture.getexif().get(_ORIENTATION, _UPRIGHT)
+    yield 1, (rows, columns), _PIXEL_BYTES
+    with _open_picture(path, "PNG") as picture:
+        if "transparency" in picture.info:
+            raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
+        # Some versions of Pillow give 16 bits of a PNG as 32.
+        values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+        stated = picture.getexif().get(_ORIENTATION, _UPRIGHT)  # which a PNG may say behind its pixels
+        yield _upright(path, values, stated, wanted)
 
 
 def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Numbers:
-    """The numbers of a picture as they are ``wanted`` of a file that states how it is to be shown; MitsimError where
-    nobody says whether what is stored is meant, or what is shown."""
+    """Return the numbers of a picture as they are ``wanted`` of a file that states its orientation; MitsimError where
+    nobody says whether the stored or the shown picture is meant."""
     if wanted.orientation is None and stated != _UPRIGHT:
         raise wanted.refusal(
             path,
@@ -248,60 +233,49 @@ def _upright(path: Path, values: Numbers, stated: Any, wanted: Wanted) -> Number
 
 
 def orient(values: Numbers, orientation: int) -> Numbers:
-    """``values`` (rows, columns) as they are to be shown by an ``orientation`` of TIFF 6.0 and Exif, 1 to 8."""
+    """Return ``values`` (rows, columns) as they are to be shown by an ``orientation`` of TIFF 6.0 and Exif, 1 to 8."""
     turns, mirrored = _TURNS[orientation]
     turned = np.rot90(values, turns)
     return turned[:, ::-1] if mirrored else turned
 
 
-def _tiff(path: Path, wanted: Wanted) -> _Header:
+def _tiff(path: Path, wanted: Wanted) -> _Reader:
     pages, places = _pages_of(path)
     if not pages:
         raise wanted.refusal(path, "is no TIFF, or has no page; write it again")
     if pages > _MOST_PAGES:
         raise wanted.refusal(path, f"has over {_MOST_PAGES} pages; give fewer")
-
-    def read() -> Iterator[Numbers]:
-        """Its pages."""
-        with _open_picture(path, "TIFF", packed, places) as picture:
-            for page in range(pages):
-                picture.seek(page)
-                unsigned = _check_tags(path, picture, wanted)
-                _check_size(path, wanted, picture.height, picture.width)
-                with stderr_silenced():
-                    values = np.array(picture)
-                # Pillow holds 32 bits as if they had a sign.
-                values = values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
-                yield _upright(path, values, places[page].value if page in places else _UPRIGHT, wanted)
-
     with _open_picture(path, "TIFF", places=places) as picture:
         _check_tags(path, picture, wanted)
         size = picture.height, picture.width
         packed = picture.tag_v2.get(_COMPRESSION, _PLAIN) != _PLAIN  # type: ignore[attr-defined]
-    if 0 in places and wanted.orientation is None:
-        _upright(path, np.empty((0, 0)), places[0].value, wanted)
-    if 0 in places and wanted.orientation == TO_FILE and abs(_TURNS.get(places[0].value, (0, False))[0]) == 1:
+    first = places[0][0] if places.get(0) else _UPRIGHT
+    if wanted.orientation is None:
+        _upright(path, np.empty((0, 0)), first, wanted)
+    if wanted.orientation == TO_FILE and abs(_TURNS.get(first, (0, False))[0]) == 1:
         size = size[::-1]
     held = path.stat().st_size / max(math.prod(size), 1) if packed or places else 0.0
-    return _Header(pages, size, read, held + _PIXEL_BYTES)
+    yield pages, size, held + _PIXEL_BYTES
+    with _open_picture(path, "TIFF", packed, places) as picture:
+        for page in range(pages):
+            picture.seek(page)
+            unsigned = _check_tags(path, picture, wanted)
+            _check_size(path, wanted, picture.height, picture.width)
+            with stderr_silenced():
+                values = np.array(picture)
+            # Pillow holds 32 bits as if they had a sign.
+            values = values.view(np.uint32) if unsigned and values.dtype == np.int32 else values
+            yield _upright(path, values, places[page][0] if page in places else _UPRIGHT, wanted)
 
 
-@dataclass(frozen=True)
-class _Stated:
-    """The orientation that a page of a TIFF states, if not upright: its value, and its bytes in the file."""
-
-    value: int
-    start: int
-    upright: bytes
-
-
-def _pages_of(path: Path) -> tuple[int, dict[int, _Stated]]:
-    """How many pages a TIFF has, one more than :data:`_MOST_PAGES` at most, and orientations by page.
+def _pages_of(path: Path) -> tuple[int, dict[int, tuple[int, int, bytes]]]:
+    """Return the number of pages of a TIFF, one more than :data:`_MOST_PAGES` at most, and the orientation of each page
+    that is not upright: its value, its place in the file, and the bytes of an upright one.
 
     Pillow takes a millisecond for each page, and turns a picture as it loads it: of files that are packed and of others
     in different ways, which change with its version. It is given upright ones.
     """
-    found: dict[int, _Stated] = {}
+    found: dict[int, tuple[int, int, bytes]] = {}
     with open(path, "rb") as file:
         order: Literal["little", "big"] = "little" if file.read(2) == b"II" else "big"
         big = int.from_bytes(file.read(2), order) == _BIG
@@ -317,15 +291,15 @@ def _pages_of(path: Path) -> tuple[int, dict[int, _Stated]]:
                 width = _WIDTHS.get(kind, 0) if tag == _ORIENTATION else 0
                 value = int.from_bytes(entries[start + entry - place :][:width], order)
                 if width and value != _UPRIGHT:
-                    upright = _UPRIGHT.to_bytes(width, order)
-                    found[pages] = _Stated(value, following + counted + start + entry - place, upright)
+                    at = following + counted + start + entry - place
+                    found[pages] = value, at, _UPRIGHT.to_bytes(width, order)
             file.seek(following + counted + count * entry)
             following, pages = int.from_bytes(file.read(place), order), pages + 1
     return pages, found
 
 
 def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
-    """Whether numbers of a page of a TIFF ``picture`` have no sign; MitsimError for a page that is not ``wanted``."""
+    """Return True if a page of a TIFF ``picture`` has numbers without sign; MitsimError for one that is not wanted."""
     tags: Any = picture.tag_v2  # type: ignore[attr-defined]
     bits, photometric, samples = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC), tags.get(_SAMPLES, (_UNSIGNED,))
     grey = photometric == _BLACK_IS_ZERO and len(bits) == 1 and bits[0] in wanted.bits
@@ -342,7 +316,7 @@ def _check_tags(path: Path, picture: Image, wanted: Wanted) -> bool:
     return bool(samples[0] == _UNSIGNED)
 
 
-def _npy(path: Path, wanted: Wanted) -> _Header:
+def _npy(path: Path, wanted: Wanted) -> _Reader:
     with open(path, "rb") as file:
         array = Npy.of(file, path.stat().st_size)
     kinds, sides = "buif" if 1 in wanted.bits else "uif", array.shape[-2:]
@@ -353,37 +327,29 @@ def _npy(path: Path, wanted: Wanted) -> _Header:
         rows, columns, colours = array.shape
         kind = f"{rows} x {columns} pixels of {colours} numbers, as of red, green and blue"
         raise wanted.refusal(path, f"holds {kind}; save one number a pixel, raw and not demosaiced")
-    pages = array.shape[0] if len(array.shape) == 3 else 1
+    pages = range(array.shape[0]) if len(array.shape) == 3 else [None]
     # Columns first, a page is scattered over the whole file.
     at_once = array.bytes / max(math.prod(sides), 1) if array.fortran else float(array.dtype.itemsize)
-
-    def read() -> Iterator[Numbers]:
-        """Its pages."""
-        with open(path, "rb") as file:
-            for page in range(pages):
-                yield array.part(file, page if len(array.shape) == 3 else None)
-
-    return _Header(pages, (sides[0], sides[1]), read, at_once + _PIXEL_BYTES)
+    yield len(pages), (sides[0], sides[1]), at_once + _PIXEL_BYTES
+    with open(path, "rb") as file:
+        for page in pages:
+            yield array.part(file, page)
 
 
-def _exr(path: Path, wanted: Wanted) -> _Header:
+def _exr(path: Path, wanted: Wanted) -> _Reader:
     from mitsim.core.exr import read_frame, read_header  # most work reads no picture of this kind
 
     header = read_header(path)
-
-    def read() -> Iterator[Numbers]:
-        """Its one page."""
-        channels = read_frame(path)[0]
-        name = _CHANNEL if _CHANNEL in channels or len(channels) > 1 else next(iter(channels))
-        if name not in channels:
-            names = ", ".join(channels)
-            raise wanted.refusal(path, f"its channels are {names}; {_CHANNEL}, or a single one, is needed")
-        yield channels[name]
-
-    return _Header(1, (header.height, header.width), read)
+    yield 1, (header.height, header.width), _PIXEL_BYTES
+    channels = read_frame(path)[0]
+    name = _CHANNEL if _CHANNEL in channels or len(channels) > 1 else next(iter(channels))
+    if name not in channels:
+        names = ", ".join(channels)
+        raise wanted.refusal(path, f"its channels are {names}; {_CHANNEL}, or a single one, is needed")
+    yield channels[name]
 
 
-def _dng(path: Path, wanted: Wanted) -> _Header:
+def _dng(path: Path, wanted: Wanted) -> _Reader:
     try:
         import rawpy  # an extra: most benches write other files
     except ImportError:
@@ -403,43 +369,31 @@ def _dng(path: Path, wanted: Wanted) -> _Header:
         mosaic = "".join(colours[raw.raw_color(*place)] for place in corner) if raw.num_colors > 1 else None
     if mosaic is not None and mosaic != (wanted.mosaic or mosaic):
         raise wanted.refusal(path, f"its mosaic is {cut(mosaic)}, and {wanted.mosaic} is stated; correct that")
-
-    def read() -> Iterator[Numbers]:
-        """Its one picture."""
-        with stderr_silenced(), rawpy.imread(str(path)) as raw:
-            flat = raw.raw_type == rawpy.RawType.Flat
-            values = raw.raw_image_visible.copy() if flat else np.empty(0)
-        if values.ndim != 2:
-            raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
-        yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
-
-    return _Header(1, (sizes.height, sizes.width), read)
+    yield 1, (sizes.height, sizes.width), _PIXEL_BYTES
+    with stderr_silenced(), rawpy.imread(str(path)) as raw:
+        flat = raw.raw_type == rawpy.RawType.Flat
+        values = raw.raw_image_visible.copy() if flat else np.empty(0)
+    if values.ndim != 2:
+        raise wanted.refusal(path, "holds colours, and no number a pixel; save the raw numbers")
+    yield _upright(path, values, _FLIPS.get(sizes.flip, 0), wanted)
 
 
-def _bare(path: Path, wanted: Wanted) -> _Header:
+def _bare(path: Path, wanted: Wanted) -> _Reader:
     raw = wanted.raw
     if raw is None:
         raise wanted.refusal(path, "has no header; say how it is read by shape and bits")
     needed, size = math.prod(raw.shape) * raw.kind.itemsize, path.stat().st_size
     if size != needed:
-        raise wanted.refusal(
-            path,
-            f"has {size} bytes, but {raw.shape[0]}x{raw.shape[1]} numbers of {raw.bits} bits take {needed}; "
-            "correct shape or bits",
-        )
-
-    def read() -> Iterator[Numbers]:
-        """Its one page."""
-        values = np.fromfile(path, raw.kind, math.prod(raw.shape)).reshape(raw.shape)
-        if values.max() >= 2**raw.bits:
-            most = values.max()
-            raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
-        yield values
-
-    return _Header(1, raw.shape, read)
+        claimed = f"{raw.shape[0]}x{raw.shape[1]} numbers of {raw.bits} bits take {needed}"
+        raise wanted.refusal(path, f"has {size} bytes, but {claimed}; correct shape or bits")
+    yield 1, raw.shape, _PIXEL_BYTES
+    values = np.fromfile(path, raw.kind, math.prod(raw.shape)).reshape(raw.shape)
+    if (most := values.max()) >= 2**raw.bits:
+        raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
+    yield values
 
 
-_READERS: dict[str, Callable[[Path, Wanted], _Header]] = {
+_READERS: dict[str, Callable[[Path, Wanted], _Reader]] = {
     **dict(zip(FORMATS, (_png, _tiff, _tiff, _npy, _exr, _dng), strict=True)),
     **dict.fromkeys(BARE, _bare),
 }
@@ -447,20 +401,18 @@ _READERS: dict[str, Callable[[Path, Wanted], _Header]] = {
 
 
 def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
-    numbers = [str(count) for count in bits]
+    *most, last = (str(count) for count in bits)
     colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
     zero = " whose zero is black" if kind == "TIFF" else ""
     raw = "" if wanted.colour else ", raw and not demosaiced"
-    return (
-        f"grey {kind} of {', '.join(numbers[:-1])} or {numbers[-1]} bits{zero}{colours}; save one number a pixel{raw}"
-    )
+    return f"grey {kind} of {', '.join(most)} or {last} bits{zero}{colours}; save one number a pixel{raw}"
 
 
 @contextmanager
 def _open_picture(
-    path: Path, kind: str, whole: bool = False, places: Mapping[int, _Stated] | None = None
+    path: Path, kind: str, whole: bool = False, places: Mapping[int, tuple[int, int, bytes]] | None = None
 ) -> Iterator[Image]:
-    """A picture file of that ``kind``, its pixels not yet read.
+    """Open a picture file of that ``kind``, its pixels not yet read.
 
     Parameters
     ----------
@@ -480,9 +432,9 @@ def _open_picture(
         warnings.simplefilter("ignore")  # on metadata that is damaged; where pixels are, reading them raises
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         source = io.BytesIO(file.read()) if whole or places else cast("IO[bytes]", _Copied(file))
-        for stated in (places or {}).values():
-            source.seek(stated.start)
-            source.write(stated.upright)
+        for _, place, upright in (places or {}).values():
+            source.seek(place)
+            source.write(upright)
         source.seek(0)
         try:
             opened = Image.open(source, formats=(kind,))
@@ -507,7 +459,7 @@ class _Copied:
 
 @contextmanager
 def _one_line_refusals(path: Path, wanted: Wanted) -> Iterator[None]:
-    """Whatever readers raise, as one line that names the file."""
+    """Raise whatever readers raise as one line that names the file."""
     try:
         yield
     except MitsimError:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import check_plain
+from mitsim.core.files import MOST_SIDE, check_plain
 from mitsim.core.imagelist import BGGR, JPEG, PRINTS, Preparation, Wanted, image_files, planes_of
 from mitsim.core.images import Numbers, orient, own_end, read_image, read_images
 from mitsim.core.manifests import Digital
@@ -154,9 +154,15 @@ class Preparer:
             for values that the factor does not divide, of another size than dark and flat frames, or smaller than the
             part that is to be taken; and where turning would need pixels beyond the picture.
         """
-        values = values / (self.how.divide_by or 1) if mean else self._divide(path, values)
+        factor = self.how.divide_by or 1
+        if mean:
+            values = values / factor
+        elif factor > 1:
+            if (values % factor).any():
+                raise MitsimError(f"{path}: holds numbers that are no multiples of {factor}; correct divide_by")
+            values = values // factor
         if self.counts:
-            return np.ascontiguousarray(self._crop(path, self._orient(self.plane(values))))
+            return np.ascontiguousarray(self._place(path, values))
         full = None if self.end is None else values >= self.end
         for name, other in (("dark", self.dark), ("flat", self.response)):
             if other is not None and other.shape != values.shape:
@@ -171,57 +177,36 @@ class Preparer:
             light[self._place(path, full.astype(np.float64)) > 0] = self.digital.saturation_dn
         return light.astype(np.float32)
 
-    def _divide(self, path: Path, values: Numbers) -> Numbers:
-        factor = self.how.divide_by or 1
-        if factor == 1:
-            return values
-        if (values % factor).any():
-            raise MitsimError(f"{path}: holds numbers that are no multiples of {factor}; correct divide_by")
-        return values // factor
+    def _place(self, path: Path, values: Numbers) -> Numbers:
+        """Return the plane of ``values``, oriented, turned and cropped."""
+        values = self.plane(values)
+        values = orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
+        first, end = _part(path, values.shape, self.how)
+        if self.how.turn_deg:
+            from scipy.ndimage import affine_transform  # here: most frames are not turned
 
-    def _orient(self, values: Numbers) -> Numbers:
-        return orient(values, self.how.orientation) if isinstance(self.how.orientation, int) else values
-
-    def _place(self, path: Path, values: FloatArray) -> FloatArray:
-        """The plane of ``values``, oriented, turned and cropped."""
-        values = self._orient(self.plane(values))
-        if not self.how.turn_deg:
-            return self._crop(path, values)
-        from scipy.ndimage import affine_transform  # here: most frames are not turned
-
-        angle = math.radians(self.how.turn_deg)
-        cosine, sine = math.cos(angle), math.sin(angle)
-        matrix = np.array([[cosine, sine], [-sine, cosine]])
-        pivot = (np.array(values.shape) - 1) / 2 if self.how.turn_about == "centre" else np.zeros(2)
-        offset = pivot - matrix @ pivot
-        self._check_turn(path, values.shape, matrix, offset)
-        turned = affine_transform(values, matrix, offset, order=1, mode="nearest")
-        return self._crop(path, turned)
-
-    def _check_turn(self, path: Path, shape: tuple[int, ...], matrix: FloatArray, offset: FloatArray) -> None:
-        """MitsimError where a turned picture's part would need pixels beyond it."""
-        last = np.array(shape) - 1
-        first, end = _part(path, shape, self.how)
-        corners = np.array([[row, column] for row in (first[0], end[0] - 1) for column in (first[1], end[1] - 1)])
-        seen = corners @ matrix.T + offset
-        if (seen >= -_EDGE).all() and (seen <= last + _EDGE).all():
-            return
-        whole = np.array([[row, column] for row in (0, last[0]) for column in (0, last[1])])
-        margin = np.ceil(np.abs(whole @ matrix.T + offset - whole).max(axis=0) - _EDGE).astype(int)
-        rows, columns = np.array(shape) - 2 * margin
-        inside = f", such as {margin[0]},{margin[1]},{rows},{columns}" if min(rows, columns) > 0 else ""
-        raise MitsimError(
-            f"{path}: turned by {self.how.turn_deg:g} degrees about its {self.how.turn_about}, a part of it lies "
-            f"beyond its {shape[0]}x{shape[1]} pixels; give a smaller crop{inside}"
-        )
-
-    def _crop(self, path: Path, values: Numbers) -> Numbers:
-        (row, column), (last_row, last_column) = _part(path, values.shape, self.how)
-        return values[row:last_row, column:last_column]
+            angle = math.radians(self.how.turn_deg)
+            cosine, sine = math.cos(angle), math.sin(angle)
+            matrix, last = np.array([[cosine, sine], [-sine, cosine]]), np.array(values.shape) - 1
+            pivot = last / 2 if self.how.turn_about == "centre" else np.zeros(2)
+            offset = pivot - matrix @ pivot
+            corners = np.array([[row, column] for row in (first[0], end[0] - 1) for column in (first[1], end[1] - 1)])
+            seen = corners @ matrix.T + offset
+            if (seen < -_EDGE).any() or (seen > last + _EDGE).any():
+                whole = np.array([[row, column] for row in (0, last[0]) for column in (0, last[1])])
+                margin = np.ceil(np.abs(whole @ matrix.T + offset - whole).max(axis=0) - _EDGE).astype(int)
+                rows, columns = last + 1 - 2 * margin
+                inside = f", such as {margin[0]},{margin[1]},{rows},{columns}" if min(rows, columns) > 0 else ""
+                raise MitsimError(
+                    f"{path}: turned by {self.how.turn_deg:g} degrees about its {self.how.turn_about}, a part of it "
+                    f"lies beyond its {_size(values)} pixels; give a smaller crop{inside}"
+                )
+            values = affine_transform(values, matrix, offset, order=1, mode="nearest")
+        return values[first[0] : end[0], first[1] : end[1]]
 
 
 def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First row and column of the part of a picture of a ``shape`` that is taken, and the ones behind its last."""
+    """Return first row and column of the part of a picture of a ``shape`` that is taken, and the ones behind its last."""
     crop = how.crop
     if crop is None:
         return (0, 0), (shape[0], shape[1])
@@ -297,15 +282,13 @@ def _size(values: npt.NDArray[np.generic]) -> str:
 
 # -------- Pictures to be printed
 
-_JPEG_SIDE = 16384
-"""Pixels a side of the largest JPEG that is read, as of other pictures."""
 _MOST_SIDE = 4096
 """Texels a side of a print: 0.03 mm of a sheet of 128 mm, a thirtieth of a projector pixel; four fill the texels that a
 scene may have (:data:`mitsim.scene.headers.MOST_TEXELS`)."""
 
 
 def read_reflectance(path: Path) -> FloatArray:
-    """Reflectances of a picture's pixels: its numbers as they are stored, without a gamma curve.
+    """Return the reflectances of a picture's pixels: its numbers as they are stored, without a gamma curve.
 
     Whole numbers of 8 or 16 bits are divided by 255 or 65 535; real ones, and whole ones of more bits, are reflectances
     as they are. Of colours the mean is taken. A JPEG is turned as it is to be shown.
@@ -327,7 +310,19 @@ def read_reflectance(path: Path) -> FloatArray:
     suffix = path.suffix.lower()
     if suffix not in PRINTS:
         raise MitsimError(f"picture {path}: ends in {suffix or 'nothing'}; read are {', '.join(PRINTS)}")
-    values = _read_jpeg(path) if suffix in JPEG else read_image(path, Wanted("picture", colour=True))
+    if suffix in JPEG:
+        from PIL import Image, ImageOps
+
+        check_plain(path, "picture")
+        try:
+            with Image.open(path, formats=("JPEG",)) as picture:
+                if max(picture.size) > MOST_SIDE:
+                    raise MitsimError(f"picture {path}: {picture.size} pixels; at most {MOST_SIDE} a side are read")
+                values = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
+            raise MitsimError(f"picture {path}: cannot be read as a JPEG ({error}); write it again") from error
+    else:
+        values = read_image(path, Wanted("picture", colour=True))
     grey = np.asarray(values, dtype=np.float64) / (own_end(values) or 1.0)
     if grey.ndim == 3:
         if (grey[..., 3:] < 1).any():
@@ -338,21 +333,8 @@ def read_reflectance(path: Path) -> FloatArray:
     return np.asarray(grey)
 
 
-def _read_jpeg(path: Path) -> npt.NDArray[np.uint8]:
-    from PIL import Image, ImageOps
-
-    check_plain(path, "picture")
-    try:
-        with Image.open(path, formats=("JPEG",)) as picture:
-            if max(picture.size) > _JPEG_SIDE:
-                raise MitsimError(f"picture {path}: {picture.size} pixels; at most {_JPEG_SIDE} a side are read")
-            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise MitsimError(f"picture {path}: cannot be read as a JPEG ({error}); write it again") from error
-
-
 def fit_square(reflectance: FloatArray) -> FloatArray:
-    """A picture in the middle of a square: as high to wide as it is, black beside or above and below it.
+    """Return a picture in the middle of a square: as high to wide as it is, black beside or above and below it.
 
     Parameters
     ----------
@@ -370,9 +352,6 @@ def fit_square(reflectance: FloatArray) -> FloatArray:
             counts = np.diff(np.append(starts, size))
             sums = np.add.reduceat(reflectance, starts, axis=axis)
             reflectance = sums / (counts[:, None] if axis == 0 else counts)
-    rows, columns = reflectance.shape
-    side = max(rows, columns)
-    square = np.zeros((side, side))
-    top, left = (side - rows) // 2, (side - columns) // 2
-    square[top : top + rows, left : left + columns] = reflectance
-    return square
+    side = max(reflectance.shape)
+    before = [(side - own) // 2 for own in reflectance.shape]
+    return np.pad(reflectance, [(gap, side - own - gap) for gap, own in zip(before, reflectance.shape, strict=True)])

@@ -322,10 +322,10 @@ def test_a_file_that_is_cut_while_it_is_read_is_refused(tmp_path: Path, name: st
     write(tmp_path / name)
     wanted = Wanted(raw=Raw.of("500x500", 16, "little"))
     with _one_line_refusals(tmp_path / name, wanted):
-        found = _read_header(tmp_path / name, wanted)
+        _, numbers = _read_header(tmp_path / name, wanted)
     os.truncate(tmp_path / name, 600)
     with pytest.raises(MitsimError, match="cannot be read"), _one_line_refusals(tmp_path / name, wanted):
-        list(found.read())
+        list(numbers)
 
 
 def test_no_picture_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
