@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, ParamSpec, TypeVar, get_args
 
-import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
@@ -41,17 +40,17 @@ DEFAULT_CAMERA = "imx249"
 """Of a bench where none is named: the paper's."""
 _SERVES = "Serves: "
 """Begin of the sentence of a file's first comment that says what the file is for."""
-Model = TypeVar("Model", bound=pydantic.BaseModel)
+Model = TypeVar("Model", bound=BaseModel)
 LARGEST = 1e12
 """Largest number of a device, and one over the smallest: far from any device, and products of a few stay finite."""
-Positive = Annotated[float, pydantic.Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
-NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 
 
-class Configuration(pydantic.BaseModel):
+class Configuration(BaseModel):
     """A frozen model of finite numbers, of the very types that it states, without further fields."""
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
 
 # ---- Mistakes in files -----------------------------------------------------------------------------------------------
@@ -112,18 +111,16 @@ _NAMED = re.compile(r"\s*(?:(\[\[?)([^\]]+)\]|([\w\"' .-]+?)\s*=)")
 """Line that begins a table, or sets a name."""
 
 
-def mistakes(model: type[pydantic.BaseModel], data: Table) -> list[Mistake]:
+def mistakes(model: type[BaseModel], data: Table) -> list[Mistake]:
     """Return what is wrong with ``data`` that is to be a ``model``; an empty list if nothing is."""
     try:
         model.model_validate(data)
-    except pydantic.ValidationError as error:
+    except ValidationError as error:
         return _mistakes_in(model, error, data)
     return []
 
 
-def refusal(
-    model: type[pydantic.BaseModel], error: pydantic.ValidationError, where: str, data: object = None
-) -> MitsimError:
+def refusal(model: type[BaseModel], error: ValidationError, where: str, data: object = None) -> MitsimError:
     """Return pydantic's ``error`` on the ``data`` of a ``model`` as a message that begins with ``where``.
 
     Of a :class:`Table` it lists all mistakes; of other data, which programs write, the first.
@@ -146,7 +143,7 @@ def refuse_together(where: str, found: Sequence[Mistake]) -> MitsimError:
     return MitsimError(f"{where}: has {len(found)} mistakes:", *listed[:_MOST_MISTAKES], *more)
 
 
-def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationError, data: object) -> list[Mistake]:
+def _mistakes_in(model: type[BaseModel], error: ValidationError, data: object) -> list[Mistake]:
     """Return pydantic's errors as mistakes, misspelt names first and one for each place."""
     above = data.place if isinstance(data, Table) else ()
     found, meant = dict[Place, Mistake](), set[Place]()
@@ -165,29 +162,24 @@ def _mistakes_in(model: type[pydantic.BaseModel], error: pydantic.ValidationErro
                 place = place[:end] or place
                 break
         field = ".".join(cut(str(part)) for part in (*above, *place))
-        line = data.line(place) if isinstance(data, Table) else 0
-        text = _complaint(model, one, field)
-        if kind == "extra_forbidden" and "did you mean " in text:
-            meant.add((*place[:-1], text.rpartition("did you mean ")[2].removesuffix("?")))
-        elif place in meant:  # a misspelt name is both unknown and missing
-            continue
+        line, value = data.line(place) if isinstance(data, Table) else 0, short_text(one["input"], 100)
+        if kind == "value_error":  # a validator of ours, whose message has the value
+            text = f"{field}: {one['ctx']['error']}" if field else str(one["ctx"]["error"])
+        elif kind == "missing":
+            if place in meant:  # a misspelt name is both unknown and missing
+                continue
+            text = f"{field}: is missing"
+        elif kind == "extra_forbidden":
+            known = [*getattr(_model_at(model, place[:-1]), "model_fields", ())]
+            near = near_name(str(place[-1]), known).strip()
+            if near:
+                meant.add((*place[:-1], near.removeprefix("did you mean ").removesuffix("?")))
+            hint = near or (f"known fields: {', '.join(known)}" if known else "remove it")
+            text = f"{field}: got {value}, no such field; {hint}"
+        else:
+            text = f"{field or 'contents'}: got {value}; {rule_of(one['msg'])}"
         found.setdefault(place, (line, text))
     return [*found.values()]
-
-
-def _complaint(model: type[pydantic.BaseModel], one: Any, field: str) -> str:
-    """Return what is wrong with a ``field``: its value and the rule of pydantic."""
-    value = short_text(one["input"], 100)
-    if one["type"] == "value_error":  # a validator of ours, whose message has the value
-        return f"{field}: {one['ctx']['error']}" if field else str(one["ctx"]["error"])
-    if one["type"] == "missing":
-        return f"{field}: is missing"
-    if one["type"] == "extra_forbidden":
-        known = [*getattr(_model_at(model, one["loc"][:-1]), "model_fields", ())]
-        near = near_name(str(one["loc"][-1]), known)
-        hint = near.strip() or (f"known fields: {', '.join(known)}" if known else "remove it")
-        return f"{field}: got {value}, no such field; {hint}"
-    return f"{field or 'contents'}: got {value}; {rule_of(one['msg'])}"
 
 
 _PLAINER = {"a valid integer": "a whole number", "a valid string": "text", "a valid boolean": "true or false"}
@@ -207,17 +199,14 @@ def rule_of(message: str) -> str:
     return f"give {_PLAINER.get(rule, rule.replace(' valid ', ' '))}"
 
 
-def _model_at(model: type[pydantic.BaseModel], place: Place) -> type[pydantic.BaseModel] | None:
+def _model_at(model: type[BaseModel] | None, place: Place) -> type[BaseModel] | None:
     """Return the model of the part at a ``place`` in a ``model``; None for another kind of part."""
     for name in place:
-        if isinstance(name, str) and name in model.model_fields:
+        if model is not None and isinstance(name, str) and name in model.model_fields:
             kinds = [model.model_fields[name].annotation]
             for kind in kinds:  # grows, because a part may be in a tuple, or optional
                 kinds += get_args(kind)
-            models = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)]
-            if not models:
-                return None
-            model = models[0]
+            model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
     return model
 
 
@@ -286,7 +275,7 @@ def validate(model: type[Model], data: dict[str, Any], where: str, context: obje
     """
     try:
         return model.model_validate(data, context=context)
-    except pydantic.ValidationError as error:
+    except ValidationError as error:
         raise refusal(model, error, where, data) from error
 
 
@@ -546,7 +535,6 @@ def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         checked, signature = check_arguments(function), inspect.signature(function)
-        own = [each for each in signature.parameters.values() if each.kind != each.VAR_KEYWORD]
         left_out = {*without.split(), *signature.parameters}
         fields = {name: each for model in models for name, each in model.model_fields.items() if name not in left_out}
 
@@ -557,19 +545,17 @@ def takes(*models: type[Options], without: str = "") -> Callable[[Callable[P, R]
                     raise unknown_option(name, function.__name__, [*fields])
             return checked(*arguments, **named)
 
-        keywords = [_keyword(name, each) for name, each in fields.items()]
-        call.__signature__ = signature.replace(parameters=[*own, *keywords])  # type: ignore[attr-defined]
+        parameters = [each for each in signature.parameters.values() if each.kind != each.VAR_KEYWORD]
+        for name, field in fields.items():
+            default = inspect.Parameter.empty if field.is_required() else field.default
+            keyword = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(name, keyword, default=default, annotation=field.annotation))
+        call.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         lines = [f"{name}\n    {each.description}" for name, each in fields.items()]
         call.__doc__ = "\n".join([inspect.getdoc(function) or "", "", "Other Parameters", "----------------", *lines])
         return call
 
     return decorate
-
-
-def _keyword(name: str, field: FieldInfo) -> inspect.Parameter:
-    """Return the parameter of a signature that a ``field`` of a ``name`` is."""
-    default = inspect.Parameter.empty if field.is_required() else field.default
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=field.annotation)
 
 
 def unknown_option(name: str, function: str, known: Sequence[str]) -> ArgumentError:

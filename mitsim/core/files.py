@@ -30,8 +30,6 @@ FRAMES, PARTS = "frame_*.exr", "*.part.npz"
 """What an unfinished capture and an unfinished calibration have finished, as their folders name it."""
 PAIRS, SHARDS = "pairs.json", "pairs_*.h5"
 """Manifest of a store of pairs, and what an unfinished one has finished."""
-_FINISHED = {"calibration": ("parts", PARTS), "pairs": ("shards", SHARDS)}
-"""What work of a kind finishes one after the other, and its files; frames of all others."""
 
 
 @contextmanager
@@ -122,10 +120,32 @@ def prepare_output(path: Path | str, overwrite: bool = False, kind: Literal["fol
     _check_name(path)
     if not path.parent.is_dir():
         raise MitsimError(f"output {path}: the folder {path.parent} does not exist; create it or choose another")
+    place = path.parent if kind == "file" else path
     if kind == "file":
-        _prepare_file(path, overwrite)
+        if path.is_dir():
+            raise MitsimError(f"output {path}: is a folder, but a file is to be written; give a file name")
+        _check_plain(path)
+        if path.exists() and not overwrite:
+            raise MitsimError(f"output {path}: exists already; remove it or choose another name")
+    elif path.exists() and not path.is_dir():
+        raise MitsimError(f"output {path}: is a file, but a folder is needed; choose another name")
     else:
-        _prepare_folder(path, overwrite)
+        try:
+            path.mkdir(exist_ok=True)
+            occupied = any(item.name != LOCK and not item.match(_PART) for item in path.iterdir())
+        except OSError as error:
+            raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
+        if occupied and not overwrite:
+            left = _unfinished_work(path) or "; choose a new one or empty it"
+            raise MitsimError(f"output {path}: the folder holds files already{left}")
+    # Permission bits do not show everything (root, read-only mounts, quotas): only a file that was really written does.
+    try:
+        with tempfile.TemporaryFile(dir=place) as file:
+            file.write(b"mitsim")
+    except OSError as error:
+        raise MitsimError(
+            f"output {path}: the folder {place} is not writable ({error.strerror}); choose another place"
+        ) from error
     return path
 
 
@@ -278,32 +298,8 @@ def _lock(path: Path, name: Path) -> Iterator[None]:
         lock.release()
 
 
-def _prepare_file(path: Path, overwrite: bool) -> None:
-    if path.is_dir():
-        raise MitsimError(f"output {path}: is a folder, but a file is to be written; give a file name")
-    _check_plain(path)
-    if path.exists() and not overwrite:
-        raise MitsimError(f"output {path}: exists already; remove it or choose another name")
-    _try_writing(path, path.parent)
-
-
-def _prepare_folder(path: Path, overwrite: bool) -> None:
-    if path.exists() and not path.is_dir():
-        raise MitsimError(f"output {path}: is a file, but a folder is needed; choose another name")
-    try:
-        path.mkdir(exist_ok=True)
-        occupied = any(item.name != LOCK and not item.match(_PART) for item in path.iterdir())
-    except OSError as error:
-        raise MitsimError(f"output {path}: cannot be used ({error.strerror}); choose another place") from error
-    if occupied and not overwrite:
-        raise MitsimError(
-            f"output {path}: the folder holds files already{_unfinished_work(path) or '; choose a new one or empty it'}"
-        )
-    _try_writing(path, path)
-
-
 def _unfinished_work(folder: Path) -> str:
-    """What a killed work left in the folder, and how to go on; nothing when there is none."""
+    """Return what a killed work left in the folder, and how to go on; nothing when there is none."""
     try:
         name = PAIRS if (folder / PAIRS).is_file() else "manifest.json"
         manifest = json.loads(read_text(folder / name, _LONGEST_HEAD))
@@ -312,19 +308,9 @@ def _unfinished_work(folder: Path) -> str:
     if not isinstance(manifest, dict) or manifest.get("status") != "incomplete":
         return ""
     kind = manifest.get("kind")
-    name, pattern = _FINISHED.get(str(kind), ("frames", FRAMES))
+    finished = {"calibration": ("parts", PARTS), "pairs": ("shards", SHARDS)}
+    name, pattern = finished.get(str(kind), ("frames", FRAMES))
     return f": an unfinished {kind} with {len([*folder.glob(pattern)])} finished {name}; go on with resume=True"
-
-
-def _try_writing(path: Path, folder: Path) -> None:
-    # Permission bits do not tell (root, read-only mounts, quotas): only a file that was really written does.
-    try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(b"mitsim")
-    except OSError as error:
-        raise MitsimError(
-            f"output {path}: the folder {folder} is not writable ({error.strerror}); choose another place"
-        ) from error
 
 
 # -------- JSON files
@@ -346,11 +332,11 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    raise TypeError(f"plain: {value!r} is {type(value).__name__}, which JSON cannot hold; convert it first")
+    if value is not None and not isinstance(value, (str, bool, int)):
+        raise TypeError(f"plain: {value!r} is {type(value).__name__}, which JSON cannot hold; convert it first")
+    return value
 
 
 def json_text(obj: Any) -> str:
@@ -365,19 +351,19 @@ def write_json(path: Path | str, obj: Any) -> None:
 
 def parse_json(text: str) -> Any:
     """The object in a JSON ``text``. ValueError when it is not JSON, has a key twice, or is nested too deep."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        unique: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in unique:
+                raise ValueError(f"key {cut(key)!r} is there twice")
+            unique[key] = value
+        return unique
+
     try:
-        return json.loads(text, object_pairs_hook=_once)
+        return json.loads(text, object_pairs_hook=once)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    unique: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in unique:
-            raise ValueError(f"key {cut(key)!r} is there twice")
-        unique[key] = value
-    return unique
 
 
 BYTE_ORDER_MARK = "\ufeff"
@@ -419,10 +405,9 @@ def check_plain(path: Path | str, what: str = "file") -> os.stat_result:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MitsimError(f"{what} {path}: cannot be read ({reason}); check the path") from error
-    if stat.S_ISDIR(status.st_mode):
-        raise MitsimError(f"{what} {path}: cannot be read (Is a directory); check the path")
     if not stat.S_ISREG(status.st_mode):
-        raise MitsimError(f"{what} {path}: cannot be read (a pipe or device, no plain file); check the path")
+        kind = "Is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or device, no plain file"
+        raise MitsimError(f"{what} {path}: cannot be read ({kind}); check the path")
     return status
 
 
