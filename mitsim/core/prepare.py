@@ -206,7 +206,7 @@ class Preparer:
 
 
 def _part(path: Path, shape: tuple[int, ...], how: Preparation) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return first row and column of the part of a picture of a ``shape`` that is taken, and the ones behind its last."""
+    """Return first row and column of the part of a picture that is taken, and the ones behind its last."""
     crop = how.crop
     if crop is None:
         return (0, 0), (shape[0], shape[1])

@@ -435,9 +435,7 @@ def flatcam_calibration(path: Path, channel: str) -> Calibration:
                 f"{scene[1]} of the scene: rows and columns are exchanged; a file of version 7.3 holds columns first"
             )
         manifest = CalibrationManifest(
-            camera={"name": path.stem, "channel": plane},
-            centre=True,
-            configuration={TURNED: angle} if angle else {},
+            camera={"name": path.stem, "channel": plane}, centre=True, configuration={TURNED: angle} if angle else {}
         )
         return Packed(manifest, "", FACTORS, lambda name: ({"factor": sides[name]}, {}), path)
 

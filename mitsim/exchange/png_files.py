@@ -22,7 +22,7 @@ from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 from mitsim.devices.session import UNIFORM, halves_in_order
-from mitsim.exchange.packed import Packed, Run, shots_of
+from mitsim.exchange.packed import Run, shots_of
 
 PATTERNS = "patterns.json"
 """Which picture shows what, and where the grid lies in it."""
@@ -59,14 +59,13 @@ class Raster:
 
     @classmethod
     def of(cls, projector: str) -> Raster:
-        """Of the ``projector``, a name or TOML file. MitsimError where it does not say its rows and columns."""
-        return cls.of_projector(
-            load_model(locate(projector, "calibration", ".toml", PROJECTOR), ProjectorModel).model_dump()
-        )
+        """Return that of the ``projector``, a name or TOML file. MitsimError where its rows and columns are unknown."""
+        path = locate(projector, "calibration", ".toml", PROJECTOR)
+        return cls.of_projector(load_model(path, ProjectorModel).model_dump())
 
     @classmethod
     def of_projector(cls, model: Mapping[str, Any]) -> Raster:
-        """Of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
+        """Return that of a projector's ``model``, as a run's manifest has it; MitsimError as :meth:`of`."""
         if not model:
             raise ArgumentError("projector", "is not known of a run of imported frames; give its name or file")
         rows, columns = model.get("rows"), model.get("columns")
@@ -113,9 +112,8 @@ def draw_family(
     patterns, raster = Patterns.of(family, names), Raster.of(projector)
     light = with_closing(pictures_of(patterns, f"patterns {name}"), closing)
     count = len(names) + (closing is not None)
-    _check_cost(raster, count)
     with whole_folder(folder) as place:
-        where = draw(place, light, raster, (n, n), f"projector {projector}")
+        where = draw(place, light, count, raster, (n, n), f"projector {projector}")
         write_json(place / PATTERNS, describe(patterns, names, where))
     return {"patterns": name, "n": n, "pictures": count, "projector": where, "output": str(folder)}
 
@@ -151,16 +149,15 @@ def draw_stripes(folder: Path, projector: str, listed: FrameList) -> dict[str, A
         shots.append(
             {"file": frame_name(number), "pattern": picture_name(number), "side": side, "index": index, "sign": sign}
         )
-    _check_cost(raster, len(light))
     with whole_folder(folder) as place:
-        where = draw(place, light, raster, (n, n), f"projector {projector}")
+        where = draw(place, light, len(light), raster, (n, n), f"projector {projector}")
         write_json(place / PATTERNS, {"projector": where, "shots": shots})
         write_json(place / SESSION, listed.model_dump(mode="json", exclude_defaults=True))
     return {"patterns": "stripes", "n": n, "pictures": len(light), "projector": where, "output": str(folder)}
 
 
 def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> FrameList:
-    """The list of a calibration session's frames, in the order of their names.
+    """Return the list of a calibration session's frames, in the order of their names.
 
     Parameters
     ----------
@@ -188,27 +185,17 @@ def session_of(camera: str, exposure_s: float, n: int, signed_capture: str) -> F
 
 
 def frame_name(index: int) -> str:
-    """Name of the frame of shot ``index`` among PNG files."""
+    """Return the name of the frame of shot ``index`` among PNG files."""
     return f"frame_{index:05d}.png"
 
 
 def picture_name(index: int) -> str:
-    """Path of the picture of shot ``index`` in the folder that holds it."""
+    """Return the path of the picture of shot ``index`` in the folder that holds it."""
     return f"patterns/pattern_{index:05d}.png"
 
 
-# ---- Pictures of all shots, and what they cost ----
-
-
-def _check_cost(raster: Raster, pictures: int) -> None:
-    """MitsimError where so many ``pictures`` of a ``raster`` take more than a day, or than the memory that is free."""
-    pixels = raster.rows * raster.columns
-    cost = Cost(pictures * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
-    cost.check(f"{pictures} pictures of {raster.rows} x {raster.columns} pixels", Limits())
-
-
 def draw(
-    folder: Path, light: Iterable[npt.NDArray[Any]], raster: Raster, sides: tuple[int, int], place: str
+    folder: Path, light: Iterable[npt.NDArray[Any]], count: int, raster: Raster, sides: tuple[int, int], place: str
 ) -> dict[str, Any]:
     """Write a picture for each shot to `patterns/` in a folder that this process holds, and a black and a white one.
 
@@ -216,14 +203,14 @@ def draw(
     ----------
     folder
         that holds `patterns/`.
-    light
-        (n, n') of 0 and 1 for each shot.
+    light, count
+        (n, n') of 0 and 1 for each shot, and their number.
     raster
         of the projector.
     sides
         n and n'.
     place
-        what the grid is of, for messages.
+        of the grid, for messages.
 
     Returns
     -------
@@ -233,14 +220,20 @@ def draw(
     Raises
     ------
     MitsimError
-        where a cell would have no pixel.
+        where a cell would have no pixel, and where the pictures take more than a day, or than the memory that is free.
     """
+    pixels = raster.rows * raster.columns
+    cost = Cost(count * pixels * _SECONDS_PER_PIXEL, _PIXEL_BYTES * pixels)
+    cost.check(f"{count} pictures of {raster.rows} x {raster.columns} pixels", Limits())
     grid = grid_in(raster, sides, place)
     (folder / "patterns").mkdir()
-    for index, shot in enumerate(light):
-        write_png(folder / picture_name(index), draw_picture(shot, grid, raster))
-    for name, level in (("black", 0), ("white", 1)):
-        write_png(folder / "patterns" / f"{name}.png", draw_picture(np.full(sides, level), grid, raster))
+    pictures = ((picture_name(index), shot) for index, shot in enumerate(light))
+    ends = [(f"patterns/{name}.png", np.full(sides, level)) for name, level in (("black", 0), ("white", 1))]
+    for name, shot in chain(pictures, ends):
+        cells = (_WHITE * shot).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell_columns"], axis=1)
+        picture = np.zeros((raster.rows, raster.columns), np.uint8)
+        picture[grid["first_row"] :, grid["first_column"] :][: cells.shape[0], : cells.shape[1]] = cells
+        write_png(folder / name, picture)
     return {"rows": raster.rows, "columns": raster.columns, **grid}
 
 
@@ -248,7 +241,7 @@ def draw(
 
 
 def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any]:
-    """Where the patterns' grid lies in a projector's raster: whole pixels a cell, in the middle.
+    """Return the place of the patterns' grid in a projector's raster: whole pixels a cell, in the middle.
 
     On the scene a cell is square to :data:`SQUARE`, and of such cells as large as fits; where none is, it is the
     squarest.
@@ -298,7 +291,7 @@ def grid_in(raster: Raster, sides: tuple[int, int], place: str) -> dict[str, Any
 
 
 def describe_cells(where: Mapping[str, Any]) -> str:
-    """How large a cell is, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
+    """Return a cell's size, and its shape on the scene, of the place ``where`` of a grid as of :func:`grid_in`."""
     rows, columns, shape = where["cell"], where["cell_columns"], where["cell_shape"]
     size = f"{rows} pixels a side" if rows == columns else f"{rows} x {columns} pixels"
     if abs(math.log(shape)) > SQUARE:
@@ -306,25 +299,8 @@ def describe_cells(where: Mapping[str, Any]) -> str:
     return size if rows == columns else f"{size}, square on the scene"
 
 
-def draw_picture(light: npt.NDArray[Any], grid: Mapping[str, Any], raster: Raster) -> npt.NDArray[np.uint8]:
-    """A picture for the projector, (rows, columns), black around the grid.
-
-    Parameters
-    ----------
-    light
-        (n, n') of 0 and 1.
-    grid, raster
-        as of :func:`grid_in`.
-    """
-    picture = np.zeros((raster.rows, raster.columns), np.uint8)
-    cells = (_WHITE * light).astype(np.uint8).repeat(grid["cell"], axis=0).repeat(grid["cell_columns"], axis=1)
-    rows, columns = cells.shape
-    picture[grid["first_row"] :, grid["first_column"] :][:rows, :columns] = cells
-    return picture
-
-
 def pictures_of(patterns: Patterns, place: str) -> Iterator[npt.NDArray[Any]]:
-    """What the projector shows for each shot, (n, n') of 0 and 1, one at a time.
+    """Yield the projector's light for each shot, (n, n') of 0 and 1, one at a time.
 
     Parameters
     ----------
@@ -365,7 +341,7 @@ def with_closing(pictures: Iterable[npt.NDArray[Any]], closing: ClosingKind | No
 
 
 def describe(patterns: Patterns, names: Sequence[str], where: Mapping[str, Any]) -> dict[str, Any]:
-    """What `patterns.json` says of a family.
+    """Return the content of `patterns.json` for a family.
 
     Parameters
     ----------
@@ -425,52 +401,41 @@ def write_pngs(folder: Path, run: Run, projector: str | None = None) -> tuple[st
         pixels.
     """
     rasters = {name: check_pictures(shots.manifest, projector, str(shots.place)) for name, shots in run.parts.items()}
-    with whole_folder(folder) as place:
-        for name, shots in run.parts.items():
-            (place / name).mkdir(exist_ok=True)
-            where = _fill(place / name, shots, rasters[name])
+    notes = [f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN"] if run.colours else []
+    with whole_folder(folder) as whole:
+        for line, shots in run.parts.items():
+            manifest, place, names = shots.manifest, whole / line, list[str]()
+            rows, columns = (len(matrix) for matrix in manifest.patterns.matrices)
+            closing, captures = manifest.closing_frame, manifest.patterns.captures
+            pictures = with_closing(pictures_of(manifest.patterns, str(shots.place)), closing.kind if closing else None)
+            place.mkdir(exist_ok=True)
+            count = len(captures) + bool(closing)
+            where = draw(place, pictures, count, rasters[line], (rows, columns), str(shots.place))
+            (place / "frames").mkdir()
+            frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(shots))
+            last = [(closing.file, shots.read(closing.file)[0]["DN"])] if closing else []
+            for index, (file, dn) in enumerate(chain(frames, last)):
+                if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
+                    raise MitsimError(
+                        f"{shots.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up "
+                        f"to {_LARGEST}; use the format hdf5"
+                    )
+                names.append(frame_name(index))
+                write_png(place / "frames" / names[-1], dn.astype(np.uint16))
+            own = folder / line
+            again = f"--patterns {own / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
+            if (ambient := manifest.ambient_frame) is not None:
+                with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
+                    np.save(stream, shots.read(ambient.file)[0]["DN"])
+                again += f" --ambient-frame {own / 'ambient.npy'} --ambient-shots {ambient.shots}"
+            if closing is not None:
+                again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
+            write_json(place / PATTERNS, describe(manifest.patterns, names[: len(captures)], where))
+            again += f" --camera NAME --calibration {Path('CAL', line)} -o {Path('RUN', line)}"
+            notes.append(f"Read again by: mitsim import {own / 'frames'} {again}")
         if run.colours:
-            write_text(place / COLOUR, run.text)
-    begin = (f"Begin with: mkdir RUN; cp {folder / COLOUR} RUN",) if run.colours else ()
-    again = (_read_again(folder / name, name, shots.manifest) for name, shots in run.parts.items())
-    return *begin, *again, f"Patterns in cells of {describe_cells(where)}"
-
-
-def _fill(place: Path, run: Packed[RunManifest], raster: Raster) -> dict[str, Any]:
-    """Write a run's pictures to a folder that this process holds; returns the grid's place as :func:`draw` does."""
-    manifest = run.manifest
-    sides = tuple(len(matrix) for matrix in manifest.patterns.matrices)
-    closing = manifest.closing_frame
-    pictures = with_closing(pictures_of(manifest.patterns, str(run.place)), closing.kind if closing else None)
-    where = draw(place, pictures, raster, (sides[0], sides[1]), str(run.place))
-    (place / "frames").mkdir()
-    names = []
-    frames = ((shot.file, channels["DN"]) for shot, channels, _ in shots_of(run))
-    last = [(closing.file, run.read(closing.file)[0]["DN"])] if closing else []
-    for index, (file, dn) in enumerate(chain(frames, last)):
-        if dn.dtype != np.uint32 or int(dn.max()) > _LARGEST:
-            raise MitsimError(
-                f"{run.place / file}: has {dn.dtype} numbers up to {dn.max():g}, and PNG holds whole ones up to "
-                f"{_LARGEST}; use the format hdf5"
-            )
-        names.append(frame_name(index))
-        write_png(place / "frames" / names[-1], dn.astype(np.uint16))
-    if manifest.ambient_frame is not None:
-        with whole_file(place / "ambient.npy") as part, part.open("wb") as stream:
-            np.save(stream, run.read(manifest.ambient_frame.file)[0]["DN"])
-    write_json(place / PATTERNS, describe(manifest.patterns, names[: len(manifest.patterns.captures)], where))
-    return where
-
-
-def _read_again(folder: Path, line: str, manifest: RunManifest) -> str:
-    """How the frames in a ``folder`` become a RUN folder, or that of a ``line``, again."""
-    again = f"--patterns {folder / PATTERNS} --exposure {manifest.digital.exposure_s!r}"
-    if manifest.ambient_frame is not None:
-        again += f" --ambient-frame {folder / 'ambient.npy'} --ambient-shots {manifest.ambient_frame.shots}"
-    if (closing := manifest.closing_frame) is not None:
-        again += f" --closing-frame {closing.kind} --closing-exposure {closing.exposure_s!r}"
-    frames, run, calibration = folder / "frames", Path("RUN", line), Path("CAL", line)
-    return f"Read again by: mitsim import {frames} {again} --camera NAME --calibration {calibration} -o {run}"
+            write_text(whole / COLOUR, run.text)
+    return (*notes, f"Patterns in cells of {describe_cells(where)}")
 
 
 def check_pictures(manifest: RunManifest, projector: str | None, place: str) -> Raster:

@@ -56,11 +56,7 @@ def twelve_bits(path: Path) -> None:
         ("a.npy", lambda path: np.save(path, NUMBERS), NUMBERS),
         ("a.npy", lambda path: np.save(path, NUMBERS.astype(">u2")), NUMBERS),
         ("a.npy", lambda path: np.save(path, np.asfortranarray(NUMBERS / 3.0)), NUMBERS / 3.0),
-        (
-            "a.exr",
-            lambda path: write_frame(path, {"Y": NUMBERS.astype(np.float32)}, {}),
-            NUMBERS.astype(np.float32),
-        ),
+        ("a.exr", lambda path: write_frame(path, {"Y": NUMBERS.astype(np.float32)}, {}), NUMBERS.astype(np.float32)),
     ],
 )
 def test_numbers_are_read_as_they_are_stored(tmp_path: Path, name: str, write: Write, expected: np.ndarray) -> None:

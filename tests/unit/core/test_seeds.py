@@ -23,20 +23,7 @@ def test_other_streams_do_not_change_a_stream() -> None:
 
 
 def test_different_names_give_different_streams() -> None:
-    names = [
-        (),
-        ("a",),
-        ("b",),
-        ("a", "b"),
-        ("ab",),
-        ("b", "a"),
-        (1,),
-        ("1",),
-        (-1,),
-        (12,),
-        (1, 2),
-        ("", "a"),
-    ]
+    names = [(), ("a",), ("b",), ("a", "b"), ("ab",), ("b", "a"), (1,), ("1",), (-1,), (12,), (1, 2), ("", "a")]
     values = [first(root, *name) for root in (0, 1, 2**64 - 1) for name in names]
     assert len(set(values)) == len(values)
 
