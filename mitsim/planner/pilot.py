@@ -22,7 +22,6 @@ from mitsim.light.passes import PASSES
 from mitsim.light.settings import (
     REPLICATES,
     Approximation,
-    Drawn,
     ErrorCovariance,
     Forming,
     PilotResult,
@@ -172,7 +171,7 @@ class PilotRuns:
     @property
     def _rough(self) -> bool:
         """True if a few anchors may leave too much error."""
-        few = ErrorCovariance.between(self.anchored.of_few, self.switched.light**2)
+        few = ErrorCovariance.between(self.anchored.until(math.inf), self.switched.light**2)
         return few.estimate([Approximation("anchors", SMOOTH)]).bound > _ROUGH * self.accuracy
 
     def heavy(self, samples: int) -> dict[str, SampleCost]:
@@ -226,10 +225,6 @@ class PilotRuns:
     def forming(self) -> Forming:
         """What the cost of forming frames depends on."""
         return self.fine.forming(self.lighting)
-
-    @cached_property
-    def _raster(self) -> tuple[Drawn, Drawn]:
-        return self.fine.raster()
 
     @cached_property
     def _left_out(self) -> LeftOut:
@@ -288,7 +283,7 @@ class PilotRuns:
             layers=fine.layers,
             changes=ErrorCovariance.between(seen, light**2),
             sample_costs=sample_costs,
-            spread=fine.spread(light),
+            spread=fine.sample_cost(light, spread=True),
             shared=shared,
             repeats=repeats,
             forming=replace(self.forming, lines=self._lines, occluded=(rows, columns)),
@@ -300,7 +295,7 @@ class PilotRuns:
             reach=self._base.reach,
             sharp=apart,
             occluded=self._base.occluded,
-            raster=self._raster,
+            raster=fine.raster,
             hits=self._hits,
         )
 

@@ -38,7 +38,7 @@ from mitsim.optics.image_formation import Entries, number_of_terms, raster_error
 from mitsim.optics.shadow import Places
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CombinedTracer, FromCameraTracer
-from mitsim.transport.records import AMBIENT, PathSamples
+from mitsim.transport.records import AMBIENT, Bundle, PathSamples
 
 Known = dict[Hashable, tuple[Sequence[PathSamples], FloatArray]]
 """Frames that were formed already, with their light."""
@@ -250,7 +250,9 @@ def ladder(
     while True:
         *earlier, before, judge = tried
         last = tried[judge] - tried[before]
-        gain = _gain(norm(last), norm(tried[before] - tried[earlier[-1]])) if earlier else _UNKNOWN_GAIN
+        gain, former = _UNKNOWN_GAIN, norm(tried[before] - tried[earlier[-1]]) if earlier else 0.0
+        if former > 0:
+            gain = min(norm(last) / former, gain)
         rest = max(gain, least_gain) / (1 - max(gain, least_gain))
         # Two steps tell what the judge leaves; one alone, what the step before it does.
         if (rest if earlier else 1 + rest) * norm(last) <= tolerance or judge == counts[-1]:
@@ -259,10 +261,6 @@ def ladder(
         tried[following] = frames(following)
     limit = tried[judge] + rest * last
     return {count: limit - found for count, found in tried.items()}
-
-
-def _gain(last: float, before: float) -> float:
-    return min(last / before, _UNKNOWN_GAIN) if before > 0 else _UNKNOWN_GAIN
 
 
 def coarsening_changes(
@@ -299,11 +297,13 @@ def norm(seen: FloatArray) -> float:
     return math.sqrt(max(product(seen, seen), 0.0))
 
 
-def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seed: int, samples: int) -> PathSamples:
-    """Trace the projector's light in parts, without the light of lamps."""
-    each = max(1, _AT_ONCE // tracer.paths_per_sample)
-    parts = [tracer.trace(seed, first, min(each, samples - first)) for first in range(0, samples, each)]
-    return PathSamples.join([part.where(part.kind != AMBIENT) for part in parts])
+def heavy_paths(tracer: FromCameraTracer | CombinedTracer, seeds: Sequence[int], samples: int) -> list[PathSamples]:
+    """Trace the projector's light of each replicate in parts, without the light of lamps."""
+    each, found = max(1, _AT_ONCE // tracer.paths_per_sample), []
+    for own in (integer(seed, "heavy") for seed in seeds):
+        parts = [tracer.trace(own, first, min(each, samples - first)) for first in range(0, samples, each)]
+        found.append(PathSamples.join([part.where(part.kind != AMBIENT) for part in parts]))
+    return found
 
 
 def noise(seen: FloatArray) -> float:
@@ -323,36 +323,27 @@ class DirectRuns:
     def __init__(self, bench: Apparatus, base: Settings, sample: Sample, accuracy: float, seed: int) -> None:
         self.bench, self.base, self.sample, self.accuracy = bench, base, sample, accuracy
         self._known: Known = {}
+        self._noises: dict[bool, tuple[float, float]] = {}
         self._seeds = [integer(seed, "pilot", "fine", replicate) for replicate in range(REPLICATES)]
         self._simulation = simulation = sample.simulation(bench, base)
-        tracer = tracer_of(simulation, shown_pixels(base, sample), base.anchors)
-        self.first, self._path_samples = self._trace(tracer)
+        self.first, self._path_samples = self._trace(base.anchors)
         apart, samples = simulation.sharp, sample.sharp(simulation)
         self._sharp = apart.replicates(self._seeds, samples)[0] if apart else []
-
-    def _trace(self, tracer: DirectTracer) -> list[list[PathSamples]]:
-        return tracer.replicates(self._seeds, self.sample.anchored, self.sample.fine)
-
-    @property
-    def judging(self) -> tuple[float, ...]:
-        """Depths [mm] of the layers that judge one layer; none for a flat scene."""
-        return self.layers.get(_JUDGING, ())
-
-    @cached_property
-    def layers(self) -> dict[int, tuple[float, ...]]:
+        inverse = np.concatenate([light.inverse_depth for light in (*self._path_samples, *self._sharp)])
+        near = far = base.depth
+        if inverse.size:
+            near, far = 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / base.depth)
+        self.layers: dict[int, tuple[float, ...]] = {1: (base.depth,)}
         """Candidates for the layers' depths [mm], by their number."""
-        near, far = self._range()
-        candidates: dict[int, tuple[float, ...]] = {1: (self.base.depth,)}
         if far > near * (1 + _FLAT):
             for count in LAYER_LADDER[1:]:
-                candidates[count] = tuple(float(node) for node in 1 / np.linspace(1 / far, 1 / near, count))
-        return candidates
+                self.layers[count] = tuple(float(node) for node in 1 / np.linspace(1 / far, 1 / near, count))
+        self.judging = self.layers.get(_JUDGING, ())
+        """Depths [mm] of the layers that judge one layer; none for a flat scene."""
 
-    def _range(self) -> tuple[float, float]:
-        inverse = np.concatenate([path_samples.inverse_depth for path_samples in (*self._path_samples, *self._sharp)])
-        if not inverse.size:
-            return self.base.depth, self.base.depth
-        return 1 / float(inverse.max()), 1 / max(float(inverse.min()), _FARTHEST / self.base.depth)
+    def _trace(self, anchors: int, spread: bool = False) -> list[list[PathSamples]]:
+        tracer = DirectTracer(self._simulation.setup, anchors, spread, shown_pixels(self.base, self.sample))
+        return tracer.replicates(self._seeds, self.sample.anchored, self.sample.fine)
 
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
@@ -374,51 +365,44 @@ class DirectRuns:
         cells, layer = (norm(self.changes[part]) if part in self.changes else 0.0 for part in (_CELL, _LAYER))
         return (cells / whole, layer / whole) if whole else (math.inf, math.inf)
 
-    def sample_cost(self, light: float) -> SampleCost:
-        """Return the sample cost of light at the sensor's centre, relative to all ``light``."""
-        return self._sample_cost(self._noise, light)
-
-    def spread(self, light: float) -> SampleCost:
-        """Return the sample cost of light at random points of the sensor, where gloss makes noise."""
-        if self.bench.loaded.one_way and not self.bench.loaded.glossy:
-            return self.sample_cost(light)
-        return self._sample_cost(self._spread_noise, light)
-
-    def _sample_cost(self, noises: tuple[float, float], light: float) -> SampleCost:
-        many, few = noises
-        steep = many > 0 and few > 0 and self.sample.anchored < self.sample.fine
-        rate = math.log(few / many) / math.log(self.sample.fine / self.sample.anchored) if steep else 0.5
-        return SampleCost.relative(many, light, self.sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
-
     @cached_property
     def _whole(self) -> FloatArray:
         return self._form(self._simulation, self._path_samples, self.sample.fine)
 
-    @cached_property
-    def _noise(self) -> tuple[float, float]:
-        return self._noise_of(self._whole, self.first)
+    def sample_cost(self, light: float, spread: bool = False) -> SampleCost:
+        """Return the sample cost of light at the sensor's centre, relative to all ``light``.
 
-    @cached_property
-    def _spread_noise(self) -> tuple[float, float]:
-        tracer = tracer_of(self._simulation, shown_pixels(self.base, self.sample), 1, spread=True)
-        first, seen = self._trace(tracer)
-        return self._noise_of(self._form(self._simulation, seen, self.sample.fine), first)
-
-    def _noise_of(self, many: FloatArray, first: list[PathSamples]) -> tuple[float, float]:
-        return noise(many), noise(self._form(self._simulation, first, self.sample.anchored))
+        With ``spread`` it is that of light at random points of the sensor, where gloss makes noise.
+        """
+        spread = spread and not (self.bench.loaded.one_way and not self.bench.loaded.glossy)
+        sample = self.sample
+        if spread not in self._noises:
+            first, seen = self._trace(1, spread=True) if spread else (self.first, self._path_samples)
+            each = (seen, sample.fine), (first, sample.anchored)
+            many, few = (noise(self._form(self._simulation, light, count)) for light, count in each)
+            self._noises[spread] = many, few
+        many, few = self._noises[spread]
+        steep = many > 0 and few > 0 and sample.anchored < sample.fine
+        rate = math.log(few / many) / math.log(sample.fine / sample.anchored) if steep else 0.5
+        return SampleCost.relative(many, light, sample.fine, self.bench.n**2, min(max(rate, 0.5), _STEEPEST))
 
     def forming(self, family: Lighting) -> Forming:
         """Return what the cost of forming frames of a ``family`` depends on."""
-        simulation = Simulation(self.bench, self.base)
-        fine = simulation.grids["fine"]
-        light = fine.bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
-        cells = max(fine.bundle.cells)
-        geometry = self.bench.geometry
-        waves = self.bench.waves
+        geometry, waves = self.bench.geometry, self.bench.waves
+        bundle, light = self._accumulated
+        shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
+        places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
+        rows = max(1.0, float(np.mean([len(np.unique(place // bundle.cells[1])) for place in places])))
+
+        def largest_terms(spectrum: Spectrum | None) -> float:
+            if not geometry.is_drawn(spectrum is not None):
+                return math.inf
+            return number_of_terms(raster(geometry, self.base.depth, spectrum))
+
         return Forming(
             pixels=geometry.frame_side,
-            cells=cells,
-            lit=self._lit_rows(simulation, light) / cells,
+            cells=max(bundle.cells),
+            lit=rows / max(bundle.cells),
             terms=float(len(self.bench.spectrum.weights) * geometry.mask_terms),
             shots=len(family.weights),
             classes=family.weights.shape[1],
@@ -426,30 +410,27 @@ class DirectRuns:
             geometric_terms=float(geometry.mask_terms),
             correlated=(geometry.is_drawn(waves=False), geometry.is_drawn(geometry.diffracts)),
             phases=float(cells_per_pixel(geometry) ** 2),
-            largest_terms=(self._largest_terms(None), self._largest_terms(waves)),
+            largest_terms=(largest_terms(None), largest_terms(waves)),
             drawing=(drawing_seconds(geometry, None), drawing_seconds(geometry, waves)),
             parted=bool(self.bench.loaded.parting),
         )
 
-    def _largest_terms(self, spectrum: Spectrum | None) -> float:
-        geometry = self.bench.geometry
-        if not geometry.is_drawn(spectrum is not None):
-            return math.inf
-        return number_of_terms(raster(geometry, self.base.depth, spectrum))
+    @cached_property
+    def _accumulated(self) -> tuple[Bundle, sparse.csr_array]:
+        bundle = Simulation(self.bench, self.base).grids["fine"].bundle
+        return bundle, bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
 
+    @cached_property
     def raster(self) -> tuple[Drawn, Drawn]:
-        """Return the error of a shadow on a raster, without diffraction and with it."""
-        simulation = Simulation(self.bench, self.base)
-        bundle, geometry = simulation.grids["fine"].bundle, self.bench.geometry
-        light = bundle.accumulate(self._path_samples[0], self.sample.lighting.labels, self.sample.fine)
-        shot = sparse.csr_array(self.sample.lighting.weights[:1]) @ light[: self.sample.lighting.weights.shape[1]]
-        light = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])
+        """Error of a shadow on a raster, without diffraction and with it."""
+        geometry, lighting, (bundle, light) = self.bench.geometry, self.sample.lighting, self._accumulated
+        shot = sparse.csr_array(lighting.weights[:1]) @ light[: lighting.weights.shape[1]]
+        seen = shot.toarray().reshape(bundle.anchors, bundle.cells[0], bundle.anchors, bundle.cells[1])[0, :, 0]
 
         def draw_shadow(spectrum: Spectrum | None) -> Drawn:
             waves = spectrum is not None
             if not (geometry.is_drawn(waves) or geometry.may_be_drawn(waves)):
                 return Drawn()
-            seen = light[0, :, 0]
             error, known = raster_error(geometry, bundle.rows, bundle.columns, self.base.depth, spectrum, seen)
             found = Estimate(error, _SURE_OF_RASTER * error) if known else Estimate(*(error * by for by in _OF_FINER))
             return Drawn(found, geometry.is_drawn(waves), cells_to_choose(geometry, spectrum))
@@ -457,25 +438,19 @@ class DirectRuns:
         without, waves = draw_shadow(None), self.bench.waves
         return without, draw_shadow(waves) if waves else without
 
-    def _lit_rows(self, simulation: Simulation, light: sparse.csr_array) -> float:
-        shots = (self.sample.lighting.weights @ (light[: len(self.sample.rows)] != 0)) != 0
-        width = simulation.grids["fine"].bundle.cells[1]
-        places = [np.flatnonzero(shot) if isinstance(shot, np.ndarray) else shot.indices for shot in shots]
-        return max(1.0, float(np.mean([len(np.unique(place // width)) for place in places])))
-
     def _frames(self, layers: tuple[float, ...], subdivision: int, one_line: bool = False) -> FloatArray:
         """Form frames in given layers and cells. One line suffices for layers, in a third of the time."""
         settings = replace(self.base, layers=layers, subdivision=subdivision)
         simulation = self.sample.simulation(self.bench, settings, one_line)
-        return self._form(simulation, self._path_samples, self.sample.fine, self._sharp)
+        frames = self._form(simulation, self._path_samples, self.sample.fine)
+        if not self._sharp:
+            return frames
+        light, samples = emission(simulation.physics, self.sample.lighting), self.sample.sharp(simulation)
+        return frames + self.sample.frames(simulation.grids["sharp"], self._sharp, samples, light)
 
-    def _form(
-        self, simulation: Simulation, path_samples: list[PathSamples], samples: int, sharp: Sequence[PathSamples] = ()
-    ) -> FloatArray:
-        sample, light = self.sample, emission(simulation.physics, self.sample.lighting)
-        grids = simulation.grids
-        frames = sample.frames(grids["fine"], path_samples, samples, light, self._known)
-        return frames + sample.frames(grids["sharp"], sharp, sample.sharp(simulation), light) if sharp else frames
+    def _form(self, simulation: Simulation, light: list[PathSamples], samples: int) -> FloatArray:
+        emitted = emission(simulation.physics, self.sample.lighting)
+        return self.sample.frames(simulation.grids["fine"], light, samples, emitted, self._known)
 
 
 def _product_seconds() -> float:
@@ -496,8 +471,3 @@ def _product_seconds() -> float:
 def shown_pixels(settings: Settings, sample: Sample) -> Labels:
     """Return the projector pixels that the shots show, without those that ``settings`` trace apart."""
     return np.setdiff1d(sample.shown, settings.sharp.pixels) if settings.sharp else sample.shown
-
-
-def tracer_of(simulation: Simulation, pixels: Labels, anchors: int, spread: bool = False) -> DirectTracer:
-    """Return a tracer of direct light from ``pixels`` to ``anchors`` a side, or spread over the sensor."""
-    return DirectTracer(simulation.setup, anchors, spread, pixels)

@@ -17,7 +17,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.seeds import integer
 from mitsim.light.cost_model import SHARED_COST
 from mitsim.light.grids import Grid
-from mitsim.light.passes import PASSES, PassTracer
+from mitsim.light.passes import PASSES
 from mitsim.light.settings import REPLICATES, WIDE, Approximation, ErrorCovariance, Noise, SampleCost, Settings
 from mitsim.light.simulation import Simulation, emission
 from mitsim.planner.pilot_direct import (
@@ -32,9 +32,9 @@ from mitsim.planner.pilot_direct import (
     noise,
     norm,
     shown_pixels,
-    tracer_of,
 )
 from mitsim.transport import records
+from mitsim.transport.direct import DirectTracer
 from mitsim.transport.indirect import adaptive_counts, block_moments, effect_of
 from mitsim.transport.integrator import KINDS
 from mitsim.transport.path_reuse import PathReuseTracer
@@ -93,7 +93,7 @@ class AnchorRuns:
         self.coarse = math.inf, math.inf
         self._seeds = [integer(seed, "pilot", self._stream, replicate) for replicate in range(REPLICATES)]
         self._frames: Callable[[int], FloatArray] = cache(self._at_anchors)
-        self._seen: Callable[[int, tuple[float, ...]], FloatArray] = cache(self._in_cells)
+        self._beyond_mean: Callable[[int, tuple[float, ...]], FloatArray] = cache(self._in_cells)
         self._choose(sample)
 
     def _choose(self, sample: Sample) -> None:
@@ -117,34 +117,29 @@ class AnchorRuns:
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by each number of anchors, and by one cell and one layer."""
-        changes, (cells, layers) = self._until(self.tolerance), self._worth_a_look
+        changes, (cells, layers) = self.until(self.tolerance), self._worth_a_look
         if not (cells or layers):
             return changes
         return {**changes, **coarsening_changes(self._pass.name, self._beyond_mean, layers)}
 
     @property
     def _worth_a_look(self) -> tuple[bool, tuple[float, ...]]:
-        most = _AS_ROUGH * norm(self._beyond_mean())
+        most = _AS_ROUGH * norm(self._beyond_mean(1, ()))
         cells, layer = (most * part > 1 for part in self.coarse)
         return cells, self.layers if layer else ()
 
-    @property
-    def of_few(self) -> dict[Approximation, FloatArray]:
-        return self._until(math.inf)
-
-    def _until(self, tolerance: float, judge: int = _JUDGE) -> dict[Approximation, FloatArray]:
+    def until(self, tolerance: float, judge: int = _JUDGE) -> dict[Approximation, FloatArray]:
+        """Return the change of the frames by each number of anchors, until it is below a tolerance."""
         found = ladder(self.ladder, self._frames, judge, tolerance)
         return {Approximation(self._pass.anchors, count): change for count, change in found.items()}
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
         """Return the sample cost of what a few anchors see beyond their mean, by pass."""
-        return {self._pass.name: SampleCost.relative(noise(self._beyond_mean()), light, self._samples, self._lanes)}
-
-    def _beyond_mean(self, cells: int = 1, layers: tuple[float, ...] = ()) -> FloatArray:
-        """Form frames of what a few anchors see beyond their mean; 0 ``cells`` are those of a run."""
-        return self._seen(cells, layers)
+        beyond = noise(self._beyond_mean(1, ()))
+        return {self._pass.name: SampleCost.relative(beyond, light, self._samples, self._lanes)}
 
     def _in_cells(self, cells: int, layers: tuple[float, ...]) -> FloatArray:
+        """Form frames of what a few anchors see beyond their mean; 0 ``cells`` are those of a run."""
         known = self._frames(self.few) if cells == 1 and not layers else None
         return self._beyond(self._simulation(self.few, cells, layers), self._few, known)
 
@@ -181,7 +176,7 @@ class AnchorRuns:
     def _trace(self, simulation: Simulation) -> list[PathSamples]:
         anchors = self._grids(simulation)[0].bundle.anchors
         if anchors not in self.traced:
-            tracer = tracer_of(simulation, self.pixels, anchors)
+            tracer = DirectTracer(simulation.setup, anchors, pixels=self.pixels)
             self.traced[anchors] = tracer.replicates(self._seeds, self._samples)[0]
         return self.traced[anchors]
 
@@ -207,14 +202,12 @@ class PenumbraRuns(AnchorRuns):
 
 
 class FollowedRuns(AnchorRuns):
-    """Frames with fewer anchors for followed light."""
+    """Frames with fewer anchors for followed light, from the projector's side and from the camera's side."""
 
     _pass = PASSES["indirect_residual"]
     _stream = "followed"
     ladder = (1, 2, 3, 5, 8, 12)
     few = 2
-    passes = "indirect_residual", "camera_residual"
-    """From the projector's side, and from the camera's side."""
 
     def _choose(self, sample: Sample) -> None:
         self._samples = sample.followed
@@ -222,30 +215,29 @@ class FollowedRuns(AnchorRuns):
     @cached_property
     def changes(self) -> dict[Approximation, FloatArray]:
         """Change of the frames by each number of anchors, and by wide cells."""
-        if not self._lit or not _tracers(self._simulation()) or not norm(self._frames(1)):
+        if not self._lit or not any(self._simulation().at_anchors) or not norm(self._frames(1)):
             return {}
-        return {**self._until(self.tolerance, _FOLLOWED_JUDGE), WIDE: self._wide}
+        found, one, (cells, layers) = (
+            self.until(self.tolerance, _FOLLOWED_JUDGE),
+            self._beyond_mean(1, ()),
+            self._worth_a_look,
+        )
+        missing = (self._beyond_mean(2, ()) - one) / (1 - EVEN_CELLS) if cells else np.zeros_like(one)
+        layered = self._beyond_mean(1, layers) if layers else one
+        return {**found, WIDE: np.asarray(layered + missing - self._beyond_mean(0, ()))}
 
     def sample_costs(self, light: float) -> dict[str, SampleCost]:
         """Return the sample costs from the projector's side and from the camera's side."""
-        tracers = self._simulation().at_anchors
-        if not self.changes:
-            return dict.fromkeys(self.passes, SampleCost.none())
-        every = self._beyond_mean()
-        seen = (every, every) if None in tracers else (every - self._from_camera, self._from_camera)
-        return {
-            name: SampleCost.relative(noise(each), light, self._samples, tracer.paths_per_sample)
-            if tracer
-            else SampleCost.none()
-            for name, each, tracer in zip(self.passes, seen, tracers, strict=True)
-        }
-
-    @property
-    def _camera_is_faint(self) -> bool:
-        """True if light from the camera's side needs no more anchors than a few."""
-        if None in self._simulation(self.few).at_anchors:
-            return False
-        return math.sqrt(float(np.square(self._from_camera).sum()) / REPLICATES) < _FAINT * self.tolerance
+        found, tracers = {}, self._simulation().at_anchors
+        every = self._beyond_mean(1, ()) if self.changes else None
+        for place, (name, tracer) in enumerate(zip(("indirect_residual", "camera_residual"), tracers, strict=True)):
+            found[name] = SampleCost.none()
+            if every is not None and tracer is not None:
+                seen = every
+                if None not in tracers:
+                    seen = self._from_camera if place else every - self._from_camera
+                found[name] = SampleCost.relative(noise(seen), light, self._samples, tracer.paths_per_sample)
+        return found
 
     @cached_property
     def _from_camera(self) -> FloatArray:
@@ -257,18 +249,11 @@ class FollowedRuns(AnchorRuns):
         tracer, one = simulation.at_anchors[1], self._simulation().at_anchors[1]
         if tracer is None or one is None or not self.changes or not light:
             return SampleCost.none()
-        seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self._seeds]
+        seen = heavy_paths(tracer, self._seeds, samples)
         frames = self._beyond(simulation, seen, samples=samples)
         # The heaviest paths come to one anchor of several: each connection counts.
         found = Noise.among(frames, light, samples, np.concatenate([replicate.value for replicate in seen]))
         return SampleCost(found, one.paths_per_sample)
-
-    @property
-    def _wide(self) -> FloatArray:
-        one, (cells, layers) = self._beyond_mean(), self._worth_a_look
-        missing = (self._beyond_mean(2) - one) / (1 - EVEN_CELLS) if cells else np.zeros_like(one)
-        layered = self._beyond_mean(1, layers) if layers else one
-        return np.asarray(layered + missing - self._beyond_mean(0))
 
     @cached_property
     def _few(self) -> list[PathSamples]:
@@ -276,28 +261,25 @@ class FollowedRuns(AnchorRuns):
 
     @cached_property
     def _few_by_tracer(self) -> list[list[PathSamples]]:
-        tracers = _tracers(self._simulation(self.few))
-        return [tracer.replicates(self._seeds, self._samples)[0] for tracer in tracers]
+        tracers = self._simulation(self.few).at_anchors
+        return [tracer.replicates(self._seeds, self._samples)[0] for tracer in tracers if tracer is not None]
 
     def _at_anchors(self, anchors: int) -> FloatArray:
-        simulation, samples = self._simulation(anchors), self._samples
-        grids, tracers = self._grids(simulation), _tracers(simulation)
+        simulation, samples, found = self._simulation(anchors), self._samples, []
+        grids, tracers = self._grids(simulation), [each for each in simulation.at_anchors if each is not None]
         if anchors == self.few:
             return self._form(grids, self._few)
-        found = []
-        if anchors > self.few and self._camera_is_faint:
-            tracers = tracers[:1]
-            found.append(self._form(self._grids(self._simulation(self.few)), self._few_by_tracer[1]))
+        if anchors > self.few and len(self._few_by_tracer) > 1:
+            camera = math.sqrt(float(np.square(self._from_camera).sum()) / REPLICATES)
+            if camera < _FAINT * self.tolerance:  # Light from the camera's side needs no more anchors than a few.
+                tracers = tracers[:1]
+                found.append(self._form(self._grids(self._simulation(self.few)), self._few_by_tracer[1]))
         each = max(1, _AT_ONCE // (REPLICATES * sum(tracer.paths_per_sample for tracer in tracers)))
         for first in range(0, samples, each):
             some = min(each, samples - first)
             traced = [tracer.replicates(self._seeds, some, first=first)[0] for tracer in tracers]
             found.append(self._form(grids, _join(traced)))
         return np.asarray(sum(found))
-
-
-def _tracers(simulation: Simulation) -> list[PassTracer]:
-    return [tracer for tracer in simulation.at_anchors if tracer is not None]
 
 
 def _join(traced: Sequence[list[PathSamples]]) -> list[PathSamples]:
@@ -316,12 +298,7 @@ class Bounced(NamedTuple):
 
     @classmethod
     def of(cls, replicates: list[PathSamples], samples: int) -> Bounced:
-        indirect = [light.where(light.kind == records.INDIRECT) for light in replicates]
-        return cls(replicates, indirect, samples)
-
-    @property
-    def is_indirect(self) -> bool:
-        return sum(light.value.size for light in self.indirect) == sum(light.value.size for light in self.replicates)
+        return cls(replicates, [light.where(light.kind == records.INDIRECT) for light in replicates], samples)
 
 
 class EffectRuns:
@@ -362,11 +339,11 @@ class EffectRuns:
 
     @cached_property
     def _coarse(self) -> dict[Approximation, FloatArray]:
-        if self._is_faint or not any(light.value.size for light in self._closer.indirect):
+        if self._is_faint or not any(light.value.size for light in self._looks[1].indirect):
             return {}
         changes = coarsening_changes("indirect", self._indirect, ())
         if self.layers:
-            layered, one = (self._indirect(1, layers, self._few) for layers in (self.layers, ()))
+            layered, one = (self._indirect(1, layers, self._looks[0]) for layers in (self.layers, ()))
             changes[Approximation("indirect layers", 1)] = layered - one
         return changes
 
@@ -389,25 +366,18 @@ class EffectRuns:
         return cells, layer
 
     def _indirect(self, cells: int, layers: tuple[float, ...], seen: Bounced | None = None) -> FloatArray:
-        seen = seen or self._closer
+        seen = seen or self._looks[1]
         effects = self.everything.effects - {"black-level"}
         coarse = replace(self.everything, effects=effects, coarse_layers=bool(layers), layers=layers)
         simulation = self.sample.simulation(self.bench, coarse, one_line=True, judging_cells=cells)
         return self._form(simulation, followed={"indirect": seen.indirect}, samples=seen.samples)
 
     def _noise_of_bounced(self, seen: Bounced) -> float:
-        if seen.is_indirect:
+        size, whole = (sum(each.value.size for each in light) for light in (seen.indirect, seen.replicates))
+        if size == whole:
             return noise(self._indirect(1, (), seen))
         followed = self._by_kind({"indirect": seen.replicates})
         return noise(self._form(self.simulation, followed=followed, samples=seen.samples))
-
-    @property
-    def _closer(self) -> Bounced:
-        return self._looks[1]
-
-    @property
-    def _few(self) -> Bounced:
-        return self._looks[0]
 
     @cached_property
     def _looks(self) -> tuple[Bounced, Bounced]:
@@ -440,16 +410,12 @@ class EffectRuns:
         effects = self.everything.effects
         return {name: self.simulation.physics.speckle for name in effects if not EFFECTS[name].in_frames}
 
-    def sample_cost(self, name: str) -> SampleCost:
-        """Return the sample cost of the pass ``name``, relative to all light."""
-        return self.sample_costs.get(name, SampleCost.none())
-
     def with_more(self, samples: int) -> SampleCost:
         """Measure the sample cost of light from the camera's side with more ``samples``."""
         tracer = self.simulation.from_camera
         if tracer is None or not self.light:
             return SampleCost.none()
-        seen = [heavy_paths(tracer, integer(seed, "heavy"), samples) for seed in self.seeds]
+        seen = heavy_paths(tracer, self.seeds, samples)
         frames = self._form(self.simulation, followed=self._by_kind({"from_camera": seen}), samples=samples)
         paths = np.concatenate([replicate.value for replicate in seen])
         return SampleCost(Noise.among(frames, self.light, samples, paths), tracer.paths_per_sample)
@@ -457,44 +423,34 @@ class EffectRuns:
     def indirect_cost(self) -> tuple[SampleCost, bool, tuple[int, ...]]:
         """Return the cost of indirect light, True if pixels share paths, and the paths of each block."""
         sample_cost, shared = self._shared_or_not
-        repeats, (variance, paths) = self._repeats
+        pixels = self.bench.n
+        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._looks[1].indirect]
+        # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
+        halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
+        judged = [effect_of(adaptive_counts(one), other) for one, other in (halves, halves[::-1])]
+        variance, paths = (float(each) for each in np.mean(judged, axis=0))
         if variance * paths > _WORTH_REPEATING:
             return sample_cost, shared, ()
+        repeats = tuple(int(count) for count in adaptive_counts(np.sum(moments, axis=0)).ravel())
         noise_left = replace(sample_cost.noise, error=sample_cost.noise.error * math.sqrt(variance))
         return replace(sample_cost, noise=noise_left, paths=math.ceil(sample_cost.paths * paths)), shared, repeats
 
     @cached_property
-    def _repeats(self) -> tuple[tuple[int, ...], tuple[float, float]]:
-        """Paths of each block of pixels in a sample, and their effect on variance and number of paths."""
-        pixels = self.bench.n
-        moments = [block_moments(replicate.pixel, replicate.value, pixels) for replicate in self._closer.indirect]
-        repeats = adaptive_counts(np.sum(moments, axis=0))
-        # Judged by replicates that had no say, a half each: a single heavy path recommends only its own block.
-        halves = np.sum(moments[::2], axis=0), np.sum(moments[1::2], axis=0)
-        judged = [effect_of(adaptive_counts(one), other) for one, other in (halves, halves[::-1])]
-        variance, paths = np.mean(judged, axis=0)
-        return tuple(int(count) for count in repeats.ravel()), (float(variance), float(paths))
-
-    @cached_property
     def _shared_or_not(self) -> tuple[SampleCost, bool]:
-        plain = self.sample_cost("indirect")
+        plain = self.sample_costs["indirect"]
         taken = plain.noise.samples_for(self.accuracy) * plain.paths * PASSES["indirect"].unit_cost
         if not plain.noise.error or taken < _WORTH_SHARING_S:
             return plain, False
-        tracer = self._sharing.indirect
+        tracer = self.sample.simulation(self.bench, replace(self.everything, shared=True)).indirect
         if not isinstance(tracer, PathReuseTracer) or not tracer.shares():
             return plain, False
-        samples = max(1, self._closer.samples // SHARED_COST)
+        samples = max(1, self._looks[1].samples // SHARED_COST)
         seen = tracer.replicates([integer(seed, "shared") for seed in self.seeds[:_SHARING]], samples)[0]
         seen += [PathSamples.none()] * (REPLICATES - _SHARING)
         frames = self._indirect(1, (), Bounced.of(seen, samples))[:_SHARING]
         shared = SampleCost.relative(noise(frames), self.light, samples, SHARED_COST * tracer.paths_per_sample)
         less = shared.variance * shared.paths < _CLEARLY * plain.variance * plain.paths
         return (shared, True) if less else (plain, False)
-
-    @cached_property
-    def _sharing(self) -> Simulation:
-        return self.sample.simulation(self.bench, replace(self.everything, shared=True))
 
     @cached_property
     def sample_costs(self) -> dict[str, SampleCost]:
@@ -506,7 +462,8 @@ class EffectRuns:
                 samples, rate = self.sample.sharp(self.simulation), SHARP_RATE
                 error = noise(self._form(self.simulation, sharp=self.sharp))
             elif name == "indirect":
-                error, samples = self._noise_of_bounced(self._closer), self._closer.samples
+                samples = self._looks[1].samples
+                error = self._noise_of_bounced(self._looks[1])
             elif name in _FOLLOWED:
                 error = noise(self._form(self.simulation, followed=self._by_kind({name: self.followed[name]})))
             else:

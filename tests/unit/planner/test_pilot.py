@@ -26,6 +26,7 @@ from mitsim.optics.frames import monte_carlo_error
 from mitsim.planner import pilot, pilot_direct, pilot_effects
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns
 from mitsim.transport.integrator import FollowingTracer, Tracer
+from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import DIRECT, INDIRECT, PathSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -297,8 +298,8 @@ def test_followed_light_of_either_side_has_its_own_noise(bench: Bench) -> None:
     indirect, camera = found.sample_costs(1.0).values()
     alone, nothing = FollowedRuns(bench, everything, sample, 0.0, 5), [PathSamples.none()] * REPLICATES
     vars(alone)["_few_by_tracer"] = [found._few_by_tracer[0], nothing]
-    assert indirect.noise.error == pytest.approx(pilot_direct.noise(alone._beyond_mean()), rel=1e-9)
-    both = pilot_direct.noise(found._beyond_mean())
+    assert indirect.noise.error == pytest.approx(pilot_direct.noise(alone._beyond_mean(1, ())), rel=1e-9)
+    both = pilot_direct.noise(found._beyond_mean(1, ()))
     assert math.hypot(indirect.noise.error, camera.noise.error) == pytest.approx(both, rel=0.3)
     assert (indirect.paths, camera.paths) == tuple(tracer.paths_per_sample for tracer in found._simulation().at_anchors)
 
@@ -330,9 +331,11 @@ def test_what_costs_more_to_ask_than_it_saves_is_not_asked(bench: Bench, monkeyp
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     monkeypatch.setattr(pilot_effects, "_OF_INDIRECT", 1e-12)
     loose, close = (EffectRuns(bench, everything, sample, 5, (450.0, 330.0), reported) for reported in (1.0, 1e-7))
+    tried = list[object]()
+    monkeypatch.setattr(PathReuseTracer, "shares", lambda tracer: bool(tried.append(tracer)))
     for found, asked in ((loose, False), (close, True)):
         found.indirect_cost()
-        assert ("_sharing" in vars(found)) == asked and found._closer.samples == sample.followed
+        assert bool(tried) == asked and found._looks[1].samples == sample.followed
 
 
 def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_change(bench: Bench) -> None:
@@ -349,10 +352,10 @@ def test_indirect_light_is_looked_at_closer_where_noise_hides_what_coarse_cells_
     assert open_[1] < open_[0] / 4
     one, two = (each.estimate([Approximation("indirect layers", 1)]).value for each in seen)
     assert two == pytest.approx(one, rel=0.3)
-    noises = [found.sample_cost("indirect").noise for found in (first, close)]
+    noises = [found.sample_costs["indirect"].noise for found in (first, close)]
     assert [noise.samples for noise in noises] == [sample.followed, 16 * sample.followed]
     assert 0.5 < noises[1].error * math.sqrt(16) / noises[0].error < 2
-    one, two = (found._closer[0][0].value[:50] for found in (first, close))
+    one, two = (found._looks[1][0][0].value[:50] for found in (first, close))
     assert not np.array_equal(one, two)
 
 
@@ -404,7 +407,7 @@ def test_coarse_cells_of_what_anchors_see_are_looked_at_where_they_may_matter(be
     (Planted: the part of the mean, not of what is beyond it.)"""
     runs = pilot.PilotRuns(bench, parse_patterns("dots:4", N).lighting, 1e-2, 3)
     cells, layers = (Approximation(f"anchor_residual {what}", 1) for what in ("cells", "layers"))
-    enough = 1 / (15 * pilot_direct.norm(runs.anchored._beyond_mean()))
+    enough = 1 / (15 * pilot_direct.norm(runs.anchored._beyond_mean(1, ())))
     for coarse, looked_at in (
         ((0.9 * enough, 0.9 * enough), set()),
         ((1.1 * enough, 0.9 * enough), {cells}),
@@ -423,7 +426,7 @@ def test_noise_of_light_over_mirrors_counts_with_that_of_indirect_light(bench: B
     )
     everything = Settings(bench.geometry.scene_distance, subdivision=2, effects=frozenset(effects.present(bench)))
     found = EffectRuns(bench, everything, sample, 5)
-    seen = found._closer
+    seen = found._looks[1]
     halves = [
         replace(light, kind=np.where(np.arange(light.value.size) % 2, DIRECT, INDIRECT).astype(np.int16))
         for light in seen.indirect
@@ -471,7 +474,7 @@ def test_coarse_cells_of_faint_indirect_light_are_not_looked_at(bench: Bench) ->
     for left, looked_at in ((0.9 * enough, False), (1.1 * enough, True), (0.0, True)):
         found = EffectRuns(bench, everything, sample, 5, (), 1e-2, partial(tuple, (left / 2, left)))
         assert bool(found._coarse) == looked_at
-        assert found.sample_cost("indirect").noise.error
+        assert found.sample_costs["indirect"].noise.error
 
 
 def test_processors_that_rested_do_not_pass_for_slow_ones(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -493,8 +496,9 @@ def test_noise_over_a_flat_matt_scene_is_that_at_its_centre(small_scene: Callabl
     replicates tell either noise to some 40 %; over gloss they would differ by a factor. (Planted: rays for any scene.)
     """
     flat = pilot.PilotRuns(open_bench(small_scene()), parse_patterns("dots:4", N).lighting, 1e-2, 0)
-    assert flat.fine.spread(1.0) == flat.fine.sample_cost(1.0) and "_spread_noise" not in vars(flat.fine)
-    over = flat.fine._sample_cost(flat.fine._spread_noise, 1.0).noise.error
+    assert flat.fine.sample_cost(1.0, spread=True) == flat.fine.sample_cost(1.0) and set(flat.fine._noises) == {False}
+    _, seen = flat.fine._trace(1, spread=True)
+    over = pilot_direct.noise(flat.fine._form(flat.fine._simulation, seen, flat.fine.sample.fine))
     assert 0.5 < over / flat.fine.sample_cost(1.0).noise.error < 2
 
 
