@@ -227,31 +227,6 @@ class PilotRuns:
         return self.fine.forming(self.lighting)
 
     @cached_property
-    def _left_out(self) -> LeftOut:
-        simulation = self.switched.simulation
-        if not self.bench.loaded.mirrors:
-            return LeftOut.none()
-        samples = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
-        return left_out_light(simulation.setup, simulation.aim, integer(self.seed, "pilot", "caustics"), samples)
-
-    # ---- Light that neither rays nor connections find ----
-
-    @property
-    def _unmet(self) -> float:
-        """Irradiance of highlights that neither the search for lobes nor ordinary rays meet."""
-        if not self.bench.loaded.glossy:
-            return 0.0
-        every = highlights(self._seen.setup)
-        unmet = every.unmet(self.samples["cells"].fine * REPLICATES)
-        if not len(unmet.pixels):
-            return 0.0
-        near = with_neighbours(np.isin(np.arange(self.bench.n**2), unmet.pixels), self.bench.n)
-        missing = float(unmet.irradiance.sum() - self._sharp.by_pixel[near].sum())
-        return missing if missing > _LOOSELY * float(unmet.irradiance.sum()) else 0.0
-
-    # ---- The pilot's result ----
-
-    @cached_property
     def pilot_result(self) -> PilotResult:
         """Result of all runs."""
         fine, switched, anchored = self.fine, self.switched, self.anchored
@@ -270,13 +245,22 @@ class PilotRuns:
             "direct": fine.sample_cost(light),
             "indirect": indirect,
         }
-        left_out, mirror = self._left_out.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
+        missed, simulation = LeftOut.none(), switched.simulation
+        if self.bench.loaded.mirrors:
+            each = max(1, _CAUSTIC_PATHS // (simulation.aim.shape[0] * simulation.aim.shape[1]))
+            missed = left_out_light(simulation.setup, simulation.aim, integer(self.seed, "pilot", "caustics"), each)
+        left_out, mirror = missed.unseen(_FEWEST_HITS / samples, _FEWEST_MET / samples)
         # Light over mirrors alone, and what of it is in no frame or may be in the wrong pixels.
         mirrors = self.bench.loaded.mirrors
         alone, unsure = self.bench.specular.irradiance(self.bench.geometry) if mirrors else (0.0, 0.0)
         found = self._light + sharp.irradiance + switched.received + alone
         few = not apart and sharp.hits * self.samples["cells"].fine * REPLICATES < _FEWEST_HITS
-        unmet = self._unmet
+        # Highlights that neither the search for lobes nor ordinary rays meet.
+        unmet, spots = 0.0, highlights(self._seen.setup) if self.bench.loaded.glossy else None
+        if spots is not None and len((spots := spots.unmet(self.samples["cells"].fine * REPLICATES)).pixels):
+            near = with_neighbours(np.isin(np.arange(self.bench.n**2), spots.pixels), self.bench.n)
+            missing = float(spots.irradiance.sum() - sharp.by_pixel[near].sum())
+            unmet = missing if missing > _LOOSELY * float(spots.irradiance.sum()) else 0.0
         unresolved = unmet + (sharp.irradiance if few else 0.0)
         return PilotResult(
             depth=self._base.depth,
@@ -412,19 +396,13 @@ def occluded_pixels(simulation: Simulation, accuracy: float, seed: int) -> tuple
     found = pixels[_most(rough, rest)]
     every, looked = np.zeros(n**2), np.zeros(n**2, dtype=bool)
     # Few rays miss what is hidden by a little; it lies beside what is hidden by much.
-    while len(near := np.intersect1d(_beside(found, n), pixels[~looked[pixels]])):
+    while len(near := np.intersect1d(with_neighbours(np.isin(np.arange(n**2), found), n), pixels[~looked[pixels]])):
         if looked.sum() + len(near) > 9 * _MOST * n**2:
             return ()
         every[near], _ = _roughness(simulation, near, _NEAR, integer(seed, "near", int(looked.sum())))
         looked[near] = True
         found = _most(every, rest)
     return tuple(np.sort(found).tolist()) if len(found) <= _MOST * n**2 else ()
-
-
-def _beside(found: Labels, n: int) -> Labels:
-    chosen = np.zeros(n**2, dtype=bool)
-    chosen[found] = True
-    return with_neighbours(chosen, n)
 
 
 def _most(rough: FloatArray, rest: float) -> Labels:
@@ -481,9 +459,16 @@ def sharp_pixels(
     order = np.argsort(-sharp.moments, kind="stable")
     lit = min(int(np.count_nonzero(sharp.moments)), len(order) - 1)
     moments = np.cumsum(sharp.moments[order])[:lit]
-    paths = _paths(moments, light**2 / len(order) * _EVEN, len(order), anchors)
     if anchors <= _FEW:
-        count = max(int(np.argmin(paths[1:])) + 1, _unseen(sharp, order[:lit], _LEFT_SHARP * accuracy * whole))
+        # Paths, to a factor, with the first 0..k pixels apart: two kinds of light with variances V and paths
+        # P per sample take (sum sqrt(V P))^2.
+        count_apart, apart = np.arange(len(moments) + 1), np.concatenate([[0.0], moments])
+        rest = np.maximum(moments[-1] - apart, 0) + light**2 / len(order) * _EVEN
+        paths = (np.sqrt(rest * (len(order) - count_apart)) + np.sqrt(apart * count_apart * anchors**2)) ** 2
+        # Pixels whose light replicates may miss, until what is left is negligible or well seen.
+        light_left, moments_left = (np.cumsum(v[order[:lit]][::-1])[::-1] for v in (sharp.by_pixel, sharp.moments))
+        settled = (light_left <= _LEFT_SHARP * accuracy * whole) | (np.square(light_left) >= _SEEN * moments_left)
+        count = max(int(np.argmin(paths[1:])) + 1, int(np.argmax(settled)) if settled.any() else lit)
         if paths[count] > _WORTH * paths[0]:
             return None
     else:
@@ -495,16 +480,13 @@ def sharp_pixels(
     # One pixel at least stays with the others.
     if len(pixels) == len(order):
         pixels = np.sort(order[:count])
+    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _RAYS_OF_WINDOW)
+    window = (0.0, 0.0, 0.0, 0.0)
+    if seen.value.size:
+        window = float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())
     left = math.exp(-anchors * rate) * sharp.irradiance / whole
-    chosen = SharpPixels(tuple(pixels.tolist()), anchors, _window(simulation, pixels, seed), left)
+    chosen = SharpPixels(tuple(pixels.tolist()), anchors, window, left)
     return chosen if _connections(simulation, chosen, accuracy, seed) <= _MOST_CONNECTIONS else None
-
-
-def _unseen(sharp: SharpLight, order: Labels, negligible: float) -> int:
-    """Return how many pixels to trace separately."""
-    held, moments = (np.cumsum(values[order][::-1])[::-1] for values in (sharp.by_pixel, sharp.moments))
-    settled = (held <= negligible) | (np.square(held) >= _SEEN * moments)
-    return int(np.argmax(settled)) if settled.any() else len(order)
 
 
 def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, seed: int) -> float:
@@ -521,21 +503,3 @@ def _connections(simulation: Simulation, chosen: SharpPixels, accuracy: float, s
     energy = float((first * second).sum())
     noise = math.sqrt(float(np.square(first - second).sum()) / 2 / energy) if energy > 0 else math.inf
     return float(tracer.paths_per_sample * samples * (noise / accuracy) ** (1 / SHARP_RATE))
-
-
-def _paths(moments: FloatArray, even: float, pixels: int, anchors: int) -> FloatArray:
-    """Return (k + 1,) paths, to a factor, with the first 0..k of ``pixels`` traced separately.
-
-    Two kinds of light with variances V and paths P per sample take (sum sqrt(V P))^2.
-    """
-    count = np.arange(len(moments) + 1)
-    apart = np.concatenate([[0.0], moments])
-    rest = np.maximum(moments[-1] - apart, 0) + even
-    return np.asarray(np.sqrt(rest * (pixels - count)) + np.sqrt(apart * count * anchors**2)) ** 2
-
-
-def _window(simulation: Simulation, pixels: Labels, seed: int) -> tuple[float, float, float, float]:
-    seen = DirectTracer(simulation.setup, 2, pixels=pixels).trace(seed, 0, _RAYS_OF_WINDOW)
-    if not seen.value.size:
-        return (0.0, 0.0, 0.0, 0.0)
-    return float(seen.row.min()), float(seen.row.max()), float(seen.column.min()), float(seen.column.max())
