@@ -567,7 +567,7 @@ SIZES = {
     "metrics": (1, 81),
     "mitsim": (1, 102),
     "optics": (12, 2145),
-    "planner": (6, 2029),
+    "planner": (6, 1957),
     "reconstruct": (27, 7321),
     "report": (9, 2474),
     "scene": (10, 1873),
