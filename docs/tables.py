@@ -30,9 +30,7 @@ from mitsim.core.manifests import (
     ShotFile,
 )
 from mitsim.devices.camera import CameraGeometry
-from mitsim.devices.chart import ChartPlace
-from mitsim.devices.framelist import DarkFile, FrameList, StripeFile
-from mitsim.devices.knownlist import KnownCapture, KnownList
+from mitsim.devices.framelist import ChartPlace, DarkFile, FrameList, KnownCapture, KnownList, StripeFile
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Coherence, ProjectorModel
 from mitsim.devices.sensor import EfficiencyCurve, SensorModel

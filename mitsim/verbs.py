@@ -563,7 +563,7 @@ def characterise(
     >>> import mitsim as ms
     >>> found = ms.characterise("imx249", pixels=64, steps=50, frames=16)  # doctest: +SKIP
     """
-    from mitsim.devices.flatlist import capacity_of, load_flats
+    from mitsim.devices.framelist import capacity_of, load_flats
     from mitsim.studies.framework.run import check_study_folder
 
     asked = Procedure(**options)

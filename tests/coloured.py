@@ -11,7 +11,7 @@ import numpy as np
 
 from mitsim.core.manifests import AmbientFile, Digital, MosaicManifest, Patterns, RunManifest
 from mitsim.core.runs import AMBIENT, Capture, LineTruth, MosaicCapture, Recorder, frame_name
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.reconstruct.colour import chart
 from tests import ideal_sessions

@@ -69,8 +69,6 @@ CHECKS_A_REQUEST = (
     "mitsim.devices.sensor",
     "mitsim.devices.session",
     "mitsim.devices.framelist",
-    "mitsim.devices.knownlist",
-    "mitsim.devices.flatlist",
     "mitsim.exchange.formats",
     "mitsim.exchange.capture_list",
     "mitsim.learn.requests",

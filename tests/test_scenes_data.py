@@ -221,7 +221,7 @@ def test_camera_is_the_papers(any_scene: tuple[str, Any, Any]) -> None:
 
 def test_the_charts_place_is_inside_its_patches() -> None:
     """Two projector pixels from their edges, which print and camera blur; a pixel is 3.75 texels from texel 16 on."""
-    from mitsim.devices.chart import load_chart
+    from mitsim.devices.framelist import load_chart
 
     for box, (row, column) in zip(load_chart("colour_checker").patches, generate.chart_patches(), strict=True):
         for first, end, start in ((*box[:2], row), (*box[2:], column)):

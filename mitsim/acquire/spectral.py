@@ -9,7 +9,7 @@ With w_pl the electrons that a pixel of plane p of the 2 x 2 filters makes of a 
 are e_p = t A sum_l w_pl E_l lambda_l / (h c). They equal those of a pixel without filter, one electron per photon, in
 an irradiance sum_l w_pl E_l lambda_l / lambda at the projector's effective wavelength lambda. Frames of that irradiance
 pass the sensor like any other. Lamps have wavelengths of their own, which each colour of filters counts by itself
-(:mod:`mitsim.devices.lamps`): a count c is an irradiance c / lambda.
+(:mod:`mitsim.devices.projector`): a count c is an irradiance c / lambda.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.manifests import MOSAIC, MOST_LINES, ColourManifest, Line, MosaicManifest, spectral_of
 from mitsim.core.seeds import integer
-from mitsim.devices.lamps import SPECTRA_NM, Band, CountedLamps, Response, line_units
 from mitsim.devices.patterns import Lighting, PatternFamily
-from mitsim.devices.projector import Lines, Spectrum
+from mitsim.devices.projector import SPECTRA_NM, Band, CountedLamps, Lines, Response, Spectrum, line_units
 from mitsim.light.light import SampledLight, Sampling
 from mitsim.light.memory import frame_seconds, frames_cost
 from mitsim.light.plan import Plan

@@ -33,10 +33,9 @@ if TYPE_CHECKING:
 
     from mitsim.core.manifests import Parallax
     from mitsim.devices.camera import CameraGeometry, Devices
-    from mitsim.devices.lamps import CountedLamps
     from mitsim.devices.mask_profile import MaskProfile
     from mitsim.devices.patterns import PatternFamily
-    from mitsim.devices.projector import Lines, ProjectorModel, Spectrum
+    from mitsim.devices.projector import CountedLamps, Lines, ProjectorModel, Spectrum
     from mitsim.devices.sensor import SensorModel
     from mitsim.optics.mirror_frames import SpecularLight
     from mitsim.scene.load import LoadedScene

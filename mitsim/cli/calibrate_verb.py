@@ -257,7 +257,7 @@ def _calibrate_frames(folder: Path, asked: Calibrating) -> int:
 def _calibrate_known(listed: Path, asked: Calibrating) -> int:
     from mitsim.core.files import check_output
     from mitsim.core.job import memory_from_here, memory_since
-    from mitsim.devices.knownlist import load_known
+    from mitsim.devices.framelist import load_known
 
     captures, output, aged = load_known(listed), asked.folder, asked.aged  # refused before the fit is imported
     check_output(output)

@@ -97,7 +97,7 @@ def reconstruct(
             if asked.focus is not None or asked.margin:
                 check_parallax(manifest.parallax, str(inputs.calibration / name))
     if inputs.chart is not None:
-        from mitsim.devices.chart import load_chart
+        from mitsim.devices.framelist import load_chart
 
         chart = load_chart(inputs.chart)
     # An image of the same inputs may be replaced, and which inputs a folder has is looked into later.

@@ -1,34 +1,82 @@
-"""What the frames of a real calibration session show: a folder with its list in; which file shows what, checked, out.
+"""Lists that a person writes about files of a real camera: its session, flat frames, known pictures, a chart.
 
-The list is `session.toml` or `session.json`. Without a list of frames in it the folder's frames count in the order of
-their names.
+A list of frames is `session.toml` or `session.json` in their folder; a session's list need not name its frames, which
+then count in the order of their names. A list of known pictures is a file of any name, and its paths begin in its own
+folder. Nothing here opens a frame or imports numpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, FailFast, Field, model_validator
+from pydantic import BeforeValidator, FailFast, Field, field_validator, model_validator
 
-from mitsim.core.configuration import Configuration, Positive, Table, read_table, validate
+from mitsim.core.configuration import Configuration, Positive, Table, locate, read_table, validate
 from mitsim.core.errors import MitsimError, cut, near_name
+from mitsim.core.files import check_plain, read_json
 from mitsim.core.imagelist import ALL, PLANES, Preparation, Raw, Wanted, image_files
-from mitsim.core.manifests import MOST_PIXELS, MOST_SHOTS, Digital, FileName, Parallax, Plain
+from mitsim.core.manifests import (
+    MOSAIC,
+    MOST_PIXELS,
+    MOST_SHOTS,
+    RUN,
+    ColourManifest,
+    Digital,
+    FileName,
+    Parallax,
+    Plain,
+    RunManifest,
+    open_lines,
+    read_manifest,
+)
 from mitsim.devices.patterns import stripe_count
+from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import MOST_REPEATS, MOST_RUNGS, UNIFORM, Exposures, Half, Merge, Side, halves_in_order
 
 if TYPE_CHECKING:  # numpy takes 0.1 s to import, and a refusal needs none of it
+    from mitsim.core.arrays import FloatArray
     from mitsim.core.images import Numbers
     from mitsim.core.prepare import Preparer
 
 LISTS = ("session.toml", "session.json")
-"""Names of the list."""
+"""Names of a list of frames."""
 DARK = "dark"
-"""What names of dark frames begin with, where no list names them."""
+"""Beginning of the names of dark frames where no list names them."""
+
+
+def read_list(folder: Path, fields: str) -> tuple[Path, Table]:
+    """Return path and contents of the list in a ``folder``; refuse none or two, naming the needed ``fields``."""
+    lists = [folder / name for name in LISTS if (folder / name).is_file()]
+    if len(lists) != 1:
+        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
+        names = (" and " if lists else " nor ").join(LISTS)
+        raise _refusal(folder, f"{found} {names}; give one, with {fields}")
+    return lists[0], read_table(lists[0], "frames")
+
+
+def _refusal(folder: Path, text: str) -> MitsimError:
+    return MitsimError(f"frames {folder}: {text}")
+
+
+def _check_files(folder: Path, names: Iterable[str]) -> None:
+    """Refuse a name that is listed twice, or that no file in the ``folder`` has."""
+    seen = set[str]()
+    for name in names:
+        if name in seen:
+            raise _refusal(folder, f"{name} is listed twice; give each frame its own file")
+        seen.add(name)
+        if not (folder / name).is_file():
+            near = near_name(name, [path.name for path in folder.iterdir()])
+            raise _refusal(folder, f"{name} is listed, but no file of that name is there; {near}copy it there")
+
+
+# -------- A calibration session
+
 Key = tuple[Side, int, int, int, int]
 """Side, number of the pattern, sign, number of the exposure and repeat of a frame."""
 
@@ -68,7 +116,7 @@ def _with_name(camera: Any) -> Any:
 
 
 Identity = Annotated[Plain, BeforeValidator(_with_name)]
-"""Of a camera: a name, or anything as a run's manifest has it."""
+"""A camera: a name, or anything as a run's manifest has it."""
 
 
 class FrameList(Configuration):
@@ -114,20 +162,18 @@ class FrameList(Configuration):
 
 @dataclass(frozen=True, eq=False)
 class SessionFrames:
-    """A real session's frames, every one of them there once.
+    """A real session's frames, each of which is in the folder once.
 
     Attributes
     ----------
-    folder
-        that holds them.
-    listed
-        what its list says.
+    folder, listed
+        Folder of the frames, and its list.
     shots
-        frame by side, number of the pattern, sign and repeat.
+        Frame by side, number of the pattern, sign, exposure and repeat.
     dark
-        frames with the projector off.
+        Frames with the projector off.
     preparer
-        makes frames of the files' numbers; None: nothing is done to them.
+        Makes frames of the files' numbers; None if nothing is done to them.
     """
 
     folder: Path
@@ -138,16 +184,16 @@ class SessionFrames:
 
     @property
     def wanted(self) -> Wanted:
-        """How its frames are read."""
+        """Return how the frames are read."""
         return Wanted.of(self.listed.raw, self.listed.prepare)
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """Planes of a mosaic that its frames are of, where each is calibrated; "" alone where they are of one."""
+        """Return the planes of a mosaic that are calibrated one by one; "" alone if the frames are of one plane."""
         return PLANES if self.listed.prepare.channel == ALL else ("",)
 
     def of_plane(self, name: str) -> SessionFrames:
-        """The same of the one of the :attr:`planes` called ``name``, which its camera's identity then has."""
+        """Return the session of the one of the :attr:`planes` called ``name``, which the camera's identity then has."""
         if not name:
             return self
         prepare = self.listed.prepare.model_copy(update={"channel": name})
@@ -155,19 +201,21 @@ class SessionFrames:
         return replace(self, listed=self.listed.model_copy(update={"prepare": prepare, "camera": camera}))
 
     def with_preparer(self) -> SessionFrames:
-        """The same with what makes frames of the files' numbers, and the end of its scale; MitsimError for dark and
-        flat frames that cannot be read, and where the list is of all planes."""
+        """Return the session with its preparer, which reads the dark and flat frames, and with the end of its scale.
+
+        Raises MitsimError for frames that cannot be read, and for a list of all planes.
+        """
         if self.preparer is not None or self.listed.prepare == Preparation():
             return self
         from mitsim.core.prepare import Preparer
 
         if self.listed.prepare.channel == ALL:
-            raise MitsimError(f"frames {self.folder}: prepare.channel all is of every plane; take one, by `of_plane`")
+            raise _refusal(self.folder, "prepare.channel all is of every plane; take one, by `of_plane`")
         preparer = Preparer.of(self.listed.prepare, self.listed.digital, self.wanted, self.folder)
         return replace(self, listed=self.listed.model_copy(update={"digital": preparer.digital}), preparer=preparer)
 
     def read(self, name: str) -> Numbers:
-        """The frame in the file called ``name``, (rows, columns)."""
+        """Return the (rows, columns) frame in the file called ``name``."""
         from mitsim.core.images import read_image
 
         values = read_image(self.folder / name, self.wanted)
@@ -175,169 +223,132 @@ class SessionFrames:
 
     @property
     def pairs(self) -> bool:
-        """Whether a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
+        """Return True if a +-1 pattern is the difference of two frames, and not taken from one and a uniform one."""
         return self.listed.signed_capture == "pair"
 
     def repeats_of(self, half: Half, exposure: int = 0) -> tuple[StripeFile, ...]:
-        """All repeats of one ``half`` of a pattern, at one ``exposure`` of the ladder."""
+        """Return all repeats of one ``half`` of a pattern at one ``exposure`` of the ladder."""
         return tuple(self.shots[(*half, exposure, repeat)] for repeat in range(self.listed.repeats))
 
     @cached_property
     def files(self) -> tuple[str, ...]:
-        """Names of all frames, dark ones last."""
+        """Return the names of all frames, dark ones last."""
         return (*(shot.file for shot in self.shots.values()), *(frame.file for frame in self.dark))
 
     @cached_property
     def order(self) -> list[Half]:
-        """What the frames show, as they were taken: in the order of the list."""
+        """Return the halves of patterns in the order in which they were taken, which is that of the list."""
         keys = [(f.side, f.index, f.sign) for f in self.listed.frames or self.shots.values()]
         return list(dict.fromkeys(keys))
 
     def frame_name(self, half: Half) -> str:
-        """Names of the files that show a ``half`` of a pattern, and which it is."""
+        """Return the names of the files that show a ``half`` of a pattern, and which half it is."""
         files = [shot.file for key, shot in self.shots.items() if key[:3] == half]
-        side, index, sign, *_ = half
         more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        return f"{files[0]}{more} ({_words((side, index, sign, 0, 0))})"
+        return f"{files[0]}{more} ({_words((*half, 0, 0))})"
 
     def exposure_s(self, frame: StripeFile | DarkFile) -> float:
-        """Exposure of a ``frame`` [s]."""
+        """Return the exposure of a ``frame`` [s]."""
         return frame.exposure_s or self.listed.digital.exposure_s * self.listed.exposure_ladder[frame.exposure]
 
 
-def read_list(folder: Path, fields: str) -> tuple[Path, Table]:
-    """The list in a ``folder``, and what it says; MitsimError, which names its ``fields``, unless there is one."""
-    lists = [folder / name for name in LISTS if (folder / name).is_file()]
-    if len(lists) != 1:
-        found = "holds both" if lists else "holds neither" if folder.is_dir() else "no such folder, nor"
-        names = (" and " if lists else " nor ").join(LISTS)
-        raise MitsimError(f"frames {folder}: {found} {names}; give one, with {fields}")
-    return lists[0], read_table(lists[0], "frames")
-
-
 def load_frames(folder: Path | str) -> SessionFrames:
-    """Which file of the ``folder`` shows what.
+    """Return which file of the ``folder`` shows what.
 
-    MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or there twice.
+    Raises MitsimError for a folder without a list, a list that breaks a rule, and for frames that are missing or there
+    twice.
     """
     folder = Path(folder)
     place, data = read_list(folder, "camera, n, signed_capture and digital")
     listed = validate(FrameList, data, f"frames {place}")
-    wanted = [*_keys_of_session(listed)]
-    if listed.frames:
-        frames, dark = listed.frames, listed.dark
-    else:
+    rungs, repeats = len(listed.exposure_ladder), listed.repeats
+    wanted: list[Key] = [
+        (*half, exposure, repeat)
+        for half in halves_in_order(stripe_count(listed.n), listed.signed_capture == "pair")
+        for exposure in range(rungs)
+        for repeat in range(repeats)
+    ]
+    frames, dark = listed.frames, listed.dark
+    if not frames:
         names = [path.name for path in image_files(folder, Wanted(raw=listed.raw))]
-        dark = listed.dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
+        dark = dark or tuple(DarkFile(file=name) for name in names if name.startswith(DARK))
         names = [name for name in names if name not in {frame.file for frame in dark}]
         if len(names) != len(wanted):
-            raise MitsimError(
-                f"frames {folder}: holds {len(names)} frames, and n {listed.n}, signed_capture "
-                f"{listed.signed_capture!r}{_times(listed)} are {len(wanted)}, from {wanted[0][0]} to {wanted[-1][0]}; "
-                f"take the others, or name each in {place.name}{_not_counted(folder, names)}"
+            times = (f", repeats {repeats}" if repeats > 1 else "") + (f", {rungs} exposures" if rungs > 1 else "")
+            files = (path.name for path in folder.iterdir() if path.is_file())
+            others = [cut(name) for name in sorted({*files} - {*names, *LISTS})]
+            listing = ", ".join([*others[:3], "..."] if len(others) > 3 else others)
+            raise _refusal(
+                folder,
+                f"holds {len(names)} frames, and n {listed.n}, signed_capture {listed.signed_capture!r}{times} are "
+                f"{len(wanted)}, from {wanted[0][0]} to {wanted[-1][0]}; take the others, or name each in {place.name}"
+                + (f" (not counted: {listing})" if others else ""),
             )
         frames = tuple(
             StripeFile(file=name, side=side, index=index, sign=sign, exposure=exposure, repeat=repeat)
             for name, (side, index, sign, exposure, repeat) in zip(names, wanted, strict=True)
         )
-    shots = _each_once(folder, frames, wanted)
-    session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
-    _check_files(session)
-    return session
-
-
-def _not_counted(folder: Path, names: Sequence[str]) -> str:
-    """Which files of the ``folder`` are none of the frames called ``names``, in words: nothing where all are."""
-    known = {*names, *LISTS}
-    others = sorted(path.name for path in folder.iterdir() if path.is_file() and path.name not in known)
-    return f" (not counted: {', '.join(map(cut, others[:3]))}{', ...' if others[3:] else ''})" if others else ""
-
-
-def _keys_of_session(listed: FrameList) -> Iterator[Key]:
-    """Frames of a session in the order in which they are listed."""
-    for half in halves_in_order(stripe_count(listed.n), listed.signed_capture == "pair"):
-        for exposure in range(len(listed.exposure_ladder)):
-            for repeat in range(listed.repeats):
-                yield *half, exposure, repeat
-
-
-def _times(listed: FrameList) -> str:
-    times = f", repeats {listed.repeats}" if listed.repeats > 1 else ""
-    return times + (f", {len(listed.exposure_ladder)} exposures" if len(listed.exposure_ladder) > 1 else "")
-
-
-def _each_once(folder: Path, frames: Sequence[StripeFile], wanted: Sequence[Key]) -> dict[Key, StripeFile]:
-    """Frames by what they show; MitsimError for one that is wanted and missing, there twice, or not wanted."""
     shots: dict[Key, StripeFile] = {}
     known = set(wanted)
     for frame in frames:
         key = frame.side, frame.index, frame.sign, frame.exposure, frame.repeat
         if key not in known:
-            raise MitsimError(
-                f"frames {folder}: {frame.file} is {_words(key)}, which no such session has; it has "
-                f"{_words(wanted[0])} to {_words(wanted[-1])}; correct n, signed_capture or the frame's entry"
+            raise _refusal(
+                folder,
+                f"{frame.file} is {_words(key)}, which no such session has; it has {_words(wanted[0])} to "
+                f"{_words(wanted[-1])}; correct n, signed_capture or the frame's entry",
             )
         if key in shots:
-            raise MitsimError(
-                f"frames {folder}: {_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out"
-            )
+            raise _refusal(folder, f"{_words(key)} is there twice, {shots[key].file} and {frame.file}; leave one out")
         shots[key] = frame
-    missing = [key for key in wanted if key not in shots]
-    if missing:
-        raise MitsimError(
-            f"frames {folder}: {len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}; take "
-            "them, and name them in the list"
+    if missing := [key for key in wanted if key not in shots]:
+        raise _refusal(
+            folder,
+            f"{len(missing)} of {len(wanted)} frames are missing, first {_words(missing[0])}; take them, and name them "
+            "in the list",
         )
-    return shots
+    session = SessionFrames(folder, listed, {key: shots[key] for key in wanted}, dark)
+    _check_files(folder, session.files)
+    _check_exposures(session)
+    return session
 
 
-def _check_files(session: SessionFrames) -> None:
-    """Every file is in the folder, and shows one thing; halves of a pair are exposed alike, dark frames as the others;
-    MitsimError otherwise."""
-    folder, seen = session.folder, set[str]()
-    for name in session.files:
-        if name in seen:
-            raise MitsimError(f"frames {folder}: {name} is listed twice; give each frame its own file")
-        seen.add(name)
-        if not (folder / name).is_file():
-            near = near_name(name, [path.name for path in folder.iterdir()])
-            raise MitsimError(
-                f"frames {folder}: {name} is listed, but no file of that name is there; {near}copy it there"
-            )
-    exposures = {session.exposure_s(shot) for shot in session.shots.values()}
-    _check_ladder(session)
-    for (side, index, sign, exposure, repeat), shot in session.shots.items():
-        other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
-        if session.exposure_s(shot) != session.exposure_s(other):
-            raise MitsimError(
-                f"frames {folder}: {shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one "
-                f"pattern, exposed for {session.exposure_s(shot):g} and {session.exposure_s(other):g} s; expose them "
-                "alike"
-            )
-    if session.pairs:
-        return
-    if session.dark and (without := exposures - {session.exposure_s(frame) for frame in session.dark}):
-        raise MitsimError(
-            f"frames {folder}: no dark frame is exposed for {min(without):g} s, as other frames are; take one for each "
-            "exposure, or none"
-        )
+def _check_exposures(session: SessionFrames) -> None:
+    """Refuse halves of a pair or repeats that are exposed unlike, and dark frames that no other frame is exposed as.
 
-
-def _check_ladder(session: SessionFrames) -> None:
-    """Frames of several exposures state their numbers, and no seconds; MitsimError otherwise."""
-    rungs = len(session.listed.exposure_ladder)
+    Frames of several exposures state their numbers, and no seconds.
+    """
+    folder, rungs = session.folder, len(session.listed.exposure_ladder)
     frames: tuple[StripeFile | DarkFile, ...] = (*session.shots.values(), *session.dark)
     for frame in frames:
         if frame.exposure >= rungs:
-            raise MitsimError(
-                f"frames {session.folder}: {frame.file} is of exposure {frame.exposure}, but exposure_ladder has "
-                f"{rungs}; give 0 to {rungs - 1}"
+            raise _refusal(
+                folder,
+                f"{frame.file} is of exposure {frame.exposure}, but exposure_ladder has {rungs}; give 0 to {rungs - 1}",
             )
         if rungs > 1 and frame.exposure_s is not None:
-            raise MitsimError(
-                f"frames {session.folder}: {frame.file} states exposure_s, and exposure_ladder as well; leave it out, "
-                "and give the number `exposure`"
+            raise _refusal(
+                folder,
+                f"{frame.file} states exposure_s, and exposure_ladder as well; leave it out, and give the number "
+                "`exposure`",
             )
+    for (side, index, sign, exposure, repeat), shot in session.shots.items():
+        other = session.shots[side, index, sign if repeat or not session.pairs else -sign, exposure, 0]
+        seconds, others = session.exposure_s(shot), session.exposure_s(other)
+        if seconds != others:
+            raise _refusal(
+                folder,
+                f"{shot.file} and {other.file} are {'repeats' if repeat else 'halves'} of one pattern, exposed for "
+                f"{seconds:g} and {others:g} s; expose them alike",
+            )
+    exposures = {session.exposure_s(shot) for shot in session.shots.values()}
+    without = exposures - {session.exposure_s(frame) for frame in session.dark}
+    if session.dark and without and not session.pairs:
+        raise _refusal(
+            folder,
+            f"no dark frame is exposed for {min(without):g} s, as other frames are; take one for each exposure, or "
+            "none",
+        )
 
 
 def _words(key: Key) -> str:
@@ -345,3 +356,307 @@ def _words(key: Key) -> str:
     words = f"the uniform frame of {side} stripes" if sign == UNIFORM else f"{side} stripes {index} of sign {sign:+d}"
     words += f", exposure {exposure}" if exposure else ""
     return f"{words}, repeat {repeat}" if repeat else words
+
+
+# -------- Frames that characterise a camera
+
+_MOST_SETS, _MOST_FRAMES = 4096, 10_000
+"""Largest numbers of sets in a list, and of frames in a set: ten times what EMVA 1288's longest procedures take."""
+
+
+def capacity_of(sensor: SensorModel) -> float:
+    """Return the electrons that saturate a pixel: its full well, or the ADC's end; MitsimError without either."""
+    full = sensor.superpixel_full_well_e
+    if sensor.largest_dn is not None:
+        full = min(full, (sensor.largest_dn - sensor.superpixel_black_level_dn) / sensor.gain_dn_per_e)
+    if not math.isfinite(full):
+        raise MitsimError(
+            f"camera {sensor.name!r}: has neither a full well nor an ADC, so no light saturates it; "
+            "give full_well_e or bits"
+        )
+    return full
+
+
+class DarkSet(Configuration):
+    """Frames that were taken alike, without light."""
+
+    files: Annotated[tuple[FileName, ...], FailFast()] = Field(strict=False, max_length=_MOST_FRAMES)
+    """Names of the frames in the folder, without a path: two, or more."""
+    exposure_s: Positive
+    """Exposure of each [s]."""
+
+
+class LitSet(DarkSet):
+    """Frames that were taken alike, under even light."""
+
+    light: Positive = 1.0
+    """Power of the lamp, over that which `photons_per_s` states."""
+
+
+class FlatList(Configuration):
+    """What a camera's frames are of, and how they are read."""
+
+    name: str = Field(min_length=1, max_length=200)
+    """What the camera is called."""
+    pixel_pitch_um: float = Field(ge=1e-3, le=1e4)
+    """Distance between centres of the frames' pixels, um."""
+    bits: int | None = Field(default=None, ge=1, le=24)
+    """Bits of a number; none: real numbers."""
+    photons_per_s: Positive | None = None
+    """Photons that fall on a pixel in a second under a `light` of 1; none: not known, and no quantum efficiency."""
+    source: str = Field(default="measured by mitsim characterise", max_length=1000)
+    """Which specimen, gain setting and temperature: goes into the camera's file."""
+    raw: Raw | None = None
+    """How frames without a header are read; none: there are none."""
+    lit: Annotated[tuple[LitSet, ...], FailFast()] = Field(strict=False, max_length=_MOST_SETS)
+    """Sets under even light."""
+    dark: Annotated[tuple[DarkSet, ...], FailFast()] = Field(strict=False, max_length=_MOST_SETS)
+    """Sets in the dark, one for each exposure under light."""
+
+
+@dataclass(frozen=True)
+class FlatFrames:
+    """The ``folder`` of a camera's frames, all of which are there, and its list."""
+
+    folder: Path
+    listed: FlatList
+
+    @property
+    def wanted(self) -> Wanted:
+        """Return how the frames are read."""
+        return Wanted(raw=self.listed.raw)
+
+    @property
+    def sets(self) -> tuple[DarkSet, ...]:
+        """Return all sets, lit ones first."""
+        return (*self.listed.lit, *self.listed.dark)
+
+
+def load_flats(folder: Path | str) -> FlatFrames:
+    """Return which file of the ``folder`` shows what.
+
+    Raises MitsimError for a folder without a list, a list that breaks a rule, frames that are missing or without a
+    partner, and for an exposure under light without one in the dark.
+    """
+    folder = Path(folder)
+    place, data = read_list(folder, "name, pixel_pitch_um, bits, and sets lit and dark of files and exposure_s")
+    flats = FlatFrames(folder, validate(FlatList, data, f"frames {place}"))
+    for kind, sets in (("lit", flats.listed.lit), ("dark", flats.listed.dark)):
+        if not sets:
+            raise _refusal(folder, f"no set is {kind}; give pairs of frames under even light, and in the dark")
+        for number, each in enumerate(sets):
+            if len(each.files) < 2:
+                held = each.files[0] if each.files else "no frame"
+                raise _refusal(
+                    folder,
+                    f"{kind}.{number} holds {held} alone, of {each.exposure_s:g} s, and one frame tells no noise; add "
+                    "its partner, taken alike",
+                )
+    _check_files(folder, (name for each in flats.sets for name in each.files))
+    exposures = {each.exposure_s for each in flats.listed.dark}
+    for number, each in enumerate(flats.listed.lit):
+        if each.exposure_s not in exposures:
+            raise _refusal(
+                folder,
+                f"lit.{number} ({each.files[0]}) is exposed for {each.exposure_s:g} s, and no dark set is; add a dark "
+                "pair of that exposure",
+            )
+    return flats
+
+
+# -------- Captures of known pictures that a camera is calibrated by
+
+MOST_CAPTURES = 4096
+"""Largest number of captures in a list: more than a day of taking them."""
+MOST_TERMS = 4
+"""Most codes of a side: a normal matrix of that many times their numbers is inverted."""
+Colour = Literal["red", "green", "blue"]
+Orientation = Literal["upright", "mirrored", "upside down", "turned"]
+"""How a picture lies as the camera's code runs; turned is both others."""
+Scale = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
+_PLACING = "mosaic", "orientation", "turn_deg", "turn_about", "crop"
+"""Parts of a preparation that move pixels: frames of two such are of two cameras."""
+
+
+class KnownCapture(Configuration):
+    """One capture of a known picture."""
+
+    run: Annotated[str, Field(min_length=1)]
+    """RUN folder, or coloured folder of one, a path from the list's folder."""
+    picture: Annotated[str, Field(min_length=1)]
+    """File of what was before the camera, of as many pixels as the run's patterns: PNG, TIFF, NPY or OpenEXR, a path
+    from the list's folder."""
+    colour: Colour | None = None
+    """Plane of a colour picture that this run shows; none: the picture is grey, or the run has planes of its own."""
+
+
+class KnownList(Configuration):
+    """Captures of known pictures, and what is known of their camera."""
+
+    centre: bool = False
+    """Frames lose row and column means (FlatCam masks)."""
+    gamma: Annotated[float, Field(ge=0.1, le=10, allow_inf_nan=False)] = 1.0
+    """Power of a picture's numbers that its light goes with; 2.2 of most screens, 1 of images by a calibration."""
+    orientation: Orientation | None = None
+    """How pictures lie as the camera sees them; none: it is found."""
+    scale: Annotated[tuple[Scale, Scale], Field(strict=False)] | None = None
+    """Sensor pixels that a scene pixel shifts the mask's shadow by, of rows and columns; none: they are found."""
+    terms: int | None = Field(default=None, ge=1, le=MOST_TERMS)
+    """Codes of a side: 1, all directions are alike; more, the code changes smoothly over the scene; none: by frames
+    that are held out."""
+    board_reflectance: float | None = Field(default=None, gt=0, le=1)
+    """Reflectance that counts as 1 in pictures and images; none: unknown."""
+    known: Annotated[tuple[KnownCapture, ...], FailFast()] = Field(strict=False, min_length=1, max_length=MOST_CAPTURES)
+    """The captures."""
+
+    @model_validator(mode="after")
+    def _each_once(self) -> KnownList:
+        runs = [(each.run, each.colour) for each in self.known]
+        twice = next((run for run in runs if runs.count(run) > 1), None)
+        if twice is not None:
+            raise ValueError(f"known: the run {twice[0]!r} is there twice; name each once")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCaptures:
+    """A list whose runs and pictures are there.
+
+    Attributes
+    ----------
+    path, listed
+        Path and contents of the list.
+    lines
+        Planes that every run has, in folders of their own; None if each is a single RUN folder.
+    manifests
+        Manifests of the first run by the names of its lines; "" where there are none.
+    """
+
+    path: Path
+    listed: KnownList
+    lines: ColourManifest | None
+    manifests: dict[str, RunManifest]
+
+    def run(self, capture: KnownCapture, line: str = "") -> Path:
+        """Return the RUN folder of a ``capture``, or of a ``line`` of it."""
+        return self.path.parent / capture.run / line
+
+    def picture(self, capture: KnownCapture) -> Path:
+        """Return the file of a ``capture``'s picture."""
+        return self.path.parent / capture.picture
+
+
+def load_known(path: Path | str) -> KnownCaptures:
+    """Return the list in the file ``path``, TOML or JSON.
+
+    Raises MitsimError for a list that breaks a rule, and for runs or pictures that are missing, unfinished, of several
+    cameras, or of other lines than the first.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise MitsimError(f"list {path}: is a folder; give the TOML or JSON file in it that names runs and pictures")
+    listed = validate(KnownList, read_table(path, "list"), f"list {path}")
+    found = KnownCaptures(path, listed, None, {})
+    for number, capture in enumerate(listed.known):
+        folder = found.run(capture)
+        lines = open_lines(folder, RUN, MOSAIC)
+        if lines.filters:
+            raise MitsimError(
+                f"{folder}: is behind colour filters, all in one frame; import its planes, or calibrate --colour mosaic"
+            )
+        manifests = {name: read_manifest(part, RunManifest) for name, part in lines.parts.items()}
+        check_plain(found.picture(capture), "picture")
+        if capture.colour is not None and lines.colours is not None:
+            raise MitsimError(
+                f"list {path}: {capture.run} has planes of its own, so its colour is known; leave colour "
+                f"{capture.colour!r} out"
+            )
+        if number == 0:
+            found = KnownCaptures(path, listed, lines.colours, manifests)
+        if unlike := _difference(manifests, found.manifests, capture.run, listed.known[0].run, path):
+            raise MitsimError(f"list {path}: {unlike}")
+    return found
+
+
+def preparation_of(manifest: RunManifest, place: Path | str) -> Preparation:
+    """Return what an import did to files before they were the frames of a ``manifest`` at a ``place``.
+
+    Other runs have an empty preparation. MitsimError where the manifest states what no import does.
+    """
+    return validate(Preparation, manifest.configuration.get("prepare") or {}, f"{place}: a run's configuration.prepare")
+
+
+def _difference(
+    manifests: dict[str, RunManifest], known: dict[str, RunManifest], run: str, first: str, path: Path
+) -> str:
+    """Return how a ``run`` differs from the ``first``, whose manifests are ``known``: in lines, camera, or pixels."""
+    if [*manifests] != [*known]:
+        names = [", ".join(name for name in each if name) or "no" for each in (manifests, known)]
+        return f"{run} has {names[0]} planes, but {first} has {names[1]}; give runs of one kind"
+    for name, manifest in manifests.items():
+        ours = known[name]
+        if manifest.camera != ours.camera:
+            return f"{run} is of another camera than {first}; calibrate each by its own"
+        how, first_how = (preparation_of(each, path) for each in (manifest, ours))
+        unlike = next((field for field in _PLACING if getattr(how, field) != getattr(first_how, field)), None)
+        if unlike is not None:
+            return (
+                f"{run} was imported with another {unlike} than {first}, so its pixels see other parts of the mask; "
+                "import both alike"
+            )
+        sides, own = ([len(rows) for rows in (each.patterns.P_L, each.patterns.P_R)] for each in (manifest, ours))
+        if sides != own:
+            return (
+                f"{run} has {sides[0]} x {sides[1]} scene pixels, but {first} {own[0]} x {own[1]}; give runs of one "
+                "size"
+            )
+    return ""
+
+
+# -------- Places of a colour chart's patches in an image
+
+PATCHES = 24
+"""Patches of a ColorChecker."""
+Edge = Annotated[int, Field(ge=0, le=1 << 14)]
+Box = Annotated[tuple[Edge, ...], Field(strict=False, min_length=4, max_length=4)]
+"""First row, row after the last, first column, column after the last [projector pixels]."""
+
+
+class ChartPlace(Configuration):
+    """The patches of a chart in an image."""
+
+    spectra: Literal["ColorChecker N Ohta"]
+    """Measured spectra of the patches, in colour-science."""
+    patches: Annotated[tuple[Box, ...], Field(strict=False, min_length=PATCHES, max_length=PATCHES)]
+    """For each patch, row by row: [first row, end, first column, end] inside it [image pixels]."""
+
+    @field_validator("patches")
+    @classmethod
+    def _not_empty(cls, patches: tuple[Box, ...]) -> tuple[Box, ...]:
+        for number, (top, bottom, left, right) in enumerate(patches):
+            if not (top < bottom and left < right):
+                raise ValueError(f"patch {number} is [{top}, {bottom}, {left}, {right}]; ends must lie beyond firsts")
+        return patches
+
+    def means(self, image: FloatArray) -> FloatArray:
+        """Return the (24, ...) means over the patches of an ``image``; MitsimError where one lies outside."""
+        import numpy as np
+
+        return np.array([block.mean(axis=(0, 1)) for block in self.blocks(image)])
+
+    def blocks(self, image: FloatArray) -> list[FloatArray]:
+        """Return the pixels (rows, columns, ...) of each patch in an ``image``; MitsimError where one lies outside."""
+        rows, columns = image.shape[:2]
+        outside = next((box for box in self.patches if box[1] > rows or box[3] > columns), None)
+        if outside is not None:
+            raise MitsimError(
+                f"chart: a patch is {list(outside)}, but the image has {rows} x {columns} pixels; give the chart's "
+                "place in this image"
+            )
+        return [image[top:bottom, left:right] for top, bottom, left, right in self.patches]
+
+
+def load_chart(name: Path | str) -> ChartPlace:
+    """Return the chart ``name``: a shipped scene that shows one, or a JSON file. MitsimError when it cannot be read."""
+    path = locate(name, "scenes", "chart.json")
+    return validate(ChartPlace, read_json(path), f"file {path}")

@@ -29,7 +29,7 @@ from mitsim.core.files import output_folder
 from mitsim.core.job import Job
 from mitsim.core.manifests import CALIBRATION, RUN, CalibrationManifest, FactorNoise, open_lines, write_colours
 from mitsim.core.parallel import single_threaded_blas
-from mitsim.devices.knownlist import MOST_TERMS, KnownCaptures, load_known
+from mitsim.devices.framelist import MOST_TERMS, KnownCaptures, load_known
 from mitsim.reconstruct.factors import (
     LARGEST_ERROR,
     SEPARABLE_RESIDUAL,

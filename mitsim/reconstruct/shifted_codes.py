@@ -39,7 +39,7 @@ from mitsim.core.job import Cost, Limits
 from mitsim.core.manifests import MANIFEST
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_run
-from mitsim.devices.knownlist import KnownCapture, KnownCaptures, preparation_of
+from mitsim.devices.framelist import KnownCapture, KnownCaptures, preparation_of
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solver import centre_columns, centre_frame
 

@@ -15,7 +15,7 @@ from mitsim.core.exr import checksum, write_frame
 from mitsim.core.files import remove_page, write_bytes
 from mitsim.core.images import card, png
 from mitsim.core.manifests import ColourManifest, write_colours
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.metrics import Quality, psnr, summary_of
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE

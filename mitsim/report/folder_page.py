@@ -33,7 +33,7 @@ from mitsim.core.manifests import (
     read_manifest,
 )
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.metrics import Quality, truth_for
 from mitsim.reconstruct.colour import chart, linear_srgb
 from mitsim.reconstruct.factors import load_calibration

@@ -39,7 +39,7 @@ from mitsim.core.manifests import (
 )
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_mosaic, load_run
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.mask_profile import load_psf
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.optics.terms import best_term

@@ -536,7 +536,7 @@ class _Steps:
             check_image(load_run(run), load_calibration(calibration), ImageRequest(**options))
         chart = None
         if "chart" in values:
-            from mitsim.devices.chart import load_chart
+            from mitsim.devices.framelist import load_chart
 
             if not coloured:
                 raise ArgumentError("chart", f"{values['chart']}: the frames are not coloured; leave it out")

@@ -22,7 +22,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.files import write_json, write_text
 from mitsim.core.job import Job
-from mitsim.devices.flatlist import FlatFrames, capacity_of
+from mitsim.devices.framelist import FlatFrames, capacity_of
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.pages import round_to_error, typeset, written_figure
 from mitsim.report.plots import BLACK, BLUE, COLUMN, FONT, GREY, ORANGE, TITLE_LETTERS, VERMILION, figure_of, label_axes
@@ -420,7 +420,7 @@ def characterise(
 def characterise_frames(
     listed: FlatFrames, output: Path | str | None = None, job: Job | None = None
 ) -> Characterisation:
-    """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.flatlist.load_flats`)."""
+    """Measure a real camera by its frames under even light and in the dark (`mitsim.devices.framelist.load_flats`)."""
     job, facts = job or Job(), listed.listed
     stated = Stated(facts.name, facts.pixel_pitch_um, facts.source, facts.bits, facts.photons_per_s is not None)
 

@@ -25,7 +25,7 @@ from mitsim.acquire.capture import expose
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.core.arrays import FloatArray
 from mitsim.core.images import lightness
-from mitsim.devices.chart import ChartPlace, load_chart
+from mitsim.devices.framelist import ChartPlace, load_chart
 from mitsim.metrics import psnr
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import Factors

@@ -44,7 +44,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import RUN
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.patterns import PatternFamily
 from mitsim.devices.sensor import SensorModel
 from mitsim.light.light import trace_lines

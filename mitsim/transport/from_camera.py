@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.manifests import MOST_LINES
-from mitsim.devices.lamps import SPECTRA_NM, Band, Response
+from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport.accumulator import DeviceAccumulator
 from mitsim.transport.connect import Connection, OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
 from mitsim.transport.integrator import (

@@ -13,8 +13,7 @@ import pytest
 
 from mitsim.acquire import spectral as counted_lamps
 from mitsim.core.seeds import integer
-from mitsim.devices.lamps import SPECTRA_NM, Response, line_units
-from mitsim.devices.projector import Lines
+from mitsim.devices.projector import SPECTRA_NM, Lines, Response, line_units
 from tests.invented import sensor
 
 LINES = Lines((638.0, 445.0), (0.5, 0.5))

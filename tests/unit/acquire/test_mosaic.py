@@ -19,9 +19,8 @@ from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.calibrate.lit_session import LitSession
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.devices.lamps import CountedLamps, Response
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.projector import Spectrum
+from mitsim.devices.projector import CountedLamps, Response, Spectrum
 from mitsim.devices.sensor import EfficiencyCurve, MosaicCurves
 from mitsim.devices.session import load_recipe
 from mitsim.light.grids import Grid

@@ -10,7 +10,7 @@ import pytest
 from mitsim.bench.apparatus import check_devices
 from mitsim.core.configuration import Configuration, Table, load_model, mistakes, read_table, read_toml, validate
 from mitsim.core.errors import MitsimError
-from mitsim.devices.knownlist import KnownList
+from mitsim.devices.framelist import KnownList
 
 
 class Part(Configuration):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response, line_units
-from mitsim.devices.projector import Lines, Spectrum
+from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Lines, Response, Spectrum, line_units
 from tests.invented import sensor
 
 FILTERS = {"G": (400.0, 700.0), "B": (390.0, 650.0), "R": (300.0, 900.0)}

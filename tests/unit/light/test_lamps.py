@@ -25,9 +25,8 @@ from mitsim.acquire.spectral import SpectralBench
 from mitsim.api.bench import open_bench
 from mitsim.bench.request import Request
 from mitsim.core.manifests import MOSAIC, RUN
-from mitsim.devices.lamps import SPECTRA_NM, CountedLamps, Response
 from mitsim.devices.patterns import Lighting
-from mitsim.devices.projector import Spectrum
+from mitsim.devices.projector import SPECTRA_NM, CountedLamps, Response, Spectrum
 from mitsim.light.grids import Grid
 from mitsim.light.plan import Plan
 from mitsim.light.settings import Settings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsim.core.configuration import load_model, locate
-from mitsim.devices.chart import ChartPlace
+from mitsim.devices.framelist import ChartPlace
 from mitsim.devices.patterns import parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.report.pages import Mean, Table

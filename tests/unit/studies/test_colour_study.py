@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsim.devices.chart import load_chart
+from mitsim.devices.framelist import load_chart
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 from mitsim.report.pages import Table
 from mitsim.studies import colour_study

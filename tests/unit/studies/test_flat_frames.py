@@ -14,7 +14,7 @@ import pytest
 from scipy.fft import dctn, idctn
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.flatlist import load_flats
+from mitsim.devices.framelist import load_flats
 from mitsim.devices.sensor import load_sensor
 from mitsim.studies.characterise import CAMERA_FILE, FIELDS, Characterisation, characterise_frames
 from tests.real_flats import CAMERAS, Light, camera, write_flats
