@@ -26,10 +26,10 @@ from skimage import data
 from skimage.transform import resize
 
 from mitsim.devices.camera import centred_edges
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PITCH, PIXELS, Bench, shadow
+from tests.shadow_factor import scene_factor
 
 FAMILIES = ("uniform", "dots:4", "dots:7", "hadamard:4", "random:4")
 FRACTIONS = (0.003, 0.008, 0.02, 0.05)

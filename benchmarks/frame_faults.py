@@ -40,10 +40,10 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import BLACK, CODES, DARK, GAIN, READ, Bench
+from tests.shadow_factor import scene_factor
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8", "uniform"
 PEAKS = 2e4, 4e3, 800.0

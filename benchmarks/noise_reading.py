@@ -26,10 +26,10 @@ from harness import arguments, show, write
 from solver import dots
 
 from mitsim.devices.camera import CameraGeometry, centred_edges
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared, prepare
 from mitsim.report import CONVENTIONS, EQUAL_PEAK, EQUAL_TOTAL
 from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, picture
+from tests.shadow_factor import scene_factor
 
 N, WIDTH_MM = 128, 120.0
 BANDS = {(2.0, 1): (21.0, 23.0), (2.0, 7): (34.0, 35.5), (0.75, 1): (16.9, 19.0), (0.75, 7): (30.0, 30.5)}

@@ -35,9 +35,9 @@ from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, UNIFORM, Half, halves_in_order
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.factors import Factors, estimate_factors, predicted_error
+from tests.shadow_factor import scene_factor
 
 NOISE = 2.3e-3
 """Relative error of both factors, in quadrature, that the shipped session leaves with the anchor camera."""

@@ -123,7 +123,7 @@ def closed() -> dict[str, float]:
     from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
     from mitsim.devices.sensor import load_sensor
     from mitsim.optics.shadow import Directions
-    from mitsim.optics.speckle import contrast_of
+    from mitsim.optics.frames import contrast_of
     from mitsim.optics.terms import shadow_terms
     from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 

@@ -35,8 +35,8 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.metrics import relative_error
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared, prepare
+from tests.shadow_factor import scene_factor
 
 Precision = Literal["float64", "float32 frames", "float32 products"]
 Timed = list[tuple[float, FloatArray]]

@@ -16,9 +16,9 @@ from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Status, Verdict
+from tests.shadow_factor import scene_factor
 
 N, PIXELS, PITCH = 16, 96, 0.02
 PEAK, READ, GAIN, BLACK, CODES, DARK = 2e4, 4.0, 0.2, 100.0, 2**13, 50.0

@@ -24,8 +24,7 @@ from mitsim.devices.sensor import SensorModel
 from mitsim.light.memory import frames_at_once
 from mitsim.light.settings import Estimate
 from mitsim.optics.forming import bound_of
-from mitsim.optics.frames import ExpectedFrames, Frame
-from mitsim.optics.speckle import add_speckle
+from mitsim.optics.frames import ExpectedFrames, Frame, add_speckle
 from mitsim.sensor.chain import Digital, dn_to_electrons, electrons_from_irradiance, expose, specimen
 from mitsim.sensor.moments import mean_variance, saturated_pixels
 

@@ -272,7 +272,7 @@ class Apparatus:
             return self.projector.speckle_contrast
         import numpy as np
 
-        from mitsim.optics.speckle import contrast_of
+        from mitsim.optics.frames import contrast_of
 
         key = None if family is None else (family.left.tobytes(), family.right.tobytes())
         if key not in self._contrasts:

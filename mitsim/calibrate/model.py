@@ -30,10 +30,9 @@ from mitsim.devices.framelist import SessionFrames, load_frames
 from mitsim.devices.patterns import Lighting, stripe_signs
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, UNITS, Model, Modelling, SessionRecipe, Side, frames_of, load_recipe
-from mitsim.optics.camera_model import ModelledCamera, Placement
 from mitsim.optics.frames import Frame
 from mitsim.optics.shadow import SeparableTerms
-from mitsim.optics.terms import best_term
+from mitsim.optics.terms import ModelledCamera, Placement, best_term
 from mitsim.reconstruct.captured_session import chosen_responses
 from mitsim.reconstruct.factors import SEPARABLE_RESIDUAL, Factors, decibels, squared_condition
 from mitsim.reconstruct.solution import Status, Verdict

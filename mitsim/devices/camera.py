@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -19,7 +19,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.devices.mask import CameraMask, Mask, mls_mask
+from mitsim.devices.mask import NO_FLAWS, CameraMask, Mask, MaskKind, mls_mask
 from mitsim.devices.plate import FEW, Plate, within
 from mitsim.devices.projector import ProjectorModel
 from mitsim.devices.sensor import SensorModel
@@ -123,40 +123,31 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
         return kind
 
     @model_validator(mode="after")
-    def _mask_lies_before_the_scene(self) -> CameraGeometry:
+    def _parts_fit_together(self) -> CameraGeometry:
         if self.mask_distance + self.mask_thickness >= self.scene_distance:
             raise ValueError(
                 f"mask_distance {self.mask_distance} mm plus mask_thickness {self.mask_thickness} mm must be less than "
                 f"scene_distance {self.scene_distance} mm"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _the_region_lies_on_the_sensor(self) -> CameraGeometry:
         if self.roi is not None:
-            ends = [first + size for first, size in zip(self.roi[:2], self.roi[2:], strict=True)]
-            if min(self.roi[:2]) < 0 or min(self.roi[2:]) < 1 or ends[0] > self.shape[0] or ends[1] > self.shape[1]:
+            row, column, rows, columns = self.roi
+            all_rows, all_columns = self.shape
+            inside = row + rows <= all_rows and column + columns <= all_columns
+            if min(row, column) < 0 or min(rows, columns) < 1 or not inside:
                 raise ValueError(
-                    f"roi {list(self.roi)}: {self.roi[2]} rows from {self.roi[0]} and {self.roi[3]} columns from "
-                    f"{self.roi[1]} are not on a sensor of {self.shape[0]} x {self.shape[1]} pixels"
+                    f"roi {list(self.roi)}: {rows} rows from {row} and {columns} columns from {column} are not on a "
+                    f"sensor of {all_rows} x {all_columns} pixels"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _its_frames_can_be_read(self) -> CameraGeometry:
         rows, columns = self.frame_shape
         if not fits_a_frame(self.frame_shape):
             raise ValueError(f"{rows} x {columns} pixels; {FRAME_LIMITS} are written and read, so read a part by roi")
-        return self
-
-    @model_validator(mode="after")
-    def _a_plate_is_there(self) -> CameraGeometry:
-        if (self.mask == "plate") != (self.mask_plate is not None):
+        plate = self.mask_plate
+        if (self.mask == "plate") != (plate is not None):
             raise ValueError("mask: got 'plate'; use separable, flatcam or open, or --camera with a table [mask]")
-        if self.mask_plate is not None and self.mask_thickness and not self.mask_plate.may_be_thick:
+        if plate is not None and self.mask_thickness and not (plate.crosses is not None and plate.flaws == NO_FLAWS):
             raise ValueError(
                 f"mask_thickness: got {self.mask_thickness:g} mm; a mask of more than {FEW} separable terms, or one "
-                f"that is blurred, dusty, turned or tilted ({self.mask_plate.words}), is thin, so set 0"
+                f"that is blurred, dusty, turned or tilted ({plate.words}), is thin, so set 0"
             )
         if self.pitches[0] != self.pitches[1] and self.is_drawn(waves=True):
             raise ValueError(
@@ -167,13 +158,12 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @classmethod
     def build(cls, where: str, **values: object) -> CameraGeometry:
-        """Build from loose ``values``; a bad one raises MitsimError with one line that begins with ``where``."""
+        """Return the geometry of loose ``values``; a bad one raises a MitsimError of one line from ``where`` on."""
         return validate(cls, values, where)
 
     @property
     def identity(self) -> dict[str, object]:
-        """What manifests say of it: all fields, but for those that calibrations of 0.4 do not know, where they are 0 or
-        none."""
+        """Return what manifests state: all fields but those that are unset and unknown to calibrations of 0.4."""
         known = {name: value for name, value in self if value or not name.startswith(_NOT_KNOWN_BEFORE)}
         if self.mask_motion is not None:
             known["mask_motion"] = self.mask_motion.model_dump()
@@ -181,204 +171,186 @@ class CameraGeometry(Configuration, arbitrary_types_allowed=True):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the whole sensor."""
+        """Return rows and columns of the whole sensor."""
         return self.rows or self.pixels, self.columns or self.pixels
 
     @property
     def pitches(self) -> tuple[float, float]:
-        """Distances between rows, and between columns [mm]."""
+        """Return the distances between rows, and between columns [mm]."""
         return self.row_pitch or self.pixel_pitch, self.pixel_pitch
 
     @property
     def frame_shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame: of the region of interest."""
+        """Return rows and columns of a frame, which are those of the region of interest."""
         return self.shape if self.roi is None else self.roi[2:]
 
     @property
     def axes_alike(self) -> bool:
-        """Whether a frame's columns lie as its rows do: of square pixels, as many and as far off the axis."""
+        """Return True if pixels are square, and columns as many and as far off the axis as rows."""
         return self.pitches[0] == self.pitches[1] and np.array_equal(self.centres(0), self.centres(1))
 
     @property
     def frame_side(self) -> float:
-        """Pixels a side of a square with as many as a frame; a whole number for square frames."""
+        """Return the side in pixels of a square with as many as a frame; a whole number for square frames."""
         return side_of(self.frame_shape)
 
     @property
     def half_width(self) -> float:
-        """Half the sensor's longer side [mm]: light is followed to the square of that side."""
+        """Return half the sensor's longer side [mm]; light is followed to the square of that side."""
         return max(self.half_sides)
 
     @property
     def half_sides(self) -> tuple[float, float]:
-        """Half the sensor's height, along rows' numbers, and half its width [mm]."""
+        """Return half the sensor's height, along rows' numbers, and half its width [mm]."""
         (rows, columns), (row, column) = self.shape, self.pitches
         return rows * row / 2, columns * column / 2
 
     @property
     def tan_half_fov(self) -> float:
-        """Largest |x/z| and |y/z| of a ray that passes the field stop."""
+        """Return the largest |x/z| and |y/z| of a ray that passes the field stop."""
         return math.tan(math.radians(self.fov) / 2)
 
     def reach(self, depth: float) -> float:
-        """Largest tan-angle, from the sensor's centre, of what its edge sees at ``depth`` [mm]."""
+        """Return the largest tan-angle, from the sensor's centre, of points at ``depth`` [mm] that its edge sees."""
         return self.tan_half_fov + self.half_width / depth
 
     @property
     def pixel_edges(self) -> FloatArray:
-        """(pixels + 1,) edges of pixels along the sensor's longer side [mm]."""
+        """Return the (pixels + 1,) edges of pixels along the sensor's longer side [mm]."""
         return centred_edges(*max(zip(self.shape, self.pitches, strict=True), key=math.prod))
 
-    @property
-    def pixel_centres(self) -> FloatArray:
-        """(pixels,) centres along the sensor's longer side [mm]."""
-        edges = self.pixel_edges
-        return np.asarray((edges[:-1] + edges[1:]) / 2)
-
     def centres(self, axis: int) -> FloatArray:
-        """(m,) centres of a frame's rows (``axis`` 0) or columns (1) [mm]."""
+        """Return the (m,) centres of a frame's rows (``axis`` 0) or columns (1) [mm]."""
         edges = centred_edges(self.shape[axis], self.pitches[axis])
         centres = np.asarray((edges[:-1] + edges[1:]) / 2)
         return centres if self.roi is None else centres[self.roi[axis] : self.roi[axis] + self.roi[axis + 2]]
 
     @property
     def mask_offset(self) -> tuple[float, float]:
-        """Mask coordinates (row, column) of the mask's centre [mm]; (0, 0) on the axis."""
+        """Return the coordinates (row, column) of the mask's centre [mm]; (0, 0) on the axis."""
         return self.mask_offset_row, self.mask_offset_column
 
     def build_mask(self) -> Mask | Plate:
-        """The mask that these numbers describe, in coordinates of its own centre; of a plate what can be seen."""
-        if self.mask != "plate":
-            return mls_mask(self.mask, self.mask_feature, self.mask_order)
-        if self.mask_plate is None:
-            raise MitsimError("mask: got 'plate' without one; give a camera file with a table [mask]")
-        return within(self.mask_plate, self.mask_reach)
+        """Return the mask in coordinates of its own centre; for a plate, the part that can be seen."""
+        if self.mask_plate is not None:
+            return within(self.mask_plate, self.mask_reach)
+        return mls_mask(cast("MaskKind", self.mask), self.mask_feature, self.mask_order)
 
     @property
     def mask_reach(self) -> float:
-        """How far from its centre a mask is seen [mm]."""
+        """Return the distance from its centre to which a mask is seen [mm]."""
         seen = self.half_width + (self.mask_distance + self.mask_thickness) * self.tan_half_fov
         leaning = 1 + self.tan_half_fov * sum(map(abs, self.mask_tilt))
         return (seen + max(self.pitches) + max(map(abs, self.mask_offset))) * leaning
 
     @property
     def centred(self) -> bool:
-        """Whether a separable solver takes row and column means off this camera's frames, as for a FlatCam mask."""
-        mask = self.build_mask()
-        return mask.centred if isinstance(mask, Plate) else mask.kind == "flatcam"
+        """Return True if a separable solver subtracts row and column means from frames, as for a FlatCam mask."""
+        return self.build_mask().centred
 
     @property
     def diffracts(self) -> bool:
-        """Whether diffraction at the mask is simulated."""
-        mask = self.build_mask()
-        return not isinstance(mask, Plate) or mask.diffracts
+        """Return True if diffraction at the mask is simulated."""
+        return self.build_mask().diffracts
 
     @property
     def mask_tilt(self) -> tuple[float, float]:
-        """How the mask's distance grows along rows and along columns, tangents; (0, 0) for a mask that is even."""
+        """Return the tangents by which the mask's distance grows along rows and columns; (0, 0) if it is even."""
         made = self.mask_plate.flaws.tilt_mrad if self.mask_plate else (0.0, 0.0)
         lean = self.mask_lean_mrad or (0.0, 0.0)
         return math.tan((made[0] + lean[0]) * 1e-3), math.tan((made[1] + lean[1]) * 1e-3)
 
     @property
     def tilt_shift_mm(self) -> float:
-        """How far a tilt of the mask moves shadows at most, on the mask [mm]: a ray of slope t that leaves the even
-        plane at s meets the tilted one t s tan(tilt) beside."""
+        """Return the largest shift of shadows on the mask by its tilt [mm].
+
+        A ray of slope t that leaves the even plane at s meets the tilted one t s tan(tilt) beside.
+        """
         return self.tan_half_fov * self.mask_reach * sum(map(abs, self.mask_tilt))
 
     def tilt_nodes(self, waves: bool) -> tuple[int, int] | None:
-        """Nodes of rows and of columns from which the shadow of a tilted mask is formed (:mod:`mitsim.optics.terms`),
-        with ``waves`` or without; None where it is not: of an even mask, one that is drawn on a raster, and one that
-        would take too many terms."""
+        """Return the nodes of rows and columns that form the shadow of a tilted mask (:mod:`mitsim.optics.terms`).
+
+        The value is None for an even mask, one that is drawn on a raster, and one that would take too many terms.
+        """
         if not any(self.mask_tilt) or self.is_drawn(waves):
             return None
         farthest = self.tan_half_fov * self.mask_reach / min(self.pitches)
-        by_column, by_row = (
-            1 if not growth else 2 + math.ceil(_NODES_PER_PIXEL * farthest * abs(growth))
-            for growth in self.mask_tilt[::-1]
-        )
+        tilts = self.mask_tilt[::-1]
+        by_column, by_row = (2 + math.ceil(_NODES_PER_PIXEL * farthest * abs(t)) if t else 1 for t in tilts)
         many = by_column * by_row * len(self.build_mask().terms) > _MOST_TILTED_TERMS
         return None if many else (by_column, by_row)
 
     def tilt_left_out(self, waves: bool) -> bool:
-        """Whether the mask is tilted, and its shadow, with ``waves`` or without, that of an even one."""
+        """Return True if the mask is tilted and its shadow, with ``waves`` or without, is that of an even one."""
         return any(self.mask_tilt) and self.tilt_nodes(waves) is None
 
     @property
     def mask_words(self) -> str:
-        """The mask in words."""
-        return (
-            self.mask_plate.words
-            if self.mask == "plate" and self.mask_plate
-            else f"{self.mask}, order {self.mask_order}"
-        )
+        """Return the mask in words."""
+        return self.mask_plate.words if self.mask_plate else f"{self.mask}, order {self.mask_order}"
 
     @property
     def mask_terms(self) -> int:
-        """Separable terms of the mask as it is mounted, 1 where it has no closed form."""
+        """Return the number of separable terms of the mask as it is mounted; 1 if it has no closed form."""
         if self.is_drawn(waves=False):
             return 1
         return len(self.build_mask().terms) * math.prod(self.tilt_nodes(waves=False) or (1,))
 
     def is_correlated(self, waves: bool) -> bool:
-        """Whether frames behind the mask, with ``waves`` or without, are correlations with a shadow that is drawn,
-        as it must be or as was chosen."""
+        """Return True if frames, with ``waves`` or without, are correlations with a shadow on a raster."""
         return self.is_drawn(waves) or (self.mask_fft and self.may_be_drawn(waves))
 
     def may_be_drawn(self, waves: bool) -> bool:
-        """Whether frames behind the mask, with ``waves`` or without, may as well be sums of terms as correlations with
-        a shadow on a raster: of a plate of more than two terms that is mounted straight, and at rest, over square
-        pixels."""
+        """Return True if frames may be sums of terms as well as correlations with a shadow on a raster.
+
+        Both work for a plate of more than two terms that is mounted straight and at rest, over square pixels.
+        """
         mask = self.build_mask()
         still = self.mask_motion is None and not any(self.mask_tilt) and self.pitches[0] == self.pitches[1]
-        return isinstance(mask, Plate) and still and not (waves or self.is_drawn(waves)) and mask.crosses is None
+        return still and not (waves or self.is_drawn(waves)) and mask.crosses is None
 
     def is_drawn(self, waves: bool) -> bool:
-        """Whether the mask's shadow, with ``waves`` or without, is drawn on a raster because it has no short closed
-        form: of what is turned, of a picture of light, of more than a thousand terms, and of the waves behind many
-        terms."""
+        """Return True if the mask's shadow, with ``waves`` or without, is drawn on a raster.
+
+        A turned mask, a picture of light, more than a thousand terms, and waves behind many terms have no short closed
+        form.
+        """
         mask = self.build_mask()
-        if not isinstance(mask, Plate):
-            return False
         turned = bool(mask.flaws.turn_deg)
         return mask.irradiance or turned or mask.many or (waves and mask.amplitude.crosses is None)
 
     @property
     def few_wave_terms(self) -> bool:
-        """Whether waves behind the mask are a sum of few separable terms: of a mask of one or two that is mounted
-        straight, and at rest."""
+        """Return True if waves behind the mask are a sum of few terms: it is at rest, and mounted straight."""
         return self.diffracts and not self.is_drawn(waves=True) and not any(self.mask_tilt) and self.mask_motion is None
-
-    def fresnel_number(self, wavelength_nm: float) -> float:
-        """a^2 / (lambda d) of one mask feature at ``wavelength_nm``: well above 1, a geometric shadow is good."""
-        return self.mask_feature**2 / (wavelength_nm * 1e-6 * self.mask_distance)
 
     @property
     def wall_shift_features(self) -> float:
-        """Largest shift between a mask's two faces along a ray that passes the field stop, in features.
+        """Return the largest shift between a mask's two faces along a ray through the field stop, in features.
 
-        The two-face model of a thick mask needs it below 1: beyond, a ray may cross a wall between the faces.
+        The two-face model of a thick mask needs less than 1, because a ray may then not cross a wall between the faces.
         """
         return self.mask_thickness * self.tan_half_fov / self.mask_feature
 
     @property
     def active_sides(self) -> tuple[float, float]:
-        """A pixel's active part, along rows' and columns' numbers [mm]: a square in a square pixel."""
-        row, column = self.pitches
-        return row * math.sqrt(self.pixel_fill_factor), column * math.sqrt(self.pixel_fill_factor)
+        """Return the sides of a pixel's active part along rows' and columns' numbers [mm]."""
+        root = math.sqrt(self.pixel_fill_factor)
+        return self.pitches[0] * root, self.pitches[1] * root
 
     def angular_response(self, squared_tan: FloatArray) -> FloatArray:
-        """A pixel's response, relative to normal incidence, to rays of ``squared_tan``, tan^2(theta): cos^n(theta)."""
+        """Return a pixel's response cos^n(theta), relative to normal incidence, to rays of tan^2(theta)."""
         return np.asarray((1 + squared_tan) ** (-self.angular_exponent / 2))
 
 
 def side_of(shape: tuple[int, int]) -> float:
-    """Pixels a side of a square with as many as a frame of ``shape``; a whole number for square frames."""
+    """Return the side in pixels of a square with as many as a frame of ``shape``; a whole number for square frames."""
     return shape[0] if shape[0] == shape[1] else math.sqrt(shape[0] * shape[1])
 
 
 def centred_edges(count: int, pitch: float) -> FloatArray:
-    """(count + 1,) edges of ``count`` equal cells centred on zero, in the unit of ``pitch``; MitsimError for none."""
+    """Return the (count + 1,) edges of ``count`` equal cells about zero in the unit of ``pitch``; refuse no cells."""
     if count < 1 or not (np.isfinite(pitch) and pitch > 0):
         raise MitsimError(f"a grid of {count} cells of size {pitch} is empty; give at least 1 cell and a size above 0")
     return np.asarray((np.arange(count + 1, dtype=np.float64) - count / 2) * pitch)
@@ -394,13 +366,13 @@ class Devices:
     Attributes
     ----------
     camera
-        sensor and mask in space, as the scene states them.
+        Sensor and mask in space, as the scene states them.
     sensor
-        the camera's electronics.
+        Electronics of the camera.
     projector
-        light and lens of the projector.
+        Light and lens of the projector.
     camera_file
-        where the electronics stand, for messages.
+        File of the electronics, for messages.
     """
 
     camera: CameraGeometry

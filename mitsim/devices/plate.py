@@ -278,11 +278,6 @@ class Plate(ByValue):
         sharp = not self.blur_mm or (self.crosses is not None and len(self.crosses) == 1 and not self.flaws.turn_deg)
         return not self.irradiance and sharp
 
-    @property
-    def may_be_thick(self) -> bool:
-        """Whether the shadow of two such faces is worked out."""
-        return self.crosses is not None and self.flaws == NO_FLAWS
-
     @cached_property
     def grids(self) -> tuple[tuple[BoolArray, BoolArray], ...] | None:
         """What is open as grids that do not overlap, as :attr:`mitsim.devices.mask.Mask.openings`; None where over 4,

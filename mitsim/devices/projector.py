@@ -146,7 +146,7 @@ Share = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Coherence(Configuration):
-    """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.speckle.contrast_of`)."""
+    """What decides the contrast of a laser projector's speckle (:func:`mitsim.optics.frames.contrast_of`)."""
 
     beam_radius_mm: float | None = Field(default=None, ge=1e-3, le=1e3)
     """1/e^2 radius of a scanned beam's spot [mm]; none: all is lit at once.

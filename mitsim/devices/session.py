@@ -384,7 +384,7 @@ UNITS: Mapping[str, str] = MappingProxyType({
     "mask_distance": "mm", "mask_shift_row": "mm", "mask_shift_column": "mm", "mask_rotation": "rad",
     "magnification": "1", "projector_row": "tan", "projector_column": "tan", "gain": "e-/s",
 })  # fmt: skip
-"""Numbers of the devices that can be fitted (:class:`mitsim.optics.camera_model.Placement`), and their units."""
+"""Numbers of the devices that can be fitted (:class:`mitsim.optics.terms.Placement`), and their units."""
 FITTED = ("mask_distance", "mask_shift_row", "mask_shift_column", "mask_rotation", "magnification", "gain")
 """Those that are, where nothing is said: a shift of the projector's window looks like one of the mask."""
 

@@ -35,9 +35,8 @@ from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.optics.forming import AccumulatedLight
-from mitsim.optics.frames import ExpectedFrames
+from mitsim.optics.frames import ExpectedFrames, add_speckle
 from mitsim.optics.image_formation import FrameOptics
-from mitsim.optics.speckle import add_speckle
 from mitsim.sensor.chain import expose
 
 if TYPE_CHECKING:

@@ -28,7 +28,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import chain, combinations
-from itertools import count as count_from
 
 import numpy as np
 import numpy.typing as npt
@@ -89,13 +88,7 @@ class EdgeWaves:
     """
 
     def __init__(
-        self,
-        wavelength_nm: float,
-        distance_mm: float,
-        step_mm: float,
-        count: int,
-        span_mm: float,
-        single: bool = False,
+        self, wavelength_nm: float, distance_mm: float, step_mm: float, count: int, span_mm: float, single: bool = False
     ) -> None:
         product = wavelength_nm * 1e-6 * distance_mm
         self.step_mm, self._count = step_mm, count
@@ -163,13 +156,13 @@ def edge_wave(x: FloatArray) -> ComplexArray:
 @cache
 def fast_length(least: int) -> int:
     """Return the first number from ``least`` without prime factors above 11, for fast transforms."""
-    for length in count_from(least):
+    left, length = 0, least - 1
+    while left != 1:
+        length += 1
         left = length
         for prime in (2, 3, 5, 7, 11):
             while left % prime == 0:
                 left //= prime
-        if left == 1:
-            break
     return length
 
 
@@ -222,7 +215,7 @@ def wave_profiles(
 
 def _of_fields(shadow: ShadowGeometry) -> ShadowGeometry:
     mask = shadow.mask.amplitude
-    if isinstance(mask, Plate) and mask.crosses is None:
+    if mask.crosses is None:
         raise MitsimError(
             f"{mask.words}: its field is no sum of {FEW} separable terms, and diffraction is worked out for those "
             "alone; use --effects=-diffraction for its geometric shadow"
@@ -302,13 +295,11 @@ def _thin_means(
     if not growth:
         return _thin_means_at(beyond, shadow, profiles, directions, wavelength_nm)
     even = shadow.crossings(directions)
-    nodes = nodes_between(even, _DISTANCES)
-    at_nodes = (
-        _thin_means_at(beyond + growth * float(node), shadow, profiles, directions, wavelength_nm) for node in nodes
-    )
-    return np.asarray(
-        sum(weight * means for weight, means in zip(lagrange_weights(even, nodes), at_nodes, strict=True))
-    )
+    nodes, total = nodes_between(even, _DISTANCES), np.zeros(())
+    for weight, node in zip(lagrange_weights(even, nodes), nodes, strict=True):
+        at_node = beyond + growth * float(node)
+        total = total + weight * _thin_means_at(at_node, shadow, profiles, directions, wavelength_nm)
+    return total
 
 
 def _thin_means_at(
@@ -347,8 +338,7 @@ def _thick_means(
 
 def _products(fields: list[ComplexArray]) -> FloatArray:
     parts = [np.square(field.real) + np.square(field.imag) for field in fields]
-    for first, second in combinations(fields, 2):
-        product = first * second.conj()
+    for product in (first * second.conj() for first, second in combinations(fields, 2)):
         parts += [product.real, product.imag]
     return np.stack(parts)
 

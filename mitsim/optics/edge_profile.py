@@ -46,12 +46,6 @@ class Steps(ByValue):
     blur_mm: float = 0.0
 
     @classmethod
-    def of(cls, profile: npt.ArrayLike, feature_mm: float) -> Steps:
-        """Return the centred ``profile`` (N,) of features of ``feature_mm``, with equal neighbours merged."""
-        count = len(np.asarray(profile))
-        return cls.between(profile, np.asarray((np.arange(count + 1) - count / 2) * feature_mm))
-
-    @classmethod
     def between(cls, profile: npt.ArrayLike, lines_mm: FloatArray, blur_mm: float = 0.0) -> Steps:
         """Return the profile of (N,) values between (N + 1,) lines, with equal neighbours merged."""
         values = np.asarray(profile, dtype=np.float64)
@@ -144,15 +138,12 @@ def blurred_step(x: FloatArray, half: FloatArray | float, other: float, blur: fl
     return np.asarray(np.where(wide, means, point))
 
 
-def _density(z: FloatArray) -> FloatArray:
-    return np.asarray(np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi))
-
-
 def _once(x: FloatArray, blur: float) -> FloatArray:
     if not blur:
         return np.asarray(np.maximum(x, 0))
     z = np.maximum(x / blur, -2 * _BEYOND)  # both parts are 0 before
-    return np.asarray(blur * (z * scipy.special.ndtr(z) + _density(z)))
+    density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
+    return np.asarray(blur * (z * scipy.special.ndtr(z) + density))
 
 
 def _twice(x: FloatArray, blur: float) -> FloatArray:
@@ -160,7 +151,8 @@ def _twice(x: FloatArray, blur: float) -> FloatArray:
     if not blur:
         return np.asarray(np.square(np.maximum(x, 0)) / 2)
     z = np.maximum(x / blur, -2 * _BEYOND)
-    return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * scipy.special.ndtr(z) + z * _density(z)))
+    density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
+    return np.asarray(blur**2 / 2 * ((np.square(z) + 1) * scipy.special.ndtr(z) + z * density))
 
 
 def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
@@ -179,6 +171,12 @@ def _cubic(nodes: FloatArray, places: FloatArray) -> FloatArray:
     return result
 
 
+def _running_sums(parts: FloatArray) -> FloatArray:
+    sums = np.zeros((len(parts), parts.shape[1] + 1))
+    np.cumsum(parts, axis=1, out=sums[:, 1:])
+    return sums
+
+
 class Antiderivative:
     """First and second antiderivative of piecewise constant functions whose means are subtracted."""
 
@@ -188,32 +186,21 @@ class Antiderivative:
         self._edges, self._step = edges, step
         self._mean = (values @ width) / (edges[-1] - edges[0])
         self._values = values - self._mean[:, None]
-        self._first = self._sums(self._values * width)
+        self._first = _running_sums(self._values * width)
         # A slope of the second antiderivative drops out of its second difference, its size does not.
         self._first -= self._first.mean(axis=1, keepdims=True)
-        middle = self._first[:, :-1] + self._first[:, 1:]
-        middle *= width / 2
-        self._second = self._sums(middle)
+        self._second = _running_sums((self._first[:, :-1] + self._first[:, 1:]) * (width / 2))
 
     @classmethod
     def of_samples(cls, values: FloatArray, start: float, step: float) -> Antiderivative:
         """Integrate (functions, n) samples on equal cells of width ``step`` from ``start`` [mm]."""
         return cls(start + step * np.arange(values.shape[1] + 1), values, step)
 
-    @staticmethod
-    def _sums(parts: FloatArray) -> FloatArray:
-        sums = np.empty((len(parts), parts.shape[1] + 1))
-        sums[:, 0] = 0
-        np.cumsum(parts, axis=1, out=sums[:, 1:])
-        return sums
-
     def means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """Return the (functions, *centres.shape) means over two boxes in succession."""
         wide, narrow = max(half_pixel, half_cell), min(half_pixel, half_cell)
-        total = self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)
-        total /= 2 * wide
-        total += self._mean.reshape(-1, *[1] * centres.ndim)
-        return total
+        total = (self._ends(centres + wide, narrow) - self._ends(centres - wide, narrow)) / (2 * wide)
+        return np.asarray(total + self._mean.reshape(-1, *[1] * centres.ndim))
 
     def smooth_means(self, centres: FloatArray, half_pixel: float, half_cell: float) -> FloatArray:
         """Return the means of sampled functions without jumps; many points are interpolated between cells."""

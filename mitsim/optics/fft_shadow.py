@@ -110,14 +110,11 @@ def draw_raster(geometry: CameraGeometry, depth: float, spectrum: Spectrum | Non
     if mask.irradiance:
         values = _resample(mask, step, count)
     elif spectrum is None:
-        means = _turned_means if mask.flaws.turn_deg else _resample
-        values = sharpen(means(mask, step, count))
+        values = sharpen((_turned_means if mask.flaws.turn_deg else _resample)(mask, step, count))
     else:
         values = sharpen(_waves(replace(shadow, mask=mask.amplitude), spectrum, step, count))
-    flaws, active = (
-        Flaws(mask.blur_mm if spectrum is None else 0.0),
-        int(min(geometry.active_sides) / geometry.pixel_pitch * cells_per_pixel(geometry)),
-    )
+    active = int(min(geometry.active_sides) / geometry.pixel_pitch * cells_per_pixel(geometry))
+    flaws = Flaws(mask.blur_mm if spectrum is None else 0.0)
     return Plate(step, values, mask.words, flaws=flaws, irradiance=True, averaged=max(active, 1))
 
 
@@ -205,11 +202,9 @@ def _turned_means(mask: Plate, step: float, count: int) -> FloatArray:
 
 
 def _resample(mask: Plate, step: float, count: int) -> FloatArray:
-    start = -count * step / 2
-    along = np.stack(
-        [Steps(mask.lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))],
-        axis=1,
-    )
+    lines, start = mask.lines, -count * step / 2
+    cells = [Steps(lines[k : k + 2], np.ones(1)).cell_means(start, step, count) for k in range(len(mask.values))]
+    along = np.stack(cells, axis=1)
     return np.asarray(along @ mask.values @ along.T)
 
 
@@ -224,18 +219,14 @@ def _waves(shadow: ShadowGeometry, spectrum: Spectrum, step: float, count: int) 
         # Waves turn with the mask.
         even = replace(shadow, mask=replace(mask, flaws=NO_FLAWS))
         whole = 2 * int(np.ceil(count / 2**0.5)) + _AROUND
-        return _turn_light(_waves(even, spectrum, step, whole), count, mask.flaws)
+        middles = np.asarray(np.arange(count) + 0.5 - count / 2)
+        places = np.stack(mask.flaws.turned_back(middles[:, None], middles)) + (whole - 1) / 2
+        light = _waves(even, spectrum, step, whole)
+        return np.asarray(scipy.ndimage.map_coordinates(light, places, order=3, mode="nearest"))
     total, mirrored = np.zeros((count, count)), mask.mirrored
     for wavelength, share in zip(spectrum.wavelengths_nm, spectrum.weights, strict=True):
         total += share * _intensity(*_fields(shadow, float(wavelength), step, count), mirrored, mask.symmetric)
     return total
-
-
-def _turn_light(values: FloatArray, count: int, flaws: Flaws) -> FloatArray:
-    middles = np.asarray(np.arange(count) + 0.5 - count / 2)
-    row, column = flaws.turned_back(middles[:, None], middles)
-    places = np.stack([row, column]) + (len(values) - 1) / 2
-    return np.asarray(scipy.ndimage.map_coordinates(values, places, order=3, mode="nearest"))
 
 
 def _fields(
@@ -281,8 +272,8 @@ def _intensity(
     rows: npt.NDArray[np.complex64],
     columns: npt.NDArray[np.complex64],
     points: int,
-    mirrored: tuple[bool, bool] = (False, False),
-    symmetric: bool = False,
+    mirrored: tuple[bool, bool],
+    symmetric: bool,
 ) -> FloatArray:
     whole = len(rows) // points, columns.shape[1] // points
     kept = [count // 2 if half else count for count, half in zip(whole, mirrored, strict=True)]
@@ -293,7 +284,10 @@ def _intensity(
     def square(start: int) -> None:
         some, beyond = slice(start, min(start + at_once, kept[0])), start if symmetric else 0
         field = rows[some.start * points : some.stop * points] @ columns[:, beyond * points :]
-        means[some, beyond:] = _blocks(np.square(field.real) + np.square(field.imag), points)
+        light = np.square(field.real) + np.square(field.imag)
+        down = light.reshape(-1, points, light.shape[1]).sum(axis=1)
+        blocks = sum(down[:, place::points].astype(np.float64) for place in range(points))
+        means[some, beyond:] = blocks / points**2
         if symmetric:
             means[beyond:, some] = means[some, beyond:].T
 
@@ -301,11 +295,6 @@ def _intensity(
     if mirrored[0]:
         means = np.concatenate((means, means[::-1]))
     return np.concatenate((means, means[:, ::-1]), axis=1) if mirrored[1] else means
-
-
-def _blocks(values: npt.NDArray[np.float32], side: int) -> FloatArray:
-    rows = values.reshape(-1, side, values.shape[1]).sum(axis=1)
-    return np.asarray(sum(rows[:, place::side].astype(np.float64) for place in range(side)) / side**2)
 
 
 # -------- Frames behind a mask drawn on a raster
@@ -342,10 +331,17 @@ class Correlation:
         sides = _Side.both(shadow, rows, columns)
         self.shape = sides[0].pixels, sides[1].pixels
         self._phases, self._fill_factor = (sides[0].phases, sides[1].phases), fill_factor
-        firsts, self._spread = zip(*(side.spread(_APART) for side in sides), strict=True)
-        reach = max(len(spread) // phases for spread, phases in zip(self._spread, self._phases, strict=True))
+        firsts, spreads = list[int](), list[npt.NDArray[np.float32]]()
+        for side in sides:
+            every = _APART * side.phases
+            before = side.first % every
+            behind = -(before + len(side.weights)) % every
+            firsts.append(side.first - before)
+            spreads.append(np.pad(side.weights, ((before, behind), (0, 0))).astype(np.float32))
+        self._spread = spreads
+        reach = max(len(spread) // phases for spread, phases in zip(spreads, self._phases, strict=True))
         self._size = tuple(scipy.fft.next_fast_len(pixels + reach - 1, real=True) for pixels in self.shape)
-        self._spectra = _spectra(cast("Plate", shadow.mask), firsts, self._size, self._phases)
+        self._spectra = _spectra(cast("Plate", shadow.mask), (firsts[0], firsts[1]), self._size, self._phases)
 
     def image(self, light: FloatArray, rows: npt.ArrayLike, columns: npt.ArrayLike) -> FloatArray:
         """Return the (m, m') irradiance of ``light`` (r, c) in the cells ``rows`` (r,) x ``columns`` (c,)."""
@@ -396,22 +392,16 @@ class _Side:
         phases = max(round(step), 1)
         if pixels > 1 and abs(step - phases) > _WHOLE:
             raise MitsimError(f"a pixel is {step:g} cells of the mask's raster; draw one of a whole number")
-        cell, blur = shadow.mask.feature_mm, shadow.mask.blur_mm
+        cell, blur, count = shadow.mask.feature_mm, shadow.mask.blur_mm, len(cast("Plate", shadow.mask).values)
         halves = shadow.half_pixel / cell, shadow.half_cell(directions) / cell
         crossings = (shadow.shrink * shadow.pixel_centres_mm[0] + shadow.distance_mm * directions.centres) / cell
-        crossings = crossings + len(_mask_values(shadow)) / 2
+        crossings = crossings + count / 2
         reach = sum(halves) + 8.3 * blur / cell
         first = int(np.floor(crossings.min() - reach))
         count = -(-(int(np.ceil(crossings.max() + reach)) - first) // phases) * phases
         edges = first + np.arange(count + 1)
         below = blurred_step(edges[:, None] - crossings, halves[0], halves[1], blur / cell)
         return cls(pixels, phases, first, np.diff(below, axis=0))
-
-    def spread(self, apart: int) -> tuple[int, npt.NDArray[np.float32]]:
-        every = apart * self.phases
-        before = self.first % every
-        behind = -(before + len(self.weights)) % every
-        return self.first - before, np.pad(self.weights, ((before, behind), (0, 0))).astype(np.float32)
 
     def factor(self, profile: FloatArray, places: npt.NDArray[np.intp]) -> FloatArray:
         seen = _part(profile[:, None], self.first, self.phases * (self.pixels - 1) + len(self.weights))[:, 0]
@@ -439,10 +429,6 @@ def terms_of_raster(
         return fill_factor * weight * sides[0].factor(row, at[0]), sides[1].factor(column, at[1])
 
     return in_threads(factors, terms)
-
-
-def _mask_values(shadow: ShadowGeometry) -> FloatArray:
-    return np.asarray(shadow.mask.values)  # type: ignore[union-attr]
 
 
 def _part(values: FloatArray, first: int, count: int) -> FloatArray:
@@ -482,11 +468,10 @@ class ProfileSampler:
     def __init__(
         self, profile: npt.ArrayLike, feature_mm: float, start_mm: float | None = None, centre_mm: float = 0.0
     ) -> None:
-        values = np.asarray(profile, dtype=np.float64)
-        self._values = np.concatenate(([0.0], values, [0.0]))
+        self._values = np.concatenate(([0.0], np.asarray(profile, dtype=np.float64), [0.0]))
         self._sums = np.cumsum(self._values)
-        self._feature, self._count = feature_mm, len(values)
-        self._start = (-len(values) / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
+        self._feature, self._count = feature_mm, len(self._values) - 2
+        self._start = (-self._count / 2 if start_mm is None else start_mm / feature_mm) + centre_mm / feature_mm
 
     def __call__(self, s: FloatArray, width: FloatArray) -> FloatArray:
         """Return the mean over [s - width/2, s + width/2] for arrays that broadcast; at width 0 the value."""
@@ -519,17 +504,16 @@ def wave_samplers(
             profiles, start, step = wave_profiles(shadow, wavelength, low, high, tau[of] - centre / depth)
             return [(weight, ProfileSampler(profile, step, start, centre)) for weight, profile in profiles]
 
-        terms += [
-            (float(share) * weight, row, column) for (weight, row), (_, column) in zip(axis(0), axis(1), strict=True)
-        ]
+        both = zip(axis(0), axis(1), strict=True)
+        terms += [(float(share) * weight, row, column) for (weight, row), (_, column) in both]
     return terms
 
 
 def geometric_samplers(geometry: CameraGeometry) -> list[SampledTerm]:
     """Return the geometric shadow of the mask of ``geometry`` as samplers."""
-    if geometry.is_drawn(waves=False):
-        return _of_plate(raster(geometry, geometry.scene_distance), geometry.mask_offset)
-    return _of_plate(geometry.build_mask(), geometry.mask_offset)
+    drawn = geometry.is_drawn(waves=False)
+    mask = raster(geometry, geometry.scene_distance) if drawn else geometry.build_mask()
+    return _of_plate(mask, geometry.mask_offset)
 
 
 def _of_plate(mask: Mask | Plate, centre: tuple[float, float]) -> list[SampledTerm]:

@@ -71,9 +71,8 @@ def form_frames(
 
     def form(row: int) -> None:
         for number, (optics, parts) in enumerate(mixed):
-            frame, seen = optics.frame_and_products(
-                [_row(part, row) for part in parts], probes, None if number else frames[row]
-            )
+            estimates, out = [_row(part, row) for part in parts], None if number else frames[row]
+            frame, seen = optics.frame_and_products(estimates, probes, out)
             if number:
                 frames[row] += frame
             probed[row] += seen.ravel()
@@ -113,9 +112,8 @@ def _mix_lights(
     lights: Sequence[AccumulatedLight], basis: sparse.csr_array
 ) -> list[tuple[FrameOptics, list[sparse.csr_array]]]:
     mixed = [(light.optics, [_product(basis, group) for group in light.groups]) for light in lights]
-    for _, parts in mixed:
-        for part in parts:
-            part.sort_indices()
+    for part in (part for _, parts in mixed for part in parts):
+        part.sort_indices()
     return mixed
 
 

@@ -5,18 +5,20 @@ Frames are formed by :mod:`mitsim.optics.forming`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import in_threads
-from mitsim.devices.camera import side_of
+from mitsim.devices.camera import Devices, side_of
 from mitsim.devices.patterns import Lighting
+from mitsim.devices.projector import Coherence
 from mitsim.optics.forming import (
     AccumulatedLight,
     Mixture,
@@ -36,6 +38,8 @@ _LARGEST_BASIS, _BASIS_BYTES = 256, 7 * 2**28
 """Largest number of class frames in memory, and their bytes. Beyond, frames are formed twice."""
 _FLOAT = 8
 """Bytes per pixel."""
+Formed = tuple[FloatArray, FloatArray]
+"""Frames, and their products with random signs."""
 _ALL = sparse.csr_array(np.ones((1, 1)))
 """Mixture of ambient light: all of it."""
 
@@ -269,11 +273,11 @@ class ExpectedFrames:
     # ---- Forming, once for all iterations ----
 
     @cached_property
-    def _ambient_light(self) -> tuple[FloatArray, FloatArray] | None:
+    def _ambient_light(self) -> Formed | None:
         return self._form_with_probes(self._ambient, _ALL) if self._ambient else None
 
     @cached_property
-    def _leaked_light(self) -> tuple[FloatArray, FloatArray] | None:
+    def _leaked_light(self) -> Formed | None:
         return None if self._leak is None else self._form_with_probes(self._lights, self._leak)
 
     @cached_property
@@ -300,15 +304,12 @@ class ExpectedFrames:
             frames += self._leaked_light[0]
             probed += self._leaked_light[1]
         if self._specular is not None:
-            shares = self._shares[start:stop][:, self._specular.classes]
-            for frame, share in zip(frames, shares, strict=True):
+            for frame, share in zip(frames, self._shares[start:stop][:, self._specular.classes], strict=True):
                 for index in np.flatnonzero(share):
                     frame += share[index] * self._specular.irradiance[index]
         return frames, probed
 
-    def _form_with_probes(
-        self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array
-    ) -> tuple[FloatArray, FloatArray]:
+    def _form_with_probes(self, lights: Sequence[AccumulatedLight], basis: sparse.csr_array) -> Formed:
         return form_frames(lights, basis, self._probes if self._groups > 1 else None)
 
     @cached_property
@@ -326,12 +327,11 @@ class ExpectedFrames:
     def _frames(
         self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False
     ) -> list[Frame]:
-        ambient = self._ambient_light
-        count = self._groups
+        ambient, count = self._ambient_light, self._groups
         pairs = count * (count - 1)
 
         def frame_of(row: int) -> Frame:
-            frame, probed = irradiance[row], probes[row]
+            frame, probed = light[row], probes[row]
             if ambient is not None:
                 frame = np.add(frame, ambient[0][0], out=frame if owned else None)
                 probed = probed + ambient[1][0]
@@ -340,16 +340,15 @@ class ExpectedFrames:
             scale = self._restated**2 / max(pairs, 1) / frame.size
             variance, parts = spread * scale, products * scale
             heaviest = float(products.max()) / spread if spread else 0.0
-            if frame.min() >= 0:
-                frame.flags.writeable = False  # of those that are held, which nobody may change
-                return Frame(frame, variance, 0.0, heaviest, parts)
-            whole = float(frame.sum())
-            light = np.maximum(frame, 0, out=frame if owned else None)
-            light.flags.writeable = False
-            total = float(light.sum())
-            return Frame(light, variance, (total - whole) / total if total else 0.0, heaviest, parts)
+            removed = 0.0
+            if frame.min() < 0:
+                whole, frame = float(frame.sum()), np.maximum(frame, 0, out=frame if owned else None)
+                total = float(frame.sum())
+                removed = (total - whole) / total if total else 0.0
+            frame.flags.writeable = False  # of those that are held, which nobody may change
+            return Frame(frame, variance, removed, heaviest, parts)
 
-        return in_threads(frame_of, range(len(irradiance)))
+        return in_threads(frame_of, range(len(light)))
 
 
 # -------- The error of frames that were formed
@@ -371,3 +370,127 @@ def monte_carlo_bound(frames: Sequence[Frame] | ExpectedFrames) -> float:
         parts = parts + frame.by_group * frame.irradiance.size
         energy += float(np.square(frame.irradiance).sum())
     return bound_of(parts, energy)
+
+
+# -------- Speckle
+#
+# Laser speckle on the sensor: one realisation of coherent light, and its contrast.
+#
+# Integrated speckle after Goodman (Speckle Phenomena in Optics, section 4.6): light that averages over M independent
+# modes (polarisations, laser lines, grains within a pixel, moments of a scanned beam) follows a gamma distribution of
+# mean 1 and standard deviation C = M^(-1/2), the speckle contrast. Sensor pixels are independent, because a grain
+# lambda z / D of an illuminated patch D = 120 mm is 2 um at 400 mm, below a pixel. Contrast 0 leaves light unchanged.
+#
+# Points u of a rough surface at distance z shine with independent phases, B(u) of their light reaches the pixel (width
+# p) through the mask, and a scanned beam lights some together. With <> the mean over pairs of points u, u', weighted by
+# B, and over the sensor's pixels::
+#
+#     C^2 = (1 + P^2) / 2  sum_kl w_k w_l mu_kl^2  < g(u - u') sinc^2(p dx / lambda z) sinc^2(p dy / lambda z) >
+#
+# - P is the degree of polarisation of the scattered light, because two polarisations speckle independently (Goodman,
+#   3.3).
+# - w_k are the lines' shares of the photons. Over heights of standard deviation h, their fields have a coherence mu_kl
+#   = exp(-(4 pi h (1/lambda_k - 1/lambda_l))^2 / 2) (Goodman, chapter 6; light near the normal). Within a line of
+#   standard deviation s, mu_kk^2 = (1 + (8 pi h s / lambda^2)^2)^(-1/2).
+# - sinc^2 is the part of the grains of two points that remains over the area of a pixel: the van Cittert-Zernike
+#   theorem, with Goodman's number of grains in an aperture (4.4). Light through fewer openings comes from fewer points.
+# - g is the coherence with which the beam lights two points: 1 if all is lit at once, exp(-|u - u'|^2 / r^2) for a
+#   Gaussian beam of 1/e^2 radius r, whose positions add up in one exposure as intensities.
+
+_NODES = 16
+"""Nodes of the Gauss-Legendre rule over half a triangle of distances between points of two projector pixels."""
+Kernel = Callable[[FloatArray], FloatArray]
+"""Function of distances along one axis [mm]."""
+
+
+def add_speckle(irradiance: FloatArray, contrast: float, rng: np.random.Generator) -> FloatArray:
+    """Multiply ``irradiance`` (any shape and unit) by a gamma field of mean 1 and standard deviation ``contrast``.
+
+    Raises MitsimError for a contrast outside 0..1, because single fully developed speckle has 1.
+    """
+    if not 0 <= contrast <= 1:
+        raise MitsimError(f"speckle contrast is {contrast}; give a number from 0 (none) to 1 (fully developed)")
+    if contrast == 0:
+        return irradiance
+    return np.asarray(irradiance * rng.gamma(contrast**-2, contrast**2, size=irradiance.shape))
+
+
+def contrast_of(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray) -> float:
+    """Return the mean contrast of speckle in one sensor pixel by the module's formula.
+
+    Parameters
+    ----------
+    devices
+        Camera and projector, whose table ``speckle`` states the coherence of its light.
+    pixels_mm
+        Height and width of a projector pixel on the aligned plane [mm].
+    lit
+        (n, n) light of each projector pixel, any unit.
+
+    Raises
+    ------
+    MitsimError
+        If no pixel is lit.
+    """
+    if not lit.any():
+        raise MitsimError("speckle contrast: no projector pixel is lit; light makes it")
+    coherence, spectrum = devices.projector.speckle or Coherence(), devices.projector.spectrum
+    wavelengths = spectrum.wavelengths_nm
+    inverse, pairs = 1 / wavelengths, np.eye(len(wavelengths))
+    if coherence.roughness_um is not None:
+        height = 1e3 * coherence.roughness_um
+        pairs = np.exp(-np.square(4 * np.pi * height * (1 / wavelengths[:, None] - 1 / wavelengths)))
+        within = 1 / np.sqrt(1 + np.square(8 * np.pi * height * coherence.linewidth_nm / np.square(wavelengths)))
+        np.fill_diagonal(pairs, within)
+    pairs *= np.outer(spectrum.weights, spectrum.weights)
+    spaces = {
+        wavelength: _space(devices, pixels_mm, lit, wavelength * 1e-6)
+        for wavelength in np.unique(2 / (inverse[:, None] + inverse)[pairs > 0])
+    }
+    # Of two lines, grains at their mean wave number; where lines are coherent at all they are close to it.
+    both = np.array([[spaces.get(2 / (k + other), 0.0) for other in inverse] for k in inverse])
+    return float(np.sqrt((1 + coherence.polarisation**2) / 2 * (pairs * both).sum()))
+
+
+def _space(devices: Devices, pixels_mm: tuple[float, float], lit: FloatArray, wavelength_mm: float) -> float:
+    """Return the mean over pairs of points for one wavelength [mm].
+
+    It is relative to the sum of the squares of all pixels' light, because pixels of the mask's shadow differ.
+    """
+    camera, radius = devices.camera, (devices.projector.speckle or Coherence()).beam_radius_mm
+
+    def grains(distance: FloatArray, width: float) -> FloatArray:
+        kernel = np.square(np.sinc(width * distance / (wavelength_mm * camera.scene_distance)))
+        return np.asarray(kernel if radius is None else kernel * np.exp(-np.square(distance / radius)))
+
+    def one_feature(distance: FloatArray) -> FloatArray:
+        apart = camera.mask_distance / (camera.scene_distance * camera.mask_feature)
+        return np.asarray(np.maximum(1 - np.abs(distance) * apart, 0))
+
+    seen: list[tuple[float, Kernel]] = [(1.0, lambda distance: 1 + one_feature(distance))]
+    if camera.mask != "separable":
+        open_part = {"open": 1.0, "flatcam": 0.5}.get(camera.mask) or float(
+            sum(weight * rows.mean() * columns.mean() for weight, rows, columns in camera.build_mask().terms)
+        )
+        seen = [(1.0, np.ones_like), (1 / open_part - 1, one_feature)]
+    sizes = [2 * side for side in lit.shape]
+    spectrum = np.square(np.abs(np.fft.rfft2(lit, sizes)))
+    apart = np.fft.irfft2(spectrum, sizes)  # light of pairs of pixels, by how many rows and columns they are apart
+
+    def mean(kernels: Iterable[Kernel]) -> float:
+        total = 0.0
+        for weight, through in seen:
+            sides = zip(kernels, pixels_mm, lit.shape, strict=True)
+            rows, columns = (_between_pixels((kernel, through), size, side) for kernel, size, side in sides)
+            total += weight * float(rows @ apart @ columns)
+        return total
+
+    return mean([partial(grains, width=width) for width in camera.active_sides]) / mean([np.ones_like] * 2)
+
+
+def _between_pixels(kernels: tuple[Kernel, Kernel], size: float, count: int) -> FloatArray:
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    part, share = (nodes + 1) / 2, weights / 2 * (1 - (nodes + 1) / 2)
+    lags = np.fft.fftfreq(2 * count, 1 / (2 * count))[:, None]
+    places = np.stack([(lags + part) * size, (lags - part) * size])
+    return np.asarray((share * kernels[0](places) * kernels[1](places)).sum(axis=(0, 2)))

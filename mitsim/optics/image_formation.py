@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from itertools import pairwise, starmap
+from itertools import pairwise, product, starmap
 from typing import Any
 
 import numpy as np
@@ -93,20 +93,16 @@ class _Terms:
 
     def _side(self, axis: int, places: IntArray) -> list[FloatArray]:
         every = self.weights[axis].shape[1] * self.terms[0][axis].shape[1]
-        if len(places) < every:
-            return self._pick(axis, places)
-        if axis not in self._whole:
-            self._whole[axis] = self._pick(axis, np.arange(every))
-        return self._whole[axis]
+        if len(places) == every and axis in self._whole:
+            return self._whole[axis]
+        anchor, cell = np.divmod(places, self.terms[0][axis].shape[1])
+        weights = self.weights[axis].T[anchor]
+        picked = [weights * term[axis].T[cell] for term in self.terms]
+        return self._whole.setdefault(axis, picked) if len(places) == every else picked
 
     @cached_property
     def _whole(self) -> dict[int, list[FloatArray]]:
         return {}
-
-    def _pick(self, axis: int, places: IntArray) -> list[FloatArray]:
-        anchor, cell = np.divmod(places, self.terms[0][axis].shape[1])
-        weights = self.weights[axis].T[anchor]
-        return [weights * term[axis].T[cell] for term in self.terms]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,17 +160,17 @@ class _Raster:
         )
         by_row, by_column = self.weights
         total = np.zeros((len(by_row), len(by_column)))
-        for first in np.unique(row_anchor):
-            for second in np.unique(column_anchor):
-                inside = row_anchor == first, column_anchor == second
-                part = light[np.ix_(*inside)]
-                if not part.any():
-                    continue
+        for first, second in product(np.unique(row_anchor), np.unique(column_anchor)):
+            inside = row_anchor == first, column_anchor == second
+            part = light[np.ix_(*inside)]
+            if part.any():
                 seen = self.correlation.image(part, row[inside[0]], column[inside[1]])
-                if self.places is not None:
-                    seen = seen[np.ix_(*self.places)]
+                seen = seen if self.places is None else seen[np.ix_(*self.places)]
                 total += by_row[:, first, None] * seen * by_column[:, second]
         return total
+
+
+_Layer = _Raster | _Terms
 
 
 class FrameOptics:
@@ -212,7 +208,7 @@ class FrameOptics:
             centres = [own[np.asarray(chosen)] for own, chosen in zip(centres, places, strict=True)]
         weights = anchor_weights(positions, centres[0]), anchor_weights(positions, centres[1])
 
-        def layer(depth: float) -> _Raster | _Terms:
+        def layer(depth: float) -> _Layer:
             if geometry.is_correlated(spectrum is not None):
                 shadow = geometry, rows, columns, depth, spectrum
                 summed = largest_terms(*shadow, places) if geometry.is_drawn(spectrum is not None) else None
@@ -229,7 +225,7 @@ class FrameOptics:
         found._prepare([_Terms(terms, weights) for terms in layers], cells)
         return found
 
-    def _prepare(self, layers: Sequence[_Raster | _Terms], cells: tuple[int, int]) -> None:
+    def _prepare(self, layers: Sequence[_Layer], cells: tuple[int, int]) -> None:
         self._layers, self.cells = layers, cells
         self.weights = layers[0].weights
         (rows, self.anchors), (columns, _) = (each.shape for each in self.weights)
@@ -286,44 +282,28 @@ class FrameOptics:
             frame = np.zeros(self.frame_shape) if out is None else out
         return frame, probed
 
-    def _lit_layers(
-        self, estimates: Sequence[Entries], together: bool = False
-    ) -> Iterator[tuple[_Raster | _Terms, _Lit]]:
+    def _lit_layers(self, estimates: Sequence[Entries], together: bool = False) -> Iterator[tuple[_Layer, _Lit]]:
         split = [self._split_layers(*entries) for entries in estimates]
-        for of_depth, of_layer in zip(self._layers, zip(*split, strict=True), strict=True):
-            parts = list(of_layer)
+        for of_depth, parts in zip(self._layers, zip(*split, strict=True), strict=True):
             most = max(len(place) for place, _ in parts)
             if not most:
                 continue
-            if most < _FILLED * self.shape[0] * self.shape[1]:
-                rows, columns, parts = self._restrict_to_lit(parts)
-            else:
-                rows, columns = (np.arange(count) for count in self.shape)
+            rows, columns = (np.arange(count) for count in self.shape)
+            flat = [place for place, _ in parts]
+            if most < _FILLED * self.shape[0] * self.shape[1]:  # only rows and columns that hold light
+                places = [np.divmod(place, self.shape[1]) for place in flat]
+                lit = tuple(np.zeros(count, bool) for count in self.shape)
+                for place in places:
+                    lit[0][place[0]], lit[1][place[1]] = True, True
+                rows, columns = np.flatnonzero(lit[0]), np.flatnonzero(lit[1])
+                row_of, column_of = (np.cumsum(lit[0]) - 1) * len(columns), np.cumsum(lit[1]) - 1
+                flat = [row_of[row] + column_of[column] for row, column in places]
             lights = np.zeros((1 if together else len(parts), len(rows) * len(columns)))
-            for number, (place, values) in enumerate(parts):
-                if together:
-                    lights[0, place] += values
-                else:
-                    lights[number][place] = values
+            for number, (place, (_, values)) in enumerate(zip(flat, parts, strict=True)):
+                lights[0 if together else number, place] += values
             if together:
                 lights /= len(parts)
             yield of_depth, _Lit(rows, columns, lights.reshape(-1, len(rows), len(columns)))
-
-    def _restrict_to_lit(self, parts: Sequence[Entries]) -> tuple[IntArray, IntArray, list[Entries]]:
-        places = [np.divmod(place, self.shape[1]) for place, _ in parts]
-        lit_row, lit_column = np.zeros(self.shape[0], bool), np.zeros(self.shape[1], bool)
-        for row, column in places:
-            lit_row[row], lit_column[column] = True, True
-        rows, columns = np.flatnonzero(lit_row), np.flatnonzero(lit_column)
-        row_of, column_of = (np.cumsum(lit_row) - 1) * len(columns), np.cumsum(lit_column) - 1
-        return (
-            rows,
-            columns,
-            [
-                (row_of[row] + column_of[column], values)
-                for (row, column), (_, values) in zip(places, parts, strict=True)
-            ],
-        )
 
     def _split_layers(self, flat: IntArray, light: FloatArray) -> list[Entries]:
         if len(self._layers) == 1:

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -131,34 +132,39 @@ def specular_frames(
         If ``labels`` do not cover the beams' projector pixels, or for fewer than two boxes.
     """
     labels = np.asarray(labels)
-    _check(beams, labels, boxes_per_pixel)
-    active_part = math.sqrt(geometry.pixel_fill_factor)
-    reached = _on_sensor(beams, geometry)
+    if boxes_per_pixel < 2:
+        raise MitsimError(f"boxes_per_pixel is {boxes_per_pixel}; give at least 2")
+    if len(beams) and int(beams.pixel.max()) >= len(labels):
+        raise MitsimError(
+            f"labels has {len(labels)} entries, but light leaves projector pixel {int(beams.pixel.max())}; "
+            "give one class for each of the n * n pixels"
+        )
+    corners = beams.sensor.reshape(len(beams), 4, 2)
+    on_sensor = (corners.max(axis=1) > -geometry.half_width) & (corners.min(axis=1) < geometry.half_width)
+    reached = np.flatnonzero(on_sensor.all(axis=1))
     classes = np.unique(labels[beams.pixel[reached]])
     frames = np.zeros((len(classes), *geometry.frame_shape))
     total, lit = 0.0, np.zeros(len(labels), dtype=bool)
     for cut in _cuts(beams, reached, min(geometry.pitches) / boxes_per_pixel):
         boxes = _boxes(beams, cut, geometry)
         pixels = beams.pixel[boxes.beam]
-        total += _accumulate(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms, active_part)
+        total += _accumulate(frames, np.searchsorted(classes, labels[pixels]), boxes, geometry, terms)
         lit[pixels] = True
-    used = np.isin(classes, labels[lit])
-    area = math.prod(geometry.active_sides)
-    return SpecularFrames(
-        classes[used].astype(np.int64), frames[used] / area, np.flatnonzero(lit), total, beams.unresolved, beams.error
-    )
+    used, area = np.isin(classes, labels[lit]), math.prod(geometry.active_sides)
+    lit_classes, lit_frames = classes[used].astype(np.int64), frames[used] / area
+    return SpecularFrames(lit_classes, lit_frames, np.flatnonzero(lit), total, beams.unresolved, beams.error)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cut:
+class _Cut(NamedTuple):
+    """Numbers of beams, and places and size of their boxes, relative to a beam."""
+
     beams: IntArray
     a: FloatArray
     b: FloatArray
     size: tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class _Boxes:
+class _Boxes(NamedTuple):
     """Boxes on the sensor: beam (k,) and flux (k,); position, extent, tan-angle and magnification ds/du, all (k, 2)."""
 
     beam: IntArray
@@ -167,22 +173,6 @@ class _Boxes:
     extent: FloatArray
     tangent: FloatArray
     magnification: FloatArray
-
-
-def _check(beams: Beams, labels: IntArray, boxes_per_pixel: int) -> None:
-    if boxes_per_pixel < 2:
-        raise MitsimError(f"boxes_per_pixel is {boxes_per_pixel}; give at least 2")
-    if len(beams) and int(beams.pixel.max()) >= len(labels):
-        raise MitsimError(
-            f"labels has {len(labels)} entries, but light leaves projector pixel {int(beams.pixel.max())}; "
-            "give one class for each of the n * n pixels"
-        )
-
-
-def _on_sensor(beams: Beams, geometry: CameraGeometry) -> IntArray:
-    corners = beams.sensor.reshape(len(beams), 4, 2)
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    return np.flatnonzero(((high > -geometry.half_width) & (low < geometry.half_width)).all(axis=1))
 
 
 def _cuts(beams: Beams, reached: IntArray, box: float) -> Iterator[_Cut]:
@@ -223,46 +213,38 @@ def _boxes(beams: Beams, cut: _Cut, geometry: CameraGeometry) -> _Boxes:
     flux = (beams.flux[cut.beams, None, None] * throughput)[seen] * (cut.size[0] * cut.size[1])
     owner = np.broadcast_to(np.arange(len(cut.beams))[:, None, None], seen.shape)[seen]
     place, extent, tangent = place[seen], extent[seen], tangent[seen]
-    response = geometry.pixel_fill_factor * geometry.angular_response(
-        np.square(tangent[:, 0]) + np.square(tangent[:, 1])
-    )
+    squared = np.square(tangent[:, 0]) + np.square(tangent[:, 1])
+    response = geometry.pixel_fill_factor * geometry.angular_response(squared)
     magnification = 1 + geometry.mask_distance * _slope(corners, beams.tangent[cut.beams])
     return _Boxes(cut.beams[owner], flux * response, place, extent, tangent, magnification[owner])
 
 
 def _accumulate(
-    frames: FloatArray,
-    slot: IntArray,
-    boxes: _Boxes,
-    geometry: CameraGeometry,
-    terms: Sequence[SampledTerm],
-    active_part: float,
+    frames: FloatArray, slot: IntArray, boxes: _Boxes, geometry: CameraGeometry, terms: Sequence[SampledTerm]
 ) -> float:
     count, total = geometry.frame_shape, 0.0
-    rows, columns = ([_pieces(boxes, axis, step, geometry, active_part) for step in (0, 1)] for axis in (0, 1))
+    rows, columns = ([_pieces(boxes, axis, step, geometry) for step in (0, 1)] for axis in (0, 1))
     shadows = [
-        ([row(*piece[2:]) for piece in rows], [column(*piece[2:]) for piece in columns]) for _, row, column in terms
+        (weight, [row(*piece[2:]) for piece in rows], [column(*piece[2:]) for piece in columns])
+        for weight, row, column in terms
     ]
     for i, (row, row_share, *_) in enumerate(rows):
         for j, (column, column_share, *_) in enumerate(columns):
             flux = boxes.flux * row_share * column_share
             total += float(flux.sum())
             met = np.flatnonzero(flux)
-            passed = sum(
-                (
-                    weight * left[i][met] * right[j][met]
-                    for (weight, _, _), (left, right) in zip(terms, shadows, strict=True)
-                ),
-                np.zeros(len(met)),
-            )
+            passed = np.zeros(len(met))
+            for weight, left, right in shadows:
+                passed = passed + weight * left[i][met] * right[j][met]
             flat = (slot[met] * count[0] + row[met]) * count[1] + column[met]
             np.add.at(frames.reshape(-1), flat, flux[met] * passed)
     return total
 
 
 def _pieces(
-    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry, active_part: float
+    boxes: _Boxes, axis: int, step: int, geometry: CameraGeometry
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    active_part = math.sqrt(geometry.pixel_fill_factor)
     pitch, first = geometry.pitches[axis], 0 if geometry.roi is None else geometry.roi[axis]
     place = boxes.place[:, axis] / pitch + geometry.shape[axis] / 2 - first
     extent = boxes.extent[:, axis] / pitch
@@ -349,16 +331,15 @@ class SpecularLight:
         return float(beams.delivered[met].sum()) / area / pixels, unsure / area / pixels
 
     def _form(self, labels: bytes, geometry: CameraGeometry, spectrum: Spectrum | None) -> ClassFrames:
-        started, terms = time.perf_counter(), self._terms(geometry, spectrum)
+        started = time.perf_counter()
+        if spectrum is None:
+            terms = geometric_samplers(geometry)
+        else:
+            wide = self.beams.wide
+            near = float(np.mean(self.beams.inverse_depth[wide])) if wide.any() else 0.0
+            depth = 1 / near if near > 0 else math.inf
+            tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)
+            terms = wave_samplers(geometry, spectrum, depth, (float(tau[0]), float(tau[1])))
         found = specular_frames(self.beams, geometry, terms, np.frombuffer(labels, np.int64))
         self.seconds = time.perf_counter() - started
         return found
-
-    def _terms(self, geometry: CameraGeometry, spectrum: Spectrum | None) -> list[SampledTerm]:
-        if spectrum is None:
-            return geometric_samplers(geometry)
-        wide = self.beams.wide
-        near = float(np.mean(self.beams.inverse_depth[wide])) if wide.any() else 0.0
-        depth = 1 / near if near > 0 else math.inf
-        tau = np.average(self.beams.tangent.mean(axis=(1, 2)), axis=0, weights=self.beams.delivered)
-        return wave_samplers(geometry, spectrum, depth, (float(tau[0]), float(tau[1])))

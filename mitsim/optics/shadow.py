@@ -73,10 +73,10 @@ class Directions(ByValue):
     @classmethod
     def cells(cls, edges: npt.ArrayLike) -> Directions:
         """Return the equal cells between ``edges`` (c + 1,); raise MitsimError for unequal ones."""
-        array = _check_edges("cell edges", edges)
+        array = np.asarray(edges, dtype=np.float64)
         widths = np.diff(array)
         width = float(array[-1] - array[0]) / len(widths)
-        if np.abs(widths - width).max() > 1e-6 * width:
+        if not np.abs(widths - width).max() <= 1e-6 * width:
             raise MitsimError(f"cells of width {widths.min()} to {widths.max()} are not equal; give equal ones")
         return cls((array[:-1] + array[1:]) / 2, width)
 
@@ -127,12 +127,14 @@ class ShadowGeometry:
         return cls(camera.build_mask(), rows, row_side, *distances, camera.mask_offset, columns_mm=beside)
 
     def __post_init__(self) -> None:
-        _require_beyond(self.depth_mm, self.distance_mm + self.thickness_mm)
+        mask_mm = self.distance_mm + self.thickness_mm
+        if not self.depth_mm > mask_mm:
+            raise MitsimError(f"scene depth is {self.depth_mm} mm; it must lie beyond the mask at {mask_mm} mm")
 
     @property
     def shrink(self) -> float:
-        """Return ds/du = 1 - d/z."""
-        return _shrink(self.distance_mm, self.depth_mm)
+        """Return ds/du = 1 - d/z as (z - d)/z, which keeps its digits for a scene close to the mask."""
+        return (self.depth_mm - self.distance_mm) / self.depth_mm if np.isfinite(self.depth_mm) else 1.0
 
     @property
     def half_pixel(self) -> float:
@@ -201,8 +203,7 @@ def both_axes(
     by_row, seen_rows = shadow.from_mask(rows, 0)
     left = axis(by_row, row_profiles, seen_rows)
     alike = rows == columns and all(first == second for first, second in (shadow.offset_mm, shadow.tilt))
-    alike = alike and shadow.columns_mm is None
-    if alike and np.array_equal(row_profiles, column_profiles):
+    if alike and shadow.columns_mm is None and np.array_equal(row_profiles, column_profiles):
         return left, left
     by_column, seen_columns = shadow.from_mask(columns, 1)
     return left, axis(by_column, column_profiles, seen_columns)
@@ -216,13 +217,12 @@ def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Direction
 
 
 def _thin_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
-    feature, even = shadow.mask.feature_mm, shadow.mask.even
-    if not even or shadow.half_pixel + shadow.half_cell(directions) > _WIDE * feature:
-        boxes = shadow.on_tilted_mask(directions), shadow.half_pixel, shadow.half_cell(directions)
+    boxes = shadow.on_tilted_mask(directions), shadow.half_pixel, shadow.half_cell(directions)
+    feature = shadow.mask.feature_mm
+    if not shadow.mask.even or boxes[1] + boxes[2] > _WIDE * feature:
         return np.stack([profile.box_means(*boxes) for profile in shadow.clear(profiles, 0.0)])
-    centre = shadow.on_tilted_mask(directions) / feature
-    half_pixel, half_cell = np.array(shadow.half_pixel / feature), np.array(shadow.half_cell(directions) / feature)
-    return np.stack([_trapezoid_mean(profile, centre, half_pixel, half_cell) for profile in profiles])
+    in_features = [np.asarray(each / feature) for each in boxes]
+    return np.stack([trapezoid_mean(profile, *in_features) for profile in profiles])
 
 
 def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions: Directions) -> FloatArray:
@@ -234,97 +234,34 @@ def _thick_means(shadow: ShadowGeometry, profiles: list[FloatArray], directions:
     return means
 
 
-def shadow_factor(
-    profile: npt.ArrayLike,
-    feature_mm: float,
-    pixel_edges_mm: npt.ArrayLike,
-    cell_edges_tan: npt.ArrayLike,
-    mask_distance_mm: float,
-    depth_mm: float,
-) -> FloatArray:
-    """Return the mean of a mask profile over sensor pixel i and tan-angle cell j, for points at one depth.
-
-    Parameters
-    ----------
-    profile
-        (N,) transmission of each feature, any real numbers; centred on the axis, zero outside.
-    feature_mm
-        Feature size [mm].
-    pixel_edges_mm
-        (m + 1,) increasing edges of the sensor pixels [mm].
-    cell_edges_tan
-        (c + 1,) increasing edges of the cells in tau = x/z.
-    mask_distance_mm
-        Sensor to mask, d [mm].
-    depth_mm
-        Sensor to scene, z [mm], above d; ``inf`` is allowed.
-
-    Returns
-    -------
-    array
-        (m, c) float64.
-
-    Raises
-    ------
-    MitsimError
-        If edges do not increase, or the depth is not beyond the mask.
-    """
-    values = np.asarray(profile, dtype=np.float64)
-    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
-        raise MitsimError(f"mask profile of shape {values.shape}; give a non-empty 1-D list of finite numbers")
-    _require_positive("mask feature size", feature_mm)
-    _require_positive("distance from sensor to mask", mask_distance_mm)
-    _require_beyond(depth_mm, mask_distance_mm)
-    pixels = _check_edges("sensor pixel edges", pixel_edges_mm) * _shrink(mask_distance_mm, depth_mm) / feature_mm
-    cells = _check_edges("cell edges", cell_edges_tan) * mask_distance_mm / feature_mm
-    centre = (pixels[:-1] + pixels[1:])[:, None] / 2 + (cells[:-1] + cells[1:])[None, :] / 2
-    return _trapezoid_mean(values, centre, np.diff(pixels)[:, None] / 2, np.diff(cells)[None, :] / 2)
-
-
-def scene_factor(
-    profile: npt.ArrayLike,
-    feature_mm: float,
-    pixel_edges_mm: npt.ArrayLike,
-    scene_edges_mm: npt.ArrayLike,
-    mask_distance_mm: float,
-    depth_mm: float,
-) -> FloatArray:
-    """Return :func:`shadow_factor` for scene pixels, whose (c + 1,) edges on the plane at ``depth_mm`` are in mm."""
-    _require_positive("scene depth", depth_mm)
-    tan_edges = np.asarray(scene_edges_mm, dtype=np.float64) / depth_mm
-    return shadow_factor(profile, feature_mm, pixel_edges_mm, tan_edges, mask_distance_mm, depth_mm)
-
-
-def _trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
+def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
     """Return the mean of the profile around each crossing over two boxes of the given half-widths, in features.
 
     ``half_b`` may be 0.
     """
+    short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
+
+    def below(x: FloatArray) -> FloatArray:
+        """Return the part of the trapezoid below ``x``."""
+        distance = np.abs(x)
+        # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
+        tail = np.square(np.clip(short + long - distance, 0, 2 * short))
+        tail /= np.maximum(8 * short * long, np.finfo(float).tiny)
+        upper = np.where(distance <= long - short, 0.5 - distance / (2 * long), tail)
+        return np.asarray(np.where(x < 0, upper, 1 - upper))
+
     centre = crossing + len(profile) / 2
     reach = half_a + half_b
     first = np.floor(centre - reach)
     feature = np.clip(first, -(2**62), 2**62).astype(np.intp)
     offset = first - centre
     padded = np.concatenate(([0.0], profile, [0.0]))
-    total = np.zeros_like(centre)
-    below = np.zeros_like(centre)
+    total, before = np.zeros_like(centre), np.zeros_like(centre)
     for step in range(int(np.ceil(2 * reach.max())) + 1):
-        upto = _trapezoid_cdf(offset + (step + 1), half_a, half_b)
-        total += padded[np.clip(feature + (step + 1), 0, len(profile) + 1)] * (upto - below)
-        below = upto
+        upto = below(offset + (step + 1))
+        total += padded[np.clip(feature + (step + 1), 0, len(profile) + 1)] * (upto - before)
+        before = upto
     return total
-
-
-def _trapezoid_cdf(x: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
-    short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
-    distance = np.abs(x)
-    # The tail is used only where it is not empty and at most 2 short wide, so neither bound changes a value.
-    tail = np.square(np.clip(short + long - distance, 0, 2 * short)) / np.maximum(
-        8 * short * long, np.finfo(float).tiny
-    )
-    centre = 0.5 - distance / (2 * long)
-    upper = np.where(distance <= long - short, centre, tail)
-    return np.asarray(np.where(x < 0, upper, 1 - upper))
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:
@@ -337,30 +274,6 @@ def lagrange_weights(places: FloatArray, nodes: FloatArray) -> list[FloatArray]:
     """Return for each node the weights that interpolate to ``places`` by Lagrange polynomials."""
     weights = []
     for node in nodes:
-        others = nodes[nodes != node]
-        weights.append(
-            np.prod([np.ones_like(places), *((places - other) / (node - other) for other in others)], axis=0)
-        )
+        parts = [(places - other) / (node - other) for other in nodes[nodes != node]]
+        weights.append(np.prod([np.ones_like(places), *parts], axis=0))
     return weights
-
-
-def _shrink(distance_mm: float, depth_mm: float) -> float:
-    """Return 1 - d/z as (z - d)/z, which keeps its digits for a scene close to the mask."""
-    return (depth_mm - distance_mm) / depth_mm if np.isfinite(depth_mm) else 1.0
-
-
-def _require_beyond(depth_mm: float, mask_mm: float) -> None:
-    if not depth_mm > mask_mm:
-        raise MitsimError(f"scene depth is {depth_mm} mm; it must lie beyond the mask at {mask_mm} mm")
-
-
-def _check_edges(name: str, edges: npt.ArrayLike) -> FloatArray:
-    array = np.asarray(edges, dtype=np.float64)
-    if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all() or not (np.diff(array) > 0).all():
-        raise MitsimError(f"{name} of shape {array.shape} are not at least 2 finite increasing numbers; sort them")
-    return array
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
-        raise MitsimError(f"{name} is {value} mm; give a finite number above 0")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -53,8 +55,7 @@ def shadow_terms(
     if geometry.is_drawn(waves):
         shadow, spectrum = replace(shadow, mask=raster(geometry, depth, spectrum)), None
     if geometry.mask_motion is not None:
-        others = rows, columns, depth, spectrum, places
-        return moving_terms(geometry, shadow, rows, columns, lambda still: shadow_terms(still, *others))
+        return _moving_terms(geometry, shadow, rows, columns, depth, spectrum, places)
 
     def form(shadow: ShadowGeometry) -> SeparableTerms:
         if spectrum is None:
@@ -62,10 +63,9 @@ def shadow_terms(
         return wave_terms(shadow, rows, columns, spectrum)
 
     nodes = geometry.tilt_nodes(waves)
-    terms = tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, form) if nodes else form(shadow)
-    if geometry.pixel_fill_factor == 1:
-        return terms
-    return [(geometry.pixel_fill_factor * left, right) for left, right in terms]
+    terms = _tilted_terms(shadow, rows, columns, geometry.mask_tilt, nodes, form) if nodes else form(shadow)
+    part = geometry.pixel_fill_factor
+    return terms if part == 1 else [(part * left, right) for left, right in terms]
 
 
 # -------- A mask that is turned in its plane, or shakes
@@ -86,38 +86,37 @@ def shadow_terms(
 
 NODE_UM = 0.5
 """Shift between nodes: it errs by less than 1 % of the effect of a rotation by 1 mrad."""
-_REACH, _STEPS = 4.0, 25
-"""Deviations on either side over which a shaking mask is averaged, and number of places."""
-
-Shadow = Callable[[CameraGeometry], SeparableTerms]
-"""Function that returns the shadow of a camera whose mask is at rest."""
+_SHAKES = np.linspace(-4.0, 4.0, 25)
+"""Places over which a shaking mask is averaged, in standard deviations."""
 
 
-def moving_terms(
-    geometry: CameraGeometry, shadow: ShadowGeometry, rows: Directions, columns: Directions, at_rest: Shadow
+def _moving_terms(
+    geometry: CameraGeometry, shadow: ShadowGeometry, rows: Directions, columns: Directions, *others: Any
 ) -> SeparableTerms:
-    """Return the shadow of a camera whose mask is turned or shakes, as separable terms.
-
-    ``at_rest`` returns the terms of a camera with its mask at rest.
-    """
     motion = geometry.mask_motion
     assert motion is not None
-    still = geometry.model_copy(update={"mask_motion": None})
+    angle, deviation = motion.rotation_mrad / 1e3, motion.vibration_um / 1e3
+    weights = np.exp(-np.square(_SHAKES) / 2)
+    weights /= weights.sum()
 
-    def shift_mask(by_mm: float) -> SeparableTerms:
+    def shifted(by_mm: float) -> SeparableTerms:
         row, column = geometry.mask_offset
-        return at_rest(still.model_copy(update={"mask_offset_row": row - by_mm, "mask_offset_column": column - by_mm}))
+        moved = {"mask_motion": None, "mask_offset_row": row - by_mm, "mask_offset_column": column - by_mm}
+        return shadow_terms(geometry.model_copy(update=moved), rows, columns, *others)
 
     def shaking(by_mm: float) -> SeparableTerms:
-        return _mean_of(shift_mask, by_mm, motion.vibration_um / 1e3) if motion.vibration_um else shift_mask(by_mm)
+        if not deviation:
+            return shifted(by_mm)
+        # Factor by factor, because the axes shake independently.
+        parts = [shifted(by_mm + float(place) * deviation) for place in _SHAKES]
+        return [
+            tuple(sum(weight * pair[side] for weight, pair in zip(weights, pairs, strict=True)) for side in (0, 1))
+            for pairs in zip(*parts, strict=True)
+        ]
 
-    angle = motion.rotation_mrad / 1e3
     if not angle:
         return shaking(0.0)
-    row, column = (
-        shadow.along(axis).crossings(directions) - geometry.mask_offset[axis]
-        for axis, directions in enumerate((rows, columns))
-    )
+    row, column = _crossings(shadow, rows, columns)
     reach = abs(angle) * max(float(np.abs(row).max()), float(np.abs(column).max()))
     nodes = np.linspace(-reach, reach, max(2, 1 + int(np.ceil(2 * reach / (NODE_UM / 1e3)))))
     at_nodes = [shaking(float(node)) for node in nodes]
@@ -130,16 +129,10 @@ def moving_terms(
     ]
 
 
-def _mean_of(shifted: Callable[[float], SeparableTerms], by_mm: float, deviation_mm: float) -> SeparableTerms:
-    """Average terms over normal shifts, factor by factor, because the axes shake independently."""
-    places = np.linspace(-_REACH, _REACH, _STEPS)
-    weights = np.exp(-np.square(places) / 2)
-    weights /= weights.sum()
-    parts = [shifted(by_mm + float(place) * deviation_mm) for place in places]
-    return [
-        tuple(sum(weight * pair[side] for weight, pair in zip(weights, pairs, strict=True)) for side in (0, 1))
-        for pairs in zip(*parts, strict=True)
-    ]
+def _crossings(shadow: ShadowGeometry, rows: Directions, columns: Directions) -> list[FloatArray]:
+    """Return where rays toward rows and toward columns cross the mask, from its centre [mm]."""
+    both = enumerate((rows, columns))
+    return [shadow.along(axis).crossings(directions) - shadow.offset_mm[axis] for axis, directions in both]
 
 
 def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
@@ -166,7 +159,7 @@ def _hats(shift: FloatArray, nodes: FloatArray) -> list[FloatArray]:
 # (:mod:`mitsim.optics.diffraction`), which keeps them one profile.
 
 
-def tilted_terms(
+def _tilted_terms(
     shadow: ShadowGeometry,
     rows: Directions,
     columns: Directions,
@@ -174,33 +167,14 @@ def tilted_terms(
     nodes: tuple[int, int],
     formed: Callable[[ShadowGeometry], SeparableTerms],
 ) -> SeparableTerms:
-    """Return the shadow of a mask whose distance grows along both axes, as separable terms.
-
-    Parameters
-    ----------
-    shadow
-        Sensor, even mask and depth.
-    rows, columns
-        Directions.
-    tilt
-        Growth of the distance along rows and along columns.
-    nodes
-        Numbers of interpolation nodes; 1 where nothing moves.
-    formed
-        Function that returns the terms of a shadow whose axes have one tilt each.
-    """
     along, across = tilt
-    by_row, by_column = (
-        shadow.along(axis).crossings(directions) - shadow.offset_mm[axis]
-        for axis, directions in enumerate((rows, columns))
-    )
+    by_row, by_column = _crossings(shadow, rows, columns)
     first, second = nodes_between(by_column, nodes[0]), nodes_between(by_row, nodes[1])
     # One look at both axes serves a node of each; the last of fewer nodes is looked at again.
+    padded = [np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)]
     seen = [
         formed(replace(shadow, tilt=((along, across * float(row)), (across, along * float(column)))))
-        for row, column in zip(
-            *(np.pad(each, (0, max(nodes) - len(each)), "edge") for each in (first, second)), strict=True
-        )
+        for row, column in zip(*padded, strict=True)
     ]
     row_weights, column_weights = lagrange_weights(by_column, first), lagrange_weights(by_row, second)
     return [
@@ -258,8 +232,7 @@ def best_term(terms: SeparableTerms) -> BestTerm:
     values, split = _singular(terms)
     left, right = split(0)
     largest = max(terms, key=lambda pair: float(np.linalg.norm(pair[0]) * np.linalg.norm(pair[1])))
-    sign = 1.0 if np.vdot(left, largest[0]) >= 0 else -1.0
-    energy = np.square(values)
+    sign, energy = 1.0 if np.vdot(left, largest[0]) >= 0 else -1.0, np.square(values)
     return BestTerm(sign * left, sign * right, float(np.sqrt(energy[1:].sum() / energy.sum())))
 
 
@@ -326,10 +299,149 @@ def relative_difference(terms: SeparableTerms, reference: SeparableTerms) -> flo
 
 
 def centre_terms(terms: SeparableTerms) -> SeparableTerms:
-    """``terms`` of frames from which the means of rows and columns are taken: that of every factor's columns is."""
+    """Return the ``terms`` of frames without means of rows and columns: every factor's columns lose theirs."""
     return [(left - left.mean(axis=0), right - right.mean(axis=0)) for left, right in terms]
 
 
 def _energy(terms: SeparableTerms) -> float:
     left, right = (np.stack([np.ravel(pair[side]) for pair in terms]) for side in (0, 1))
     return max(float(((left @ left.T) * (right @ right.T)).sum()), 0.0)
+
+
+# -------- A camera as numbers that a fit can vary
+#
+# Column p of a factor is the mask's shadow of light from projector pixel p, geometric or wave-optical, in closed form,
+# times the losses of slanted rays between a flat diffuse board and a flat sensor: both cosines and the square of the
+# distance, z^2 / r^4 with r^2 = z^2 (1 + t_row^2 + t_column^2) and t = tau - u / z. As a product of the two axes,
+# (1 + t_row^2)^-2 (1 + t_column^2)^-2, the error is at most 2 t_row^2 t_column^2. All projector pixels are assumed to
+# be equally bright.
+#
+# A mask that is turned by a small angle phi from rows toward columns transmits r(s + phi t) c(t - phi s), which is not
+# separable. To first order it is L (x) R + phi (dL/ds (x) T o R - S o L (x) dR/dt), with S and T the mask coordinates
+# of rays from pixels to directions.
+
+_ANGLE = 2.0
+"""Half the power of the cosine: light from a flat board to a flat sensor falls with the fourth power."""
+_DERIVED_MM = 5e-4
+"""Shift of the mask for derivatives: a twentieth of a pixel."""
+_KEPT = 12
+"""Cached factors: one point, and one step of each number."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Positions of mask and projector, and brightness of the board.
+
+    Attributes
+    ----------
+    mask_distance
+        Sensor to mask [mm].
+    mask_shift_row, mask_shift_column
+        Shift of the mask's centre beyond the camera's own offset [mm], index coordinates.
+    mask_rotation
+        Rotation about its centre from rows toward columns [rad].
+    magnification
+        Scale of the projector's window about its centre.
+    projector_row, projector_column
+        Shift of the window [tangent of the angle].
+    gain
+        Electrons per second that a projector pixel on the board makes on a sensor pixel without the mask.
+    """
+
+    mask_distance: float
+    mask_shift_row: float = 0.0
+    mask_shift_column: float = 0.0
+    mask_rotation: float = 0.0
+    magnification: float = 1.0
+    projector_row: float = 0.0
+    projector_column: float = 0.0
+    gain: float = 1.0
+
+    def move(self, steps: Mapping[str, float]) -> Placement:
+        """Return a placement with ``steps`` added to some of its numbers, by name."""
+        return replace(self, **{name: getattr(self, name) + step for name, step in steps.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class ModelledCamera:
+    """Model of a camera as designed.
+
+    Attributes
+    ----------
+    geometry
+        The camera.
+    windows
+        Row and column tan-angles of the projector's window on the aligned plane.
+    n
+        Projector pixels per side.
+    spectrum
+        Lines of a wave-optical shadow; None for a geometric shadow.
+    """
+
+    geometry: CameraGeometry
+    windows: tuple[tuple[float, float], tuple[float, float]]
+    n: int
+    spectrum: Spectrum | None = None
+
+    @property
+    def built(self) -> Placement:
+        """Return the placement as designed."""
+        return Placement(self.geometry.mask_distance)
+
+    def factors(self, placement: Placement) -> tuple[FloatArray, FloatArray]:
+        """Return the (m, n) left and (m', n) right factor [sqrt(electrons / s)] of an unturned mask."""
+        left, right = self._cached_factors(replace(placement, gain=1.0, mask_rotation=0.0))
+        root = np.sqrt(placement.gain)
+        return left * root, right * root
+
+    @cached_property
+    def _cached_factors(self) -> Callable[[Placement], tuple[FloatArray, FloatArray]]:
+        @lru_cache(maxsize=_KEPT)
+        def axis(distance: float, offset: float, directions: Directions) -> SeparableTerms:
+            update = {"mask_distance": distance, "mask_offset_row": offset, "mask_offset_column": offset}
+            camera, depth = self.geometry.model_copy(update=update), self.geometry.scene_distance
+            squared = [np.square(directions.centres - camera.centres(of)[:, None] / depth) for of in (0, 1)]
+            by_row, by_column = ((1 + each) ** -_ANGLE * camera.angular_response(each) for each in squared)
+            terms = shadow_terms(camera, directions, directions, depth, self.spectrum)
+            return [(left * by_row, right * by_column) for left, right in terms]
+
+        @lru_cache(maxsize=_KEPT)
+        def form(placement: Placement) -> tuple[FloatArray, FloatArray]:
+            shifts = placement.mask_shift_row, placement.mask_shift_column
+            by_row, by_column = (
+                axis(placement.mask_distance, own + shift, directions)
+                for own, shift, directions in zip(
+                    self.geometry.mask_offset, shifts, self._directions(placement), strict=True
+                )
+            )
+            terms = [(left, right) for (left, _), (_, right) in zip(by_row, by_column, strict=True)]
+            best = best_term(centre_terms(terms) if self.geometry.centred else terms)
+            return best.left, best.right
+
+        return form
+
+    def rotation_terms(self, placement: Placement) -> SeparableTerms:
+        """Return the change of the product of the factors per radian of rotation of the mask at a ``placement``."""
+        step = {"mask_shift_row": _DERIVED_MM, "mask_shift_column": _DERIVED_MM}
+        ahead = self.factors(placement.move(step))
+        behind = self.factors(placement.move({name: -value for name, value in step.items()}))
+        # A mask that moves on by o is seen at s - o.
+        slopes = [(back - on) / (2 * _DERIVED_MM) for on, back in zip(ahead, behind, strict=True)]
+        left, right = self.factors(placement)
+        geometry, distance = self.geometry, placement.mask_distance
+        shifts = placement.mask_shift_row, placement.mask_shift_column
+        across, along = (
+            (1 - distance / geometry.scene_distance) * geometry.centres(axis)[:, None]
+            + distance * each.centres
+            - geometry.mask_offset[axis]
+            - shifts[axis]
+            for axis, each in enumerate(self._directions(placement))
+        )
+        return [(slopes[0], along * right), (-across * left, slopes[1])]
+
+    def _directions(self, placement: Placement) -> tuple[Directions, Directions]:
+        edges = []
+        for window, shift in zip(self.windows, (placement.projector_row, placement.projector_column), strict=True):
+            middle, half = sum(window) / 2 + shift, (window[1] - window[0]) / 2 * placement.magnification
+            edges.append(np.linspace(middle - half, middle + half, self.n + 1))
+        return Directions.cells(edges[0]), Directions.cells(edges[1])

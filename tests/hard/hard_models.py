@@ -9,8 +9,8 @@ import pytest
 
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import Prepared
+from tests.shadow_factor import scene_factor
 
 EPS = float(np.finfo(np.float64).eps)
 NUMBER = r"(inf|\d\.\de[+-]\d\d)"

@@ -22,11 +22,11 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import LARGEST_ERROR, UNKNOWN_NOISE, Estimate, estimate_factors
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report.reconstruct_run import reconstruct
 from tests.robustness import Recorder
+from tests.shadow_factor import scene_factor
 
 pytestmark = pytest.mark.robustness("Calibration")
 N, PIXELS = 16, 64

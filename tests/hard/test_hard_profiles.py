@@ -13,6 +13,7 @@ from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.fft_shadow import ProfileSampler
 from tests.hard.exact_shadows import EPS, exact_mean, power
 from tests.robustness import Recorder
+from tests.shadow_factor import steps_of
 
 pytestmark = pytest.mark.robustness("Optics")
 
@@ -95,7 +96,7 @@ def test_samplers_of_mirrored_light_equal_fractions(
 def test_cells_of_a_fine_grid_keep_their_values_in_a_mask_of_four_metres() -> None:
     """65 535 features and cells of 1 nm: exact inside features; differences of sums of 2 m had 1e-7 left."""
     bits = mls_mask(order=16).bits
-    steps = Steps.of(bits, 0.06)
+    steps = steps_of(bits, 0.06)
     for k in range(60_000, 60_020):
         start = (k - len(bits) / 2) * 0.06 + 0.013
         assert (steps.cell_means(start, 1e-6, 100) == bits[k]).all()

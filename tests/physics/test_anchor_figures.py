@@ -10,8 +10,8 @@ import pytest
 
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.solver import prepare
+from tests.shadow_factor import scene_factor
 
 
 @pytest.mark.parametrize(("k", "condition"), [(1, 7.03e6), (5, 545.0), (8, 92.6)])

@@ -20,6 +20,7 @@ from mitsim.optics.diffraction import EdgeWaves, edge_wave, fast_length, grid_st
 from mitsim.optics.edge_profile import Antiderivative, Steps
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.optics.terms import shadow_terms
+from tests.shadow_factor import steps_of
 
 STEP = 2.5e-4
 LAMBDA_NM = 550.0
@@ -273,7 +274,7 @@ def test_light_is_neither_made_nor_lost() -> None:
     """The integral of |U|^2 over the sensor's plane is the open area, but for light that left past 4 mm."""
     bits = code(5)
     waves = EdgeWaves(LAMBDA_NM, 2.0, STEP, 40_000, 20.0)
-    got = float((np.abs(waves.field(Steps.of(bits, 0.06), -5.0)) ** 2).sum() * STEP)
+    got = float((np.abs(waves.field(steps_of(bits, 0.06), -5.0)) ** 2).sum() * STEP)
     # An edge sends lambda D / (4 pi^2 x) of the light per unit length past a distance x on either side; the fade-out
     # from 1.65 mm to 2.2 mm takes that of about 2 mm.
     edges = int(np.abs(np.diff(bits, prepend=0, append=0)).sum())

@@ -48,7 +48,7 @@ def predicted(light: SampledLight) -> float:
 def points(bench: Bench, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices of some pixels, and where they are."""
     index = np.arange(step // 2, PIXELS, step)
-    return index, bench.geometry.pixel_centres[index]
+    return index, bench.geometry.centres(1)[index]
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.projector import Spectrum
 from mitsim.devices.session import FITTED, UNITS, Modelling, frames_of
-from mitsim.optics.camera_model import ModelledCamera, Placement
+from mitsim.optics.terms import ModelledCamera, Placement
 
 N = 16
 LINE = Spectrum(np.array([550.0]), np.ones(1))
@@ -140,7 +140,7 @@ def test_a_turned_mask_casts_the_shadow_that_rays_through_it_make() -> None:
     angle, model = 5e-3, camera(None)
     geometry = model.geometry
     fine, points = 16, 4
-    u = geometry.pixel_centres[:, None] + geometry.pixel_pitch * ((np.arange(fine) + 0.5) / fine - 0.5)
+    u = geometry.centres(0)[:, None] + geometry.pixel_pitch * ((np.arange(fine) + 0.5) / fine - 0.5)
     u = u.ravel()
     width = 0.3 / N
     tau = -0.15 + width * (np.arange(N * points) + 0.5) / points
@@ -222,7 +222,7 @@ def test_a_turn_acts_where_rays_cross_the_mask() -> None:
     model, placement = camera(None, depth=8.0), Placement(2.01, 0.02, -0.03, gain=5.0)
     left, right = model.factors(placement)
     (_, by_columns), (by_rows, _) = model.rotation_terms(placement)
-    pixels, edges = model.geometry.pixel_centres[:, None], np.linspace(-0.15, 0.15, N + 1)
+    pixels, edges = model.geometry.centres(0)[:, None], np.linspace(-0.15, 0.15, N + 1)
     board = 8.0 * (edges[:-1] + edges[1:]) / 2
     crossing = pixels + (board - pixels) * 2.01 / 8.0
     np.testing.assert_allclose(by_columns, (crossing + 0.03) * right, rtol=0, atol=1e-12 * right.max())

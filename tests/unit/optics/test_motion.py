@@ -37,7 +37,7 @@ def drawn(angle: float, pixel: tuple[int, int], cell: tuple[int, int], parts: in
     shadow = ShadowGeometry.of(CAMERA, DEPTH)
     steps = (np.arange(parts) + 0.5) / parts - 0.5
     row, column = (
-        shadow.shrink * (CAMERA.pixel_centres[index] + CAMERA.pixel_pitch * steps)
+        shadow.shrink * (CAMERA.centres(0)[index] + CAMERA.pixel_pitch * steps)
         + CAMERA.mask_distance * directions.centres[place]
         - offset
         for index, directions, place, offset in zip(pixel, (ROWS, COLUMNS), cell, CAMERA.mask_offset, strict=True)

@@ -7,11 +7,11 @@ from scipy.special import ndtr
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.optics.edge_profile import Antiderivative, Steps, blurred_step
-from mitsim.optics.shadow import scene_factor
+from tests.shadow_factor import scene_factor, steps_of
 
 
 def test_neighbours_of_equal_value_are_merged_and_outside_is_zero() -> None:
-    steps = Steps.of([1, 1, 0, 2], 0.5)
+    steps = steps_of([1, 1, 0, 2], 0.5)
     assert np.array_equal(steps.edges, [-1.0, 0.0, 0.5, 1.0])
     assert np.array_equal(steps.values, [1.0, 0.0, 2.0])
     assert np.array_equal(steps.at(np.array([-1.01, -1.0, 0.2, 0.5, 0.99, 1.0])), [0, 1, 0, 2, 2, 0])
@@ -27,7 +27,7 @@ def test_functions_are_equal_by_edges_and_values() -> None:
 
 def test_a_product_holds_at_every_point() -> None:
     rng = np.random.default_rng(4)
-    one, other = (Steps.of(rng.integers(-1, 2, 12), 0.3) for _ in range(2))
+    one, other = (steps_of(rng.integers(-1, 2, 12), 0.3) for _ in range(2))
     product = one.seen_through(other, 0.9, 0.17)
     s = rng.uniform(-3, 3, 2000)
     assert np.array_equal(product.at(s), one.at(s) * other.at(0.9 * s + 0.17))
@@ -61,7 +61,7 @@ def test_the_second_difference_loses_nothing_that_matters() -> None:
     u, tau = (pixels[:-1] + pixels[1:]) / 2, (scene[:-1] + scene[1:]) / 2 / 400
     centres = u[:, None] * (1 - 2 / 400) + 2 * tau
     half_pixel, half_cell = 0.01172 / 2 * (1 - 2 / 400), 2 * 120 / 128 / 400 / 2
-    steps = Steps.of(profile, 0.06)
+    steps = steps_of(profile, 0.06)
     assert np.abs(steps.box_means(centres, half_pixel, half_cell) - expected).max() < 1e-11
     # The same from 26 000 samples: features hold a whole number of them, so this too is exact.
     fine = steps.cell_means(-3.6, 2.5e-4, 28_800)

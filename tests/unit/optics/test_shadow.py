@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry, centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms, scene_factor, shadow_factor
+from mitsim.optics.shadow import Directions, ShadowGeometry, geometric_terms
 from mitsim.optics.terms import shadow_terms
+from tests.shadow_factor import scene_factor, shadow_factor
 
 ANCHOR = (0.06, centred_edges(512, 0.01172), centred_edges(128, 120 / 128), 2.0, 400.0)
 
@@ -97,32 +98,10 @@ def test_finer_cells_average_to_coarse_ones():
     np.testing.assert_allclose(fine.reshape(10, 2, 12, 5).mean(axis=(1, 3)), coarse, atol=1e-13)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"depth_mm": 2.0},
-        {"depth_mm": float("nan")},
-        {"mask_distance_mm": -1.0},
-        {"feature_mm": 0.0},
-        {"profile": []},
-        {"profile": [np.nan]},
-        {"pixel_edges_mm": [1.0, 0.0]},
-        {"pixel_edges_mm": [0.0, 1.0, 0.5]},
-        {"cell_edges_tan": [0.0]},
-    ],
-)
-def test_bad_arguments_are_refused_in_one_line(change):
-    good = {
-        "profile": [1, 0],
-        "feature_mm": 0.1,
-        "pixel_edges_mm": [0.0, 1.0],
-        "cell_edges_tan": [0.0, 1.0],
-        "mask_distance_mm": 2.0,
-        "depth_mm": 10.0,
-    }
-    assert shadow_factor(**good).shape == (1, 1)
+@pytest.mark.parametrize("depth", [2.0, float("nan")])
+def test_a_scene_at_the_mask_is_refused_in_one_line(depth):
     with pytest.raises(MitsimError, match=r"^[^\n]+$"):
-        shadow_factor(**(good | change))
+        ShadowGeometry(mls_mask(), np.zeros(1), 0.1, 2.0, 0.0, depth)
 
 
 def test_point_directions_average_over_the_pixel_alone():

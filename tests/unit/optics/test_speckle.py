@@ -6,7 +6,7 @@ from scipy import stats
 
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import stream
-from mitsim.optics.speckle import add_speckle
+from mitsim.optics.frames import add_speckle
 
 LIGHT = np.full((400, 500), 3.0)
 ALPHA = 1e-4  # of each test below; 200 000 pixels

@@ -10,7 +10,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry, Devices
 from mitsim.devices.projector import Coherence, ProjectorModel
-from mitsim.optics.speckle import _between_pixels, contrast_of
+from mitsim.optics.frames import _between_pixels, contrast_of
 from tests.invented import sensor
 
 N, POINTS, SIDE = 8, 6, 0.5  # projector pixels a side, points a pixel, a pixel's side [mm]

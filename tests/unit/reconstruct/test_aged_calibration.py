@@ -19,11 +19,11 @@ from mitsim.core.manifests import MANIFEST, Parallax
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.metrics import psnr
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import CALIBRATION_ERROR, Bench, picture
 from tests.known_camera import PLANES, KnownCamera, write_known
+from tests.shadow_factor import scene_factor
 
 N, PIXELS, PITCH, DISTANCE, DEPTH, WIDTH = 32, 128, 0.015, 2.0, 400.0, 120.0
 PARALLAX = Parallax(

@@ -7,7 +7,6 @@ from scipy.linalg import hadamard
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import (
     AmbientLight,
     StripeSums,
@@ -20,6 +19,7 @@ from mitsim.reconstruct.factors import (
 )
 from mitsim.reconstruct.solution import Verdict
 from mitsim.reconstruct.solver import prepare
+from tests.shadow_factor import scene_factor
 
 N, M = 16, 40
 H = hadamard(N).astype(float)

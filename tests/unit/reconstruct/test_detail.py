@@ -7,7 +7,6 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import parse_patterns
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulation import (
     LitFrame,
     Model,
@@ -22,6 +21,7 @@ from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solver import prepare
 from mitsim.reconstruct.uncertainty import Propagation
 from tests.ideal_sessions import PITCH, PIXELS, Bench, N, shadow
+from tests.shadow_factor import scene_factor
 
 FINE = 8
 """Parts of a scene pixel's side."""

@@ -15,12 +15,12 @@ from scipy.ndimage import gaussian_filter
 from mitsim.core.manifests import Patterns
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.picture_check import PictureCheck
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from mitsim.reconstruct.solution import Verdict
 from tests.ideal_sessions import BLACK, DARK, GAIN, PIXELS, READ, Bench, bench, picture, shadow
+from tests.shadow_factor import scene_factor
 
 FAMILIES = "dots:4", "hadamard:4", "random:4", "dots:1x8"
 Frames = list[np.ndarray]

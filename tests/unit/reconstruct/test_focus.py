@@ -19,13 +19,14 @@ from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
+from tests.shadow_factor import scene_factor
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import ColumnSpline, FactorOfDepths, move_factors
 from mitsim.reconstruct.misfit import Cause
 from mitsim.reconstruct.reconstruct import Reconstruction, reconstruct
 from tests.ideal_sessions import PEAK, PITCH, PIXELS, Bench, picture
+from tests.shadow_factor import scene_factor
 from tests.unit.reconstruct.test_faults import dark, with_frames
 
 N = 40

@@ -12,11 +12,11 @@ from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import widen_factors
 from mitsim.reconstruct.reconstruct import reconstruct
 from tests.ideal_sessions import PITCH, PIXELS, Bench, picture
+from tests.shadow_factor import scene_factor
 from tests.unit.reconstruct.test_focus import PARALLAX, WINDOW, N, shadow
 
 CARD = 3

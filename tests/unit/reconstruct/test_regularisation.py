@@ -11,7 +11,6 @@ import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.reconstruct.accumulation import accumulate
 from mitsim.reconstruct.solver import (
     RISK_POWER,
@@ -27,6 +26,7 @@ from mitsim.reconstruct.solver import (
 )
 from mitsim.reconstruct.solvers import solve_tv
 from tests.ideal_sessions import PIXELS, Bench, shadow
+from tests.shadow_factor import scene_factor
 
 N = 128
 

@@ -10,11 +10,11 @@ import pytest
 import mitsim as ms
 from mitsim.core.errors import MitsimError
 from mitsim.devices.mask import mls_mask
-from mitsim.optics.shadow import scene_factor
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.report.lit_scene import DIM, DIM_E, Plane, bin_frame
 from mitsim.studies.framework.experiment import SIDE, TEST_IMAGES, Setup, picture
 from mitsim.studies.framework.studio import Image, Studio
+from tests.shadow_factor import scene_factor
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 
