@@ -176,8 +176,9 @@ def _always(*light: str) -> Callable[[Physics], frozenset[str]]:
 
 
 def _diffraction(bench: Apparatus) -> str:
-    wavelength = bench.projector.effective_wavelength_nm
-    number, lines = bench.geometry.fresnel_number(wavelength), len(bench.spectrum.weights)
+    camera, wavelength = bench.geometry, bench.projector.effective_wavelength_nm
+    # a^2 / (lambda d): well above 1, a geometric shadow is good.
+    number, lines = camera.mask_feature**2 / (wavelength * 1e-6 * camera.mask_distance), len(bench.spectrum.weights)
     counted = f"{lines} line{'s' if lines > 1 else ''}"
     return f"a mask feature's Fresnel number is {number:.1f} at {wavelength:.0f} nm, {counted}"
 

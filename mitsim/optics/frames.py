@@ -324,9 +324,7 @@ class ExpectedFrames:
     def _shape(self) -> tuple[int, int]:
         return self._lights[0].optics.frame_shape
 
-    def _frames(
-        self, irradiance: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False
-    ) -> list[Frame]:
+    def _frames(self, light: Sequence[FloatArray], probes: Sequence[FloatArray], owned: bool = False) -> list[Frame]:
         ambient, count = self._ambient_light, self._groups
         pairs = count * (count - 1)
 
