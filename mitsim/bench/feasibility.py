@@ -12,8 +12,7 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.devices.mask import Mask
-from mitsim.devices.mask_profile import is_odd_prime
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.patterns import PatternFamily, is_prime
 from mitsim.devices.plate import Plate
 from mitsim.optics.shadow import Directions, ShadowGeometry
 from mitsim.scene.darkness import why_dark
@@ -131,7 +130,7 @@ def _beyond_one(values: FloatArray) -> float:
 def _larger(feature_mm: float, needed_mm: float, of_a_file: bool) -> str:
     least, feature = math.ceil(needed_mm / feature_mm), f"{feature_mm * 1e3:g} um"
     if of_a_file:
-        return f"use at least {next(n for n in count(least) if is_odd_prime(n))} features of {feature}"
+        return f"use at least {next(n for n in count(least) if n > 2 and is_prime(n))} features of {feature}"
     order = least.bit_length()
     return f"use order {order} ({2**order - 1} features of {feature}), or larger features"
 

@@ -364,27 +364,16 @@ def draw_dust(lines: FloatArray, values: FloatArray, dust: Dust, reach_mm: float
     finer = np.unique(np.concatenate((lines, (centres.ravel()[:, None] + across).ravel())))
     finer = finer[(finer >= lines[0]) & (finer <= lines[-1])]
     place = np.searchsorted(lines, (finer[1:] + finer[:-1]) / 2) - 1
-    result = np.asarray(values[np.ix_(place, place)])
+    result, radius = np.asarray(values[np.ix_(place, place)]), dust.radius_mm
     for centre in centres:
-        rows, columns = (_cells_within(finer - at, dust.radius_mm) for at in centre)
-        part = _disc_part(
-            finer[rows.start : rows.stop + 1] - centre[0],
-            finer[columns.start : columns.stop + 1] - centre[1],
-            dust.radius_mm,
+        row_lines, column_lines = (finer - at for at in centre)
+        rows, columns = (  # cells that the disc meets
+            slice(max(int(np.searchsorted(at, -radius, side="right")) - 1, 0), int(np.searchsorted(at, radius)))
+            for at in (row_lines, column_lines)
         )
-        result[rows, columns] *= 1 - dust.opacity * part
+        r, c = row_lines[rows.start : rows.stop + 1], column_lines[columns.start : columns.stop + 1]
+        chords = r[:-1, None] + np.diff(r)[:, None] * ((np.arange(_CHORDS) + 0.5) / _CHORDS)
+        half = np.sqrt(np.maximum(radius**2 - chords**2, 0))[:, :, None]
+        within = np.diff(np.clip(c, -half, half), axis=2).mean(axis=1)
+        result[rows, columns] *= 1 - dust.opacity * np.minimum(within / np.diff(c), 1)
     return finer, result
-
-
-def _cells_within(lines: FloatArray, radius: float) -> slice:
-    """The cells between ``lines`` that a disc of that ``radius`` about 0 meets."""
-    return slice(max(int(np.searchsorted(lines, -radius, side="right")) - 1, 0), int(np.searchsorted(lines, radius)))
-
-
-def _disc_part(rows: FloatArray, columns: FloatArray, radius: float) -> FloatArray:
-    """(r, c) part of each cell between lines ``rows`` (r + 1,) and ``columns`` (c + 1,) within a ``radius`` of 0."""
-    width = np.diff(rows)
-    at = rows[:-1, None] + width[:, None] * ((np.arange(_CHORDS) + 0.5) / _CHORDS)
-    half = np.sqrt(np.maximum(radius**2 - at**2, 0))[:, :, None]
-    within: npt.NDArray[np.float64] = np.diff(np.clip(columns, -half, half), axis=2).mean(axis=1)
-    return np.asarray(np.minimum(within / np.diff(columns), 1))

@@ -19,6 +19,7 @@ from mitsim.core.job import Cost, Limits
 from mitsim.core.seeds import stream
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Dust, Flaws, MaskKind, etch, mls_mask
+from mitsim.devices.patterns import is_prime
 from mitsim.devices.plate import LARGEST, Plate, make_square, read_drawing
 
 KINDS: Mapping[str, str] = MappingProxyType({
@@ -32,20 +33,13 @@ KINDS: Mapping[str, str] = MappingProxyType({
 })  # fmt: skip
 """What each kind of mask is."""
 _OWN = {
-    **dict.fromkeys(get_args(MaskKind), ("order",)),
-    "mura": ("features",),
-    "random": ("features", "open_part", "seed"),
-    "drawing": ("file",),
-    "psf": ("file", "psf_distance_mm", "aperture_mm2", "psf_reduce"),
+    **dict.fromkeys(get_args(MaskKind), "order"),
+    "mura": "features!",
+    "random": "features! open_part seed",
+    "drawing": "file!",
+    "psf": "file! psf_distance_mm! aperture_mm2! psf_reduce",
 }
-"""The fields that each kind has beside its name and the feature size."""
-_NEEDED = {
-    "mura": ("features",),
-    "random": ("features",),
-    "drawing": ("file",),
-    "psf": ("file", "psf_distance_mm", "aperture_mm2"),
-}
-"""Those that it cannot do without."""
+"""Fields that each kind has beside its name and the feature size; with !, those that it cannot do without."""
 _FLAWS = {
     "over_etch_um", "edge_blur_um", "opaque_transmission", "clear_transmission", "rotation_deg", "tilt_row_mrad",
     "tilt_column_mrad", "dust_per_mm2", "dust_radius_um", "dust_opacity", "dust_seed",
@@ -112,13 +106,14 @@ class MaskProfile(Configuration):
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> MaskProfile:
         flaws = set() if self.kind == "psf" else _FLAWS
-        foreign = self.model_fields_set - {"kind", "feature_mm", *_OWN[self.kind], *flaws}
+        own = _OWN[self.kind].split()
+        foreign = self.model_fields_set - {"kind", "feature_mm", *(name.rstrip("!") for name in own), *flaws}
         if foreign:
             raise ValueError(f"{min(foreign)} says nothing of a mask {self.kind}; remove it")
-        missing = [name for name in _NEEDED.get(self.kind, ()) if getattr(self, name) is None]
+        missing = [name[:-1] for name in own if name.endswith("!") and getattr(self, name[:-1]) is None]
         if missing:
             raise ValueError(f"a mask {self.kind} needs {missing[0]}; add it")
-        if self.kind == "mura" and not is_odd_prime(self.features or 0):
+        if self.kind == "mura" and not (is_prime(self.features or 0) and self.features != 2):
             raise ValueError(f"features: got {self.features}; a MURA has an odd prime, as 101 or 251")
         if self.opaque_transmission >= self.clear_transmission:
             raise ValueError(
@@ -129,15 +124,10 @@ class MaskProfile(Configuration):
             raise ValueError(f"over_etch_um: got {self.over_etch_um:g}; give less than {_MOST_GROWTH} features")
         return self
 
-    @property
-    def flawless(self) -> bool:
-        """Whether it is made and mounted as it is drawn."""
-        return not self._stated
-
     def plate(self, folder: Path) -> Plate:
         """The plate as it is made; files count from ``folder``. MitsimError for one too large."""
         drawn = self.plate_drawing(folder)
-        if self.flawless:
+        if not self._stated:
             return drawn
         values, lines, feature = drawn.values, None, drawn.feature_mm
         if self.over_etch_um:
@@ -149,11 +139,10 @@ class MaskProfile(Configuration):
             lines, values = etch(values, feature, self.over_etch_um * 1e-3)
         values = self.opaque_transmission + (self.clear_transmission - self.opaque_transmission) * values
         extent = drawn.extent_mm + 2 * max(self.over_etch_um, 0.0) * 1e-3
-        dust = (
-            Dust.scatter(self.dust_per_mm2, self.dust_radius_um * 1e-3, self.dust_opacity, extent, self.dust_seed)
-            if self.dust_per_mm2
-            else None
-        )
+        dust = None
+        if self.dust_per_mm2:
+            radius = self.dust_radius_um * 1e-3
+            dust = Dust.scatter(self.dust_per_mm2, radius, self.dust_opacity, extent, self.dust_seed)
         turn = self.rotation_deg
         if turn % _QUARTER == 0:
             quarters = int(turn // _QUARTER)
@@ -226,7 +215,7 @@ class MaskProfile(Configuration):
         if self.kind == "psf":
             picture = self.plate_of_light(folder, camera.mask_distance)
             mask |= {"mask": "plate", "mask_plate": picture, "mask_feature": picture.feature_mm}
-        elif self.kind in get_args(MaskKind) and self.flawless:
+        elif self.kind in get_args(MaskKind) and not self._stated:
             mask |= {"mask": self.kind, "mask_order": self.order}
         else:
             mask |= {"mask": "plate", "mask_plate": self.plate(folder)}
@@ -254,11 +243,6 @@ def load_mask(path: Path | str) -> MaskProfile | None:
     if not isinstance(table["mask"], dict):
         raise MitsimError(f"file {path}: mask: got {table['mask']!r}; give a table [mask]")
     return validate(MaskProfile, table.part("mask"), f"file {path}")
-
-
-def is_odd_prime(number: int) -> bool:
-    """Return True if a MURA can have this ``number`` of features a side."""
-    return number > 2 and all(number % divisor for divisor in range(2, int(number**0.5) + 1))
 
 
 # -------- Pictures of point spread functions
@@ -310,7 +294,9 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
         raise _PICTURE.refusal(
             path, f"{rows} x {columns} pixels; at most {most} a side make a mask, so set a larger psf_reduce"
         )
-    values = _grey(path, size)
+    Cost(memory_bytes=size[0] * size[1] * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
+    values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
+    values = values if values.ndim == 2 else values[..., :3].mean(axis=2)
     inside = np.zeros(values.shape, dtype=bool)
     inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
     above = values - np.median(values[~inside])
@@ -320,10 +306,3 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
     if total <= 0:
         raise _PICTURE.refusal(path, "nothing is brighter than its edges; give another picture")
     return np.asarray(light / total)
-
-
-def _grey(path: Path, size: tuple[int, int]) -> FloatArray:
-    rows, columns = size
-    Cost(memory_bytes=rows * columns * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
-    values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
-    return values if values.ndim == 2 else np.asarray(values[..., :3].mean(axis=2))

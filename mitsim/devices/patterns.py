@@ -159,9 +159,8 @@ def way_to(order: int) -> Way:
     """
     way = _way(order)
     if way is None:
-        below = max((o for o in hadamard_orders(order) if o < order), default=1)
-        above = next(o for o in range(order + 1, 4 * order + 5) if _way(o))
-        raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below} or {above}")
+        below, above = hadamard_orders(order)[-1:] or [1], next(o for o in range(order + 1, 4 * order + 5) if _way(o))
+        raise MitsimError(f"no Hadamard matrix of order {order} is available; use {below[0]} or {above}")
     return way
 
 
@@ -175,10 +174,10 @@ def stripe_count(n: int) -> int:
 
     MitsimError where no order up to 2 n is reached.
     """
-    for order in range(n, 2 * n + 1):  # with a power of two among them
-        if _way(order):
-            return order
-    raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
+    found = next(filter(_way, range(n, 2 * n + 1)), None)  # with a power of two among them
+    if found is None:
+        raise MitsimError(f"no Hadamard matrix for {n} projector pixels; use another number of pixels")
+    return found
 
 
 @cache
@@ -187,17 +186,18 @@ def _way(order: int) -> Way | None:
         return None
     if order & (order - 1) == 0:
         return "doubled", order
-    if _is_prime(order - 1) and (order - 1) % 4 == 3:
+    if is_prime(order - 1) and (order - 1) % 4 == 3:
         return "skew", order - 1
     half = order // 2
-    if _is_prime(half - 1) and (half - 1) % 4 == 1:
+    if is_prime(half - 1) and (half - 1) % 4 == 1:
         return "symmetric", half - 1
     factors = (factor for factor in range(2, half + 1) if order % factor == 0)
     found = next((factor for factor in factors if _way(factor) and _way(order // factor)), None)
     return None if found is None else ("product", found)
 
 
-def _is_prime(value: int) -> bool:
+def is_prime(value: int) -> bool:
+    """Return True if ``value`` is a prime."""
     return value > 1 and all(value % factor for factor in range(2, int(value**0.5) + 1))
 
 
@@ -402,10 +402,18 @@ def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
         raise ArgumentError("patterns", f"{text!r}: use {pattern_names()}")
     rows, _, columns = size.partition("x")
     both = [rows, columns] if f"{name}:RxC" in family.forms and rows and columns else [size or "1"]
-    periods = [_period(text, period, n) for period in both]
-    for period in periods:
-        if family.check is not None and period <= _MOST_CHECKED:
-            family.check(period)
+    most = "the projector's pixels a side" if n is None else str(n)
+    periods = []
+    for period in both:
+        if not (period.isascii() and period.isdigit() and len(period) <= _MOST_DIGITS):
+            raise MitsimError(f"patterns {text!r}: K is {period!r}; give a whole number from 1 to {most}")
+        k = int(period)
+        if k < 1 or (n is not None and k > n):
+            more = "" if n is None else ", the projector's pixels a side"
+            raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}{more}")
+        if family.check is not None and k <= _MOST_CHECKED:
+            family.check(k)
+        periods.append(k)
     return family, periods
 
 
@@ -419,18 +427,6 @@ def shot_count(text: str) -> int:
     """How many shots the patterns ``text`` take, two of each with the value -1. MitsimError as :func:`read_name`."""
     family, periods = read_name(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
-
-
-def _period(text: str, size: str, n: int | None) -> int:
-    """K of the patterns ``text``, written as ``size``, for ``n`` projector pixels a side, or any number of them."""
-    if not (size.isascii() and size.isdigit() and len(size) <= _MOST_DIGITS):
-        most = "the projector's pixels a side" if n is None else n
-        raise MitsimError(f"patterns {text!r}: K is {size!r}; give a whole number from 1 to {most}")
-    k = int(size)
-    if k < 1 or (n is not None and k > n):
-        most = "the projector's pixels a side" if n is None else f"{n}, the projector's pixels a side"
-        raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}")
-    return k
 
 
 def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:

@@ -82,18 +82,15 @@ class Lines:
     @property
     def single(self) -> tuple[Lines, ...]:
         """Each of them alone."""
-        pairs = zip(self.wavelengths_nm, self.shares, strict=True)
-        return tuple(Lines((wavelength,), (share,)) for wavelength, share in pairs)
+        return tuple(Lines((nm,), (share,)) for nm, share in zip(self.wavelengths_nm, self.shares, strict=True))
 
     @property
     def apart(self) -> tuple[Lines, ...]:
         """Each of them at its own place among all: a path carries the one, and the others are that wavelength without
         power."""
-        size = len(self.shares)
-        return tuple(
-            Lines((wavelength,) * size, tuple(share if at == place else 0.0 for at in range(size)))
-            for place, (wavelength, share) in enumerate(zip(self.wavelengths_nm, self.shares, strict=True))
-        )
+        size, pairs = len(self.shares), zip(self.wavelengths_nm, self.shares, strict=True)
+        alone = [(nm, tuple(share * (at == place) for at in range(size))) for place, (nm, share) in enumerate(pairs)]
+        return tuple(Lines((nm,) * size, shares) for nm, shares in alone)
 
     @property
     def mean_nm(self) -> float:
@@ -166,18 +163,6 @@ class Coherence(Configuration):
         if self.linewidth_nm and self.roughness_um is None:
             raise ValueError(f"linewidth_nm: got {self.linewidth_nm:g} without roughness_um; give both")
         return self
-
-
-def chessboard_means(spread: float) -> tuple[float, float]:
-    """What a Gaussian of standard deviation ``spread`` leaves of a picture of side 1 at the middles of its four fields
-    along one axis: of an even picture, and of one that is +1 and -1 in turn, times the field's own sign; means."""
-    even, signed = [], []
-    for field in range(_FIELDS):
-        below = [NormalDist((field + 0.5) / _FIELDS, spread).cdf(edge / _FIELDS) for edge in range(_FIELDS + 1)]
-        parts = [after - before for before, after in pairwise(below)]
-        even.append(sum(parts))
-        signed.append(sum(part * (-1) ** (other - field) for other, part in enumerate(parts)))
-    return mean(even), mean(signed)
 
 
 class ProjectorModel(Configuration):
@@ -261,7 +246,7 @@ class ProjectorModel(Configuration):
     """Where the numbers come from."""
 
     @model_validator(mode="after")
-    def _lines_have_shares(self) -> ProjectorModel:
+    def _fields_fit_together(self) -> ProjectorModel:
         if len(self.wavelengths_nm) != len(self.radiant_shares):
             raise ValueError(
                 f"{len(self.wavelengths_nm)} wavelengths_nm and {len(self.radiant_shares)} radiant_shares; "
@@ -269,19 +254,9 @@ class ProjectorModel(Configuration):
             )
         if self.radiant_shares and not sum(self.radiant_shares) > 0:
             raise ValueError("radiant_shares are all 0; at least one line must have power")
-        return self
-
-    @model_validator(mode="after")
-    def _one_contrast(self) -> ProjectorModel:
         if self.speckle is not None and "speckle_contrast" in self.model_fields_set:
             raise ValueError(f"got speckle_contrast {self.speckle_contrast:g} and the table speckle; give one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _a_chessboard_can_have_its_contrast(self) -> ProjectorModel:
-        if self.ansi_contrast is None:
-            return self
-        if not self.ansi_contrast < self.contrast_ratio:
+        if self.ansi_contrast is not None and not self.ansi_contrast < self.contrast_ratio:
             raise ValueError(
                 f"ansi_contrast: got {self.ansi_contrast:g}, and black pixels leave {self.contrast_ratio:g} "
                 "(contrast_ratio); give less"
@@ -291,10 +266,6 @@ class ProjectorModel(Configuration):
                 f"ansi_contrast: got {self.ansi_contrast:g}, which a lens that scatters all light exceeds at "
                 f"glare_spread {self.glare_spread:g}; give more"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _listed_fields_exist(self) -> ProjectorModel:
         unknown = [name for name in (*self.assumed, *self.derived) if name not in type(self).model_fields]
         if unknown:
             raise ValueError(f"assumed and derived list fields of this file, and {unknown[0]!r} is none")
@@ -307,14 +278,23 @@ class ProjectorModel(Configuration):
 
     @property
     def glare(self) -> float:
-        """Part of a pixel's light that the lens scatters: that with which a chessboard has the ``ansi_contrast``."""
+        """Return the part of a pixel's light that the lens scatters, with which a chessboard has the ``ansi_contrast``.
+
+        A Gaussian leaves, of a picture of side 1 at the middles of its four fields along one axis, the parts ``even``
+        of an even picture and ``fields`` of one that is +1 and -1 in turn, times the field's own sign.
+        """
         if self.ansi_contrast is None:
             return 0.0
+        shares: list[list[float]] = []
+        for field in range(_FIELDS):
+            place = NormalDist((field + 0.5) / _FIELDS, self.glare_spread)
+            shares.append([b - a for a, b in pairwise(place.cdf(edge / _FIELDS) for edge in range(_FIELDS + 1))])
+        even = mean(map(sum, shares))
+        fields = mean(sum(p * (-1) ** (k - own) for k, p in enumerate(parts)) for own, parts in enumerate(shares))
         contrast, black = self.ansi_contrast, self.black_level
-        even, fields = chessboard_means(self.glare_spread)
         white, dark = ((1 + black) / 2 * even**2 + sign * (1 - black) / 2 * fields**2 for sign in (1, -1))
         direct = 1 - contrast * black
-        return direct / (direct + contrast * dark - white)
+        return float(direct / (direct + contrast * dark - white))
 
     @property
     def lines(self) -> Lines:
@@ -343,16 +323,13 @@ class ProjectorModel(Configuration):
         """The same projector whose lines are ``count`` bands of its own, each at its mean wavelength, as
         :meth:`Lines.bands` cuts them. MitsimError as there."""
         bands = self.lines.bands(count)
-        merged = {
-            "wavelengths_nm": tuple(band.mean_nm for band in bands),
-            "radiant_shares": tuple(sum(band.shares) for band in bands),
-        }
-        return self.model_copy(update=merged)
+        waves, shares = tuple(band.mean_nm for band in bands), tuple(sum(band.shares) for band in bands)
+        return self.model_copy(update={"wavelengths_nm": waves, "radiant_shares": shares})
 
     @property
     def spectrum(self) -> Spectrum:
         """Photons at each line: power times wavelength."""
-        wavelengths = np.array(self.wavelengths_nm or (self.effective_wavelength_nm,))
+        wavelengths = np.array(self.lines.wavelengths_nm)
         photons = np.array(self.radiant_shares or (1.0,)) * wavelengths
         return Spectrum(wavelengths, photons / photons.sum())
 

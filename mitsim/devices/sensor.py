@@ -166,32 +166,20 @@ class SensorModel(Configuration, defer_build=True):
         return electrons
 
     @model_validator(mode="after")
-    def _room_above_black(self) -> SensorModel:
+    def _fields_fit_together(self) -> SensorModel:
         if self.bits is not None and self.black_level_dn >= 2**self.bits - 1:
             raise ValueError(f"black_level_dn {self.black_level_dn} leaves no room below 2^{self.bits} - 1")
-        return self
-
-    @model_validator(mode="after")
-    def _fits_a_frame(self) -> SensorModel:
         if self.largest_dn is not None and self.largest_dn > _LARGEST_CODE:
             raise ValueError(
                 f"bits {self.bits} with binning {self.binning} has codes up to {self.largest_dn}; "
                 f"frames hold at most {_LARGEST_CODE}, so bin less or take fewer bits"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _a_format(self) -> SensorModel:
         if (self.rows is None) != (self.columns is None):
             raise ValueError("rows and columns go together; give both, or none")
         if self.rows is not None and self.columns is not None and min(self.rows, self.columns) < self.binning:
             raise ValueError(
                 f"rows {self.rows} and columns {self.columns} hold no superpixel of binning {self.binning}; bin less"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _effects_are_whole(self) -> SensorModel:
         if self.temperature_c is not None and None in (self.dark_current_temperature_c, self.dark_doubling_c):
             raise ValueError(
                 f"temperature_c {self.temperature_c:g} moves the dark current only with dark_current_temperature_c "
@@ -212,15 +200,9 @@ class SensorModel(Configuration, defer_build=True):
             )
         if self.linearity and not math.isfinite(self.full_well_e):
             raise ValueError("linearity is relative to the full well; give a finite full_well_e")
-        if self.linearity:
-            parts = [level / _LEVELS for level in range(_LEVELS + 1)]
-            rises = [1 + sum((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)) for part in parts]
-            if not all(0 < rise < math.inf for rise in rises):
+        for part in (level / _LEVELS for level in range(_LEVELS + 1)):
+            if not 0 < 1 + sum((k + 1) * c * part**k for k, c in enumerate(self.linearity, 1)) < math.inf:
                 raise ValueError(f"linearity {self.linearity} falls below the full well; more light must read as more")
-        return self
-
-    @model_validator(mode="after")
-    def _one_efficiency(self) -> SensorModel:
         names = "quantum_efficiency", "quantum_efficiency_curve", "mosaic_curves"
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) > 1:
@@ -294,18 +276,14 @@ class SensorModel(Configuration, defer_build=True):
     @property
     def pitches_mm(self) -> tuple[float, float]:
         """Distances between rows, and between columns of superpixels [mm]."""
-        row = self.pixel_pitch_um if self.row_pitch_um is None else self.row_pitch_um
+        row = self.row_pitch_um or self.pixel_pitch_um
         return row * self.binning * 1e-3, self.superpixel_pitch_um * 1e-3
 
     @property
     def identity(self) -> dict[str, object]:
         """What manifests say of it: all fields but the source, and but effects that it does not name."""
-        fields = type(self).model_fields
-        return {
-            name: value
-            for name, value in self.model_dump(exclude={"source"}).items()
-            if name in _ALWAYS or value != fields[name].default
-        }
+        fields, stated = type(self).model_fields, self.model_dump(exclude={"source"}).items()
+        return {name: value for name, value in stated if name in _ALWAYS or value != fields[name].default}
 
     @property
     def has_fixed_pattern(self) -> bool:
