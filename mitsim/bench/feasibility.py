@@ -15,7 +15,7 @@ from mitsim.devices.mask import Mask
 from mitsim.devices.patterns import PatternFamily, is_prime
 from mitsim.devices.plate import Plate
 from mitsim.optics.shadow import Directions, ShadowGeometry
-from mitsim.scene.darkness import why_dark
+from mitsim.scene.load import why_dark
 from mitsim.transport.direct import DirectTracer
 
 _SEEN = 0.25

@@ -32,7 +32,7 @@ from mitsim.light.settings import (
 from mitsim.light.simulation import Simulation
 from mitsim.planner.pilot_direct import FINER, GOOD_ENOUGH, SHARP_RATE, DirectRuns, Sample
 from mitsim.planner.pilot_effects import AnchorRuns, EffectRuns, FollowedRuns, PenumbraRuns
-from mitsim.scene.darkness import why_dark
+from mitsim.scene.load import why_dark
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.missed import LeftOut, SharpLight, highlights, left_out_light, sharp_light, with_neighbours
 

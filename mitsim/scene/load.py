@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,15 +15,16 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import numpy.typing as npt
 
+from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
 from mitsim.core.errors import MitsimError
+from mitsim.core.prepare import fit_square, read_reflectance
 from mitsim.scene import tree
-from mitsim.scene.check import check_file, looking_beside
+from mitsim.scene.check import PICTURE, CheckedScene, check_file, looking_beside
+from mitsim.scene.headers import check_obj, check_ply
 from mitsim.scene.limits import Range, Unfit
 from mitsim.scene.outline import Tag
-from mitsim.scene.own_files import with_own_files
 from mitsim.scene.window import ProjectorGrid, locate_projector
 
 if TYPE_CHECKING:
@@ -94,7 +97,12 @@ class LoadedScene:
     @property
     def pixels(self) -> ProjectorGrid:
         """Return the projector's grid; raise MitsimError with the reason if there is none."""
-        return self.grid or locate_projector(str(self.path), _only_projector(self.path, self.scene), self.camera)
+        if self.grid:
+            return self.grid
+        found = [emitter for emitter in self.scene.emitters() if emitter.class_name() == "Projector"]
+        if len(found) != 1:
+            raise _one_projector(self.path, found)
+        return locate_projector(str(self.path), found[0], self.camera)
 
     @cached_property
     def hairy(self) -> bool:
@@ -156,14 +164,14 @@ def load_scene(
     cameras = [sensor for sensor in scene.sensors() if hasattr(sensor, "geometry")]
     if len(cameras) != 1:
         raise MitsimError(f'{path}: {len(cameras)} sensors of type "{SENSOR_PLUGIN}"; a scene needs exactly one')
-    emitters = list(scene.emitters())
-    projectors = _projectors(scene)
+    emitters, shapes, unfit = list(scene.emitters()), scene.shapes(), checked.unfit
+    projectors = [emitter for emitter in emitters if emitter.class_name() == "Projector"]
     for projector in projectors:
         scale = float(np.array(mi.traverse(projector)["scale"]).ravel()[0])
         if scale < 0:
             raise MitsimError(f"{path}: the projector's scale: got {scale:g}; light is at least 0")
-    if needs_projector:
-        _only_projector(path, scene)
+    if needs_projector and len(projectors) != 1:
+        raise _one_projector(path, projectors)
     grid = None
     if len(projectors) == 1:
         try:
@@ -172,6 +180,13 @@ def load_scene(
             if needs_projector:
                 raise
     small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
+    mirrors, glossy = _mirrors_and_gloss(scene, unfit)
+    bsdfs = [shape.bsdf() for shape in shapes]
+    one_sided = all(
+        shape.class_name() in _FLAT and bsdf and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
+        for shape, bsdf in zip(shapes, bsdfs, strict=True)
+    )
+    normals = [np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel() for shape in shapes if one_sided]
     return LoadedScene(
         path,
         checked.files,
@@ -180,29 +195,23 @@ def load_scene(
         projectors[0] if grid else None,
         grid,
         tuple(emitter for emitter in emitters if grid is None or emitter.class_name() != "Projector"),
-        *_mirrors_and_gloss(scene, checked.unfit),
-        checked.unfit,
-        checked.shapes if len(checked.shapes) == len(scene.shapes()) else (),
+        mirrors,
+        glossy,
+        unfit,
+        checked.shapes if len(checked.shapes) == len(shapes) else (),
         tuple(zip(small, checked.small_lamps, strict=True)),
         checked.coloured,
         checked.parting,
         checked.samples,
         notes,
-        _faces_one_way(scene),
+        bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED,
         sensor_note,
         checked.own,
     )
 
 
-def _projectors(scene: mi.Scene) -> list[mi.Emitter]:
-    return [emitter for emitter in scene.emitters() if emitter.class_name() == "Projector"]
-
-
-def _only_projector(path: Path, scene: mi.Scene) -> mi.Emitter:
-    found = _projectors(scene)
-    if len(found) != 1:
-        raise MitsimError(f"{path}: needs one emitter of type projector, the file has {len(found) or 'none'}")
-    return found[0]
+def _one_projector(path: Path, found: Sequence[mi.Emitter]) -> MitsimError:
+    return MitsimError(f"{path}: needs one emitter of type projector, the file has {len(found) or 'none'}")
 
 
 def _mirrors_and_gloss(scene: mi.Scene, unfit: Unfit) -> tuple[bool, bool]:
@@ -217,16 +226,6 @@ def holds_hair(flags: Any) -> Any:
     """Return True if the ``flags`` of a material, a number or one per lane, are those of hair or of what holds it."""
     both = int(mi.BSDFFlags.NonSymmetric) | int(mi.BSDFFlags.Null)
     return (flags & both) == both
-
-
-def _faces_one_way(scene: mi.Scene) -> bool:
-    normals = list[npt.NDArray[np.generic]]()
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if shape.class_name() not in _FLAT or not bsdf or mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide):
-            return False
-        normals.append(np.array(shape.sample_position(0.0, mi.Point2f(0.5)).n).ravel())
-    return bool(normals) and float(np.ptp(normals, axis=0).max()) < _TURNED
 
 
 _SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
@@ -333,8 +332,225 @@ def check_texels(path: Path, scene: mi.Scene, limits: Mapping[str, Range]) -> No
                 at, value, count = np.argwhere(wrong)[0], values[wrong][0], wrong.any(axis=-1).sum()
                 place = f"mesh {named}: number {at[0]} of its {last} is {value:g}"
                 if values.ndim == 3:
-                    place = (
-                        f"bitmap {named}: the texel in row {at[0]}, column {at[1]} is {value:g} ({count} such texels)"
-                    )
+                    texel = f"the texel in row {at[0]}, column {at[1]}"
+                    place = f"bitmap {named}: {texel} is {value:g} ({count} such texels)"
                 words = f" of {limit.low:g} to {limit.high:g}{limit.hint}" if limit is not _ANY else ""
                 raise MitsimError(f"{path}: {place}; allowed are finite numbers{words}")
+
+
+# -------- Pictures and meshes that a user names
+#
+# Pictures and meshes of the user in the tree of a checked scene, converted to files that Mitsuba reads.
+#
+# A picture becomes the reflectances of a sheet (:func:`mitsim.core.prepare.read_reflectance`), in the middle of a
+# square. A mesh is moved and scaled before the scene's own ``to_world`` acts: its longest side is 1, it stands on the
+# plane y = 0, and the middle of its box is over the origin.
+
+_BEHIND = 0.01
+"""Part of a mesh's corners whose normal may oppose the winding of the face, because of slivers."""
+_CODE_ROUNDING = 1e-9
+"""Rounding of 8-bit codes that were divided by 255 and are multiplied again."""
+
+
+@contextmanager
+def with_own_files(checked: CheckedScene) -> Iterator[None]:
+    """Prepare the files that the user named; the prepared files exist within the context.
+
+    Raises
+    ------
+    MitsimError
+        For a picture that is no reflectance, a mesh without faces or with normals that point inwards, and if files
+        cannot be written.
+    """
+    with ExitStack() as stack:
+        for node in checked.state.nodes:
+            name = str(node.props["filename"]) if "filename" in node.props else ""
+            if name not in checked.own:
+                continue
+            if checked.own[name] != PICTURE:
+                checked.unread[name] = _stand(node.props, Path(name))
+                continue
+            square = fit_square(read_reflectance(Path(name)))
+            codes = np.rint(255 * square)
+            # As a shipped print's where that holds them: the same file gives the same frames, however it is named.
+            whole = bool(np.abs(codes - 255 * square).max() < _CODE_ROUNDING)
+            made = Path(stack.enter_context(tempfile.TemporaryDirectory())) / f"picture{'.png' if whole else '.exr'}"
+            values = codes.astype(np.uint8) if whole else square.astype(np.float32)
+            try:
+                mi.Bitmap(values[..., None]).write(str(made))
+            except RuntimeError as error:
+                rule = "set TMPDIR to another folder"
+                raise MitsimError(f"picture {name}: {made} cannot be written ({error}); {rule}") from None
+            node.props["filename"], node.props["raw"] = str(made), True
+        yield
+
+
+def _stand(props: mi.Properties, path: Path) -> str:
+    kinds = {".ply": check_ply, ".obj": check_obj}
+    kind = path.suffix.lower()
+    if kind not in kinds:
+        raise MitsimError(f"object {path}: ends in {kind or 'nothing'}; read are .ply (triangles) and .obj")
+    try:
+        smooth, unread = kinds[kind](path)
+        mesh = mi.load_dict({"type": kind[1:], "filename": str(path)})
+    except (ValueError, RuntimeError, OSError) as error:
+        said = str(error).strip().splitlines()[-1]
+        raise MitsimError(f"object {path}: the file {said}") from None
+    props.set_plugin_name(kind[1:])
+    props["filename"] = str(path)
+    props["face_normals"] = not smooth  # Mitsuba would smooth the edges of a mesh that states no normals
+    _, sides = tree.tilts(props)
+    behind = int((sides < 0).sum())
+    if behind > _BEHIND * sides.size:
+        raise MitsimError(
+            f"object {path}: the normals of {behind} of {sides.size} corners face against the way that their faces are "
+            "wound; recompute normals outwards, or export without"
+        )
+    corners = np.array(mi.traverse(mesh)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    longest = float((high - low).max())
+    if longest <= 0:
+        raise MitsimError(f"object {path}: all its vertices are one point; export the mesh again")
+    middle = (low + high) / 2
+    upright = np.diag([1 / longest, 1 / longest, 1 / longest, 1.0])
+    upright[:3, 3] = -np.array([middle[0], low[1], middle[2]]) / longest
+    props["to_world"] = mi.ScalarAffineTransform4d(tree.placement_of(props) @ upright)
+    return unread
+
+
+# -------- Why a scene is dark
+#
+# Explanation of a dark scene: the reason why light of the projector does not reach the camera.
+#
+# A few hundred rays go from the projector through its window, or through the part of it that contains the scene, and
+# from the points that they hit to the sensor's centre. Holes, filters and glass let them pass.
+
+_RAYS = 24
+"""Rays per side: they hit anything larger than a 24th of the window."""
+_FAR = 3.0
+"""Multiple of the aligned plane's distance beyond which a scene counts as too far."""
+_SMALL = 1e-2
+"""Part of the aligned plane's distance below which a scene is assumed to be in metres."""
+_MOST_SHAPES = 64
+"""Shapes that are aimed at one by one; each takes milliseconds."""
+_MOST_PASSED = 16
+"""Surfaces that a ray passes: eight panes of two faces."""
+
+
+def why_dark(loaded: LoadedScene) -> str:
+    """Return what is wrong with a scene of which the sensor sees nothing, and the remedy."""
+    geometry, grid = loaded.camera.geometry, loaded.pixels
+    to_world = loaded.camera.world_transform()
+    projector_to_world = mi.traverse(loaded.projector)["to_world"]
+    start = projector_to_world @ mi.Point3f(0)
+    window = grid.row_tan, grid.column_tan
+    boxes = [loaded.scene.bbox(), *(shape.bbox() for shape in loaded.scene.shapes()[:_MOST_SHAPES])]
+    parts = [_part_with(box, loaded, to_world.inverse() @ start) for box in boxes]
+    for part in (window, *filter(None, parts)):
+        rows, columns = (low + (high - low) * (np.arange(_RAYS) + 0.5) / _RAYS for low, high in part)
+        y, x = (-geometry.scene_distance * edges.ravel() for edges in np.meshgrid(rows, columns, indexing="ij"))
+        plane = to_world @ mi.Point3f(x, y, geometry.scene_distance)
+        if not _is_any((projector_to_world.inverse() @ plane).z > 0):
+            return "the projector looks away from the scene, whose aligned plane lies behind it; turn the projector"
+        towards = dr.normalize(plane - start)
+        si = _meet_opaque(loaded.scene, mi.Ray3f(start, towards), None)
+        met = np.array(si.is_valid()).ravel()
+        if met.any():
+            break
+        if _is_any(loaded.scene.ray_test(mi.Ray3f(start, towards))):
+            return "all that the projector's rays meet lets light pass; put something opaque behind it"
+    else:
+        return _where_scene_lies(loaded, to_world, any(parts[1:]))
+    back = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
+    centre = to_world @ mi.Point3f(0)
+    lit = si.is_valid() & (back | (si.wi.z > 0))
+    facing = lit & (back | (dr.dot(si.n, centre - si.p) * dr.sign(dr.dot(si.n, start - si.p)) > 0))
+    if not _is_any(lit) or not _is_any(facing):
+        which = "camera" if _is_any(lit) else "projector"
+        return (
+            f"{met.sum()} of {met.size} rays of the projector meet a surface, and it turns its back to the {which}: a "
+            "mesh wound the wrong way; flip its normals or put its material in <bsdf type='twosided'>"
+        )
+    seen = np.array(to_world.inverse() @ si.p).reshape(3, -1)[:, np.array(facing).ravel()]
+    slope = np.abs(seen[:2] / seen[2]).max(axis=0)
+    if seen[2].max() <= geometry.mask_distance:
+        return f"what is lit lies at z = {seen[2].max():.4g} mm, not in front of the mask; move the scene along +z"
+    if slope.min() > geometry.tan_half_fov:
+        return (
+            f"what is lit lies outside the field stop: {np.degrees(np.arctan(slope.min())):.3g} degrees off the axis "
+            f"or more, and the stop (fov) lets {geometry.fov / 2:g} degrees pass; turn the camera or widen fov"
+        )
+    if not _is_any(facing & ~_meet_opaque(loaded.scene, si.spawn_ray_to(centre), centre).is_valid()):
+        return "something hides from the camera what is lit; move it out of the way"
+    if part is not window:
+        extents = [(own[1] - own[0]) / (whole[1] - whole[0]) for own, whole in zip(part, window, strict=True)]
+        return (
+            f"what is lit spans {min(extents):.1e} of the window only, {min(extents) * grid.n:.1e} projector pixels: "
+            "too few rays meet it; give the projector a narrower fov, or a larger target"
+        )
+    return "what is lit lies edge-on, is hidden or reflects nothing; turn it, move it or check its material"
+
+
+def _part_with(box: mi.BoundingBox3f, loaded: LoadedScene, start: mi.Point3f) -> tuple[tuple[float, float], ...] | None:
+    distance = loaded.camera.geometry.scene_distance
+    if not box.valid():
+        return None
+    corners = _corners(box, loaded.camera.world_transform())
+    origin = np.array(start).reshape(3, 1)
+    ahead = corners[2] > origin[2]
+    if not ahead.all() or distance <= origin[2, 0] or corners[2].min() > _FAR * distance:
+        return None
+    on_plane = origin + (corners - origin) * (distance - origin[2]) / (corners[2] - origin[2])
+    grid, part = loaded.pixels, []
+    for (low, high), tangents in zip((grid.row_tan, grid.column_tan), -on_plane[[1, 0]] / distance, strict=True):
+        first, last = max(low, float(tangents.min())), min(high, float(tangents.max()))
+        if first > last:
+            return None
+        part.append((first, last))
+    return tuple(part)
+
+
+def _corners(box: mi.BoundingBox3f, to_world: mi.Transform4f) -> FloatArray:
+    corners = np.array([list(box.corner(i)) for i in range(8)]).T
+    return np.array(to_world.inverse() @ mi.Point3f(corners)).reshape(3, -1)
+
+
+def _meet_opaque(scene: mi.Scene, ray: mi.Ray3f, target: mi.Point3f | None) -> mi.SurfaceInteraction3f:
+    si = scene.ray_intersect(ray)
+    for _ in range(_MOST_PASSED):
+        clear = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+        passing = si.is_valid() & (clear | (dr.max(si.bsdf().eval_null_transmission(si)) > 0))
+        if not _is_any(passing):
+            break
+        onward = si.spawn_ray(ray.d) if target is None else si.spawn_ray_to(target)
+        si = dr.select(passing, scene.ray_intersect(onward, passing), si)
+    return si
+
+
+def _where_scene_lies(loaded: LoadedScene, to_world: mi.Transform4f, within: bool) -> str:
+    distance, box = loaded.camera.geometry.scene_distance, loaded.scene.bbox()
+    if not box.valid():
+        return "the scene has no surfaces; add a shape"
+    corners = _corners(box, to_world)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    place = ", ".join(f"{axis} = {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+    where = f"no ray of the projector's window meets the scene, which lies at {place} mm of the camera"
+    if np.abs([low, high]).max() < _SMALL * distance:
+        return f"{where}: this looks like metres, and 1 unit is 1 mm; scale it by 1000"
+    if low[2] > _FAR * distance:
+        return f"{where}: too far, for the bench is aligned to {distance:g} mm; move it nearer or set scene_distance"
+    if high[2] <= 0:
+        return f"{where}: behind the camera, which looks along +z; move the scene or turn the camera"
+    if within:
+        return (
+            f"{where}: within the window, but {_RAYS} x {_RAYS} rays at each of its shapes miss them; give the "
+            "projector a narrower fov, or a larger target"
+        )
+    rows, columns = loaded.pixels.row_tan, loaded.pixels.column_tan
+    x, y = (f"{-distance * edges[1]:.4g} to {-distance * edges[0]:.4g}" for edges in (columns, rows))
+    window = f"x = {x}, y = {y}"
+    return f"{where}: outside the window, {window} mm at {distance:g} mm; move the scene or turn the projector"
+
+
+def _is_any(mask: mi.Bool) -> bool:
+    return bool(np.array(mask).any())

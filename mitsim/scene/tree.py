@@ -131,7 +131,11 @@ def placement_of(props: mi.Properties, centred: bool = True) -> FloatArray:
     """Return the (4, 4) transform from an object to the world, about its own centre if ``centred``."""
     name = _CENTRES.get(props.plugin_name(), "position")
     matrix = np.array(props["to_world"].matrix, dtype=np.float64) if "to_world" in props else np.eye(4)
-    return matrix @ _shift(props[name]) if centred and name in props else matrix
+    if centred and name in props:
+        shift = np.eye(4)
+        shift[:3, 3] = np.array(props[name], dtype=np.float64)
+        return matrix @ shift
+    return matrix
 
 
 def _place(props: mi.Properties, matrix: FloatArray) -> None:
@@ -146,12 +150,6 @@ def _place(props: mi.Properties, matrix: FloatArray) -> None:
         props["position"] = mi.ScalarPoint3d(matrix[:3, 3])
         return
     props["to_world"] = mi.ScalarAffineTransform4d(matrix)
-
-
-def _shift(point: mi.ScalarPoint3d) -> FloatArray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = np.array(point, dtype=np.float64)
-    return matrix
 
 
 # -------- Thin cylinders and small lamps as meshes
@@ -214,11 +212,15 @@ def with_thin_shapes_as_meshes(outline: Outline, state: mi.parser.ParserState) -
 
 
 def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iterator[int]:
-    eyes = [placement_of(node.props)[:3, 3] for node in nodes if node.props.plugin_name() == "projector"] + [
-        np.zeros(3)
-    ]
+    projectors = [node.props for node in nodes if node.props.plugin_name() == "projector"]
+    eyes = [*(placement_of(props)[:3, 3] for props in projectors), np.zeros(3)]
     places = [placement_of(nodes[index].props)[:3, 3] for index in standing(nodes)]
-    for index, to_world in _occurrences(nodes):
+    occurrences = [(index, np.eye(4)) for index in standing(nodes)]
+    for index in [index for index, _ in occurrences if nodes[index].props.plugin_name() == "instance"]:
+        to_world = placement_of(nodes[index].props)
+        for group in references(nodes[index].props):
+            occurrences += [(own, to_world) for own in standing(nodes, group)]
+    for index, to_world in occurrences:
         props, kind = nodes[index].props, nodes[index].props.plugin_name()
         if kind not in _FINEST:
             continue
@@ -231,12 +233,10 @@ def _thin_shapes(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Iter
         finest = _FINEST["lamp" if lamp else kind]
         if distance > finest * radius:
             raise tag.refusal("radius", got, held.format(distance / finest, "take a larger radius"))
+        kept, slender, mixed = set(_POLISHED), _SLENDER, set(_MIXED)
+        rule = "take roughplastic in place of the smooth one"
         if lamp:
-            kept, slender, rule = set[str](), _SMALL, "take a matt material"
-            mixed = set(_MIXED + _POLISHED)
-        else:
-            kept, slender, rule = set(_POLISHED), _SLENDER, "take roughplastic in place of the smooth one"
-            mixed = set(_MIXED)
+            kept, slender, mixed, rule = set(), _SMALL, {*_MIXED, *_POLISHED}, "take a matt material"
         if (kind == "sphere" and not lamp) or below & kept:
             continue
         if distance > slender * radius and below & mixed:
@@ -250,17 +250,16 @@ def _farthest(ends: Sequence[FloatArray], places: Sequence[FloatArray]) -> float
     return max(float(np.linalg.norm(end - place)) for end in ends for place in places)
 
 
-def _occurrences(nodes: Sequence[mi.parser.SceneNode]) -> Iterator[tuple[int, FloatArray]]:
-    for index in standing(nodes):
-        yield index, np.eye(4)
-        if nodes[index].props.plugin_name() == "instance":
-            for group in references(nodes[index].props):
-                yield from ((own, placement_of(nodes[index].props)) for own in standing(nodes, group))
-
-
 def _replace(nodes: Sequence[mi.parser.SceneNode], index: int, path: Path) -> None:
     props = nodes[index].props
-    _write(path, ball(props) if props.plugin_name() == "sphere" else prism(props))
+    points, normals, uv, triangles = ball(props) if props.plugin_name() == "sphere" else prism(props)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v")]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    vertices = np.concatenate([points, normals, uv], axis=1).astype("<f4")
+    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
     props.set_plugin_name("ply")
     for name in ("p0", "p1", "center", "radius", "to_world"):
         if name in props:
@@ -295,7 +294,13 @@ def prism(props: mi.Properties) -> Mesh:
     radius = float(props.get("radius", 1.0))
     first, last = _point(props, "p0", (0, 0, 0)), _point(props, "p1", (0, 0, 1))
     v, u = np.meshgrid([0.0, 1.0], np.linspace(0, 1, _SIDES + 1), indexing="ij")
-    x, y = _axes_across((last - first) / np.linalg.norm(last - first))
+    n = (last - first) / np.linalg.norm(last - first)
+    # Two axes across n where Mitsuba has them (Duff et al., Building an Orthonormal Basis, Revisited, 2017).
+    sign = float(np.copysign(1, n[2]))
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    x = np.array([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]])
+    y = np.array([b, sign + n[1] ** 2 * a, -n[1]])
     normal = np.cos(2 * np.pi * u)[..., None] * x + np.sin(2 * np.pi * u)[..., None] * y
     grown = radius * (np.pi / _SIDES) / np.sin(np.pi / _SIDES)  # a perimeter of 2 pi r
     mirrored = bool(np.linalg.det(placement_of(props)[:3, :3]) < 0)
@@ -331,26 +336,6 @@ def _triangles(rows: int, columns: int) -> FloatArray:
     a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     b, c, d = a + 1, a + columns, a + columns + 1
     return np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
-
-
-def _axes_across(n: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two axes across ``n`` where Mitsuba has them (Duff et al., Building an Orthonormal Basis, Revisited, 2017)."""
-    sign = float(np.copysign(1, n[2]))
-    a = -1 / (sign + n[2])
-    b = n[0] * n[1] * a
-    return np.array([1 + sign * n[0] ** 2 * a, sign * b, -sign * n[0]]), np.array([b, sign + n[1] ** 2 * a, -n[1]])
-
-
-def _write(path: Path, mesh: Mesh) -> None:
-    points, normals, uv, triangles = mesh
-    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
-    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, triangles
-    vertices = np.concatenate([points, normals, uv], axis=1).astype("<f4")
-    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
 # -------- Materials made of others
@@ -479,8 +464,20 @@ def fit_film(checked: CheckedScene, sensor: SensorModel) -> str:
             tag = checked.outline.tag(mi.parser.SceneNode(node))
             raise tag.refusal("film", "none", "the camera file's rows and columns are its size; give it a <film>")
         before = _sensor_words(node.props, films[0])
-        _set_pitch(node.props, sensor)
-        _set_size(films[0], sensor)
+        column = float(node.props.get("pixel_pitch", _PITCH))
+        row = float(node.props.get("row_pitch", column))
+        own_row, own_column = sensor.pitches_mm
+        if abs(own_column - column) > PITCH_TOLERANCE * column or abs(own_row - row) > PITCH_TOLERANCE * row:
+            node.props["pixel_pitch"] = own_column
+            if "row_pitch" in node.props:
+                del node.props["row_pitch"]
+            if own_row != own_column:
+                node.props["row_pitch"] = own_row
+        if sensor.frame_shape is not None:
+            films[0]["height"], films[0]["width"] = sensor.frame_shape
+            for name in _WINDOW:
+                if name in films[0]:
+                    del films[0][name]
         after = _sensor_words(node.props, films[0])
         if after != before:
             words = (
@@ -497,23 +494,3 @@ def _sensor_words(camera: mi.Properties, film: mi.Properties) -> str:
     pitch = f"{column * 1e3:g}" if row == column else f"{row * 1e3:g} x {column * 1e3:g}"
     window = f", of which a window of {film['crop_height']} x {film['crop_width']}" if _WINDOW[-1] in film else ""
     return f"{rows} x {columns} pixels of {pitch} um ({rows * row:.3g} x {columns * column:.3g} mm){window}"
-
-
-def _set_pitch(camera: mi.Properties, sensor: SensorModel) -> None:
-    own_row, own_column = sensor.pitches_mm
-    column = float(camera.get("pixel_pitch", _PITCH))
-    row = float(camera.get("row_pitch", column))
-    if abs(own_column - column) > PITCH_TOLERANCE * column or abs(own_row - row) > PITCH_TOLERANCE * row:
-        camera["pixel_pitch"] = own_column
-        if "row_pitch" in camera:
-            del camera["row_pitch"]
-        if own_row != own_column:
-            camera["row_pitch"] = own_row
-
-
-def _set_size(film: mi.Properties, sensor: SensorModel) -> None:
-    if sensor.frame_shape is not None:
-        film["height"], film["width"] = sensor.frame_shape
-        for name in _WINDOW:
-            if name in film:
-                del film[name]

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsim.scene.darkness import why_dark
-from mitsim.scene.load import load_scene
+from mitsim.scene.load import load_scene, why_dark
 
 pytestmark = pytest.mark.usefixtures("variant")
 Write = Callable[..., Path]
