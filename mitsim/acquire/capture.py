@@ -27,7 +27,7 @@ from mitsim.acquire.exposure import (
 )
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.feasibility import obstacles
+from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, Task
 from mitsim.core.configuration import takes
 from mitsim.core.environment import deciding_versions, versions

@@ -25,7 +25,7 @@ import numpy as np
 from mitsim.acquire.exposure import NoiseTarget
 from mitsim.bench.apparatus import Apparatus, Opened
 from mitsim.bench.effects import present
-from mitsim.bench.feasibility import obstacles
+from mitsim.bench.layout import obstacles
 from mitsim.bench.request import Request, check_untimed
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError

@@ -1,4 +1,4 @@
-"""White board of a calibration: a Mitsuba object from its shape in a recipe, and the pixels that miss it."""
+"""Surfaces that are put before a bench: the white board of a calibration, and pictures on its prints."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from mitsim.bench.apparatus import Opened, check_depth
 from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import keep_scenes
-from mitsim.core.errors import ArgumentError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.session import BoardShape
 from mitsim.scene.limits import Unfit
 from mitsim.transport.plugins.base import host_values, turn_and_origin
@@ -22,7 +23,6 @@ from mitsim.transport.projector import PinholeRays
 
 if TYPE_CHECKING:
     from mitsim.bench.apparatus import Apparatus
-    from mitsim.devices.camera import CameraGeometry
 
 _BEYOND = 1.1
 """Half side of a board without a stated size, relative to what the sensor's edge sees."""
@@ -52,7 +52,14 @@ def before_board(
 
 def board_object(bench: Apparatus, reflectance: float, shape: BoardShape, depth: float) -> Any:
     """Return a diffuse board of the given ``reflectance`` and ``shape`` at ``depth`` [mm] for Mitsuba."""
-    half = _half_side(shape, bench.geometry, depth)
+    geometry = bench.geometry
+    half = _BEYOND * (geometry.tan_half_fov * depth + geometry.half_width)
+    steep = math.hypot(*(math.tan(math.radians(tilt)) for tilt in (shape.tilt_row_deg, shape.tilt_column_deg)))
+    if shape.size_mm is not None:
+        half = shape.size_mm / 2
+    elif steep:  # along the slope a ray of tan-angle u meets the board at u z / (cos - u sin) from its middle
+        angle, corner = math.atan(steep), math.sqrt(2) * half / depth
+        half = half * math.sqrt(2) / max(math.cos(angle) - corner * math.sin(angle), _GRAZING)
     bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
     turned, camera = np.eye(4), np.eye(4)
     turned[:3, :3] = turn_of(shape)
@@ -81,18 +88,6 @@ def turn_of(shape: BoardShape) -> FloatArray:
     axis = np.array([uphill[1], -uphill[0], 0.0])
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
-
-
-def _half_side(shape: BoardShape, geometry: CameraGeometry, z: float) -> float:
-    if shape.size_mm is not None:
-        return shape.size_mm / 2
-    half = _BEYOND * (geometry.tan_half_fov * z + geometry.half_width)
-    steep = math.hypot(*(math.tan(math.radians(tilt)) for tilt in (shape.tilt_row_deg, shape.tilt_column_deg)))
-    if steep == 0:
-        return half
-    # Along the slope a ray of tan-angle u meets the board at u z / (cos - u sin) from its middle.
-    angle, corner = math.atan(steep), math.sqrt(2) * half / z
-    return half * math.sqrt(2) / max(math.cos(angle) - corner * math.sin(angle), _GRAZING)
 
 
 def bowed_surface(shape: BoardShape, half: float) -> tuple[FloatArray, FloatArray]:
@@ -144,3 +139,99 @@ def _bowed_mesh(shape: BoardShape, half: float, place: FloatArray, bsdf: dict[st
     arrays["faces"] = faces.ravel()
     arrays.update()
     return mesh
+
+
+# -------- Pictures on prints
+#
+# Pictures on the prints of a bench, and whether one tracing serves every picture.
+#
+# Light of a flat diffuse sheet that stands alone is linear in the reflectance of each point, and comes directly from
+# there to the sensor. Light of a white sheet times the picture is then that of the picture. Light over several surfaces
+# contains products of reflectances, and is traced for each picture.
+
+_PARALLEL = 1e-6
+"""Sine of a sheet's tilt that counts as rounding."""
+_BITMAP, _PLAIN = ("reflectance.data", "diffuse_reflectance.data"), "reflectance.value"
+"""Endings of Mitsuba's parameter names for the reflectance of a print, and of an even surface."""
+_LARGEST_CODE = 255
+"""8-bit code of reflectance 1."""
+
+
+def traced_anew(bench: Apparatus) -> str:
+    """Return why light must be traced anew for each picture; empty if light of white prints can be multiplied."""
+    loaded, shapes = bench.loaded, bench.loaded.scene.shapes()
+    if len(shapes) != 1:
+        return f"the scene has {len(shapes)} surfaces, which light each other"
+    (sheet,) = shapes
+    diffuse = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+    if sheet.class_name() != "Rectangle" or sheet.bsdf().flags() & ~diffuse:
+        return "the scene's surface is no flat diffuse sheet"
+    normal = np.array(sheet.sample_position(0.0, mi.Point2f(0.5)).n, dtype=np.float64).ravel()
+    if np.linalg.norm(np.cross(normal, camera_place(bench)[0][:, 2])) > _PARALLEL:
+        return "the sheet is not parallel to the sensor, so cells of light lie across the picture's pixels"
+    if len(loaded.lamps) > len(loaded.small_lamps):
+        return "the camera may see a lamp of the scene itself"
+    return ""
+
+
+@keep_scenes()
+def show_white(bench: Apparatus) -> None:
+    """Make all printed surfaces, or the only surface, reflect all light; raise MitsimError without either."""
+    for _, held, names in _prints(bench):
+        for name in names:
+            values = np.ones(np.shape(held[name]))
+            held[name] = _as_stored(held[name], values) if name.endswith(_BITMAP) else 1.0
+        held.update()
+
+
+@keep_scenes()
+def show_picture(bench: Apparatus, reflectance: npt.NDArray[np.float64]) -> None:
+    """Put a picture on all prints: each point takes the reflectance of the projector's pixel that lights it.
+
+    Points beyond the window take the nearest pixel. ``reflectance`` is (n, n). Raises MitsimError for a scene without a
+    print, or one whose bitmap has colours or is turned.
+    """
+    rays, n = PinholeRays(bench.projector_optics, [None]), bench.n
+    for sheet, held, names in _prints(bench):
+        for name in names:
+            if not name.endswith(_BITMAP):
+                raise MitsimError(
+                    f"{bench.loaded.path}: has no printed surface (a reflectance by bitmap) to put pictures on; give "
+                    "one its texture"
+                )
+            shape, turned = np.shape(held[name]), held[name.replace(".data", ".to_uv")]
+            if shape[2] != 1 or not np.array_equal(np.array(turned.matrix), np.eye(3)):
+                raise MitsimError(
+                    f"{bench.loaded.path}: a print has {shape[2]} channels, or a turned bitmap; give a raw grey one"
+                )
+            row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+            texel = mi.Point2f(*((np.stack([column, row]) + 0.5) / [[shape[1]], [shape[0]]]).astype(np.float32))
+            places = sheet.eval_parameterization(texel).p
+            world = np.stack([host_values(axis, len(row)) for axis in (places.x, places.y, places.z)], axis=1)
+            at = np.nan_to_num(rays.points(world.astype(np.float64))[0])
+            pixel = np.clip(np.floor(at), 0, n - 1).astype(np.int64)
+            held[name] = _as_stored(held[name], reflectance[pixel[:, 0], pixel[:, 1]].reshape(shape))
+        held.update()
+
+
+def _prints(bench: Apparatus) -> list[tuple[mi.Shape, Any, list[str]]]:
+    """Return each shape that has a print, or the only shape, with its parameters and the names of its reflectances."""
+    every = [(shape, mi.traverse(shape)) for shape in bench.loaded.scene.shapes() if shape.bsdf()]
+
+    def named(ending: str | tuple[str, ...]) -> list[tuple[mi.Shape, Any, list[str]]]:
+        found = [(shape, held, [name for name in held.keys() if name.endswith(ending)]) for shape, held in every]  # noqa: SIM118 - no dict
+        return [(shape, held, names) for shape, held, names in found if names]
+
+    found = named(_BITMAP) or (named(_PLAIN) if len(every) == 1 else [])
+    if not found:
+        raise MitsimError(
+            f"{bench.loaded.path}: none of its {len(every)} surfaces has a print (a reflectance by bitmap) to put "
+            "pictures on; give one a bitmap"
+        )
+    return found
+
+
+def _as_stored(before: Any, values: npt.NDArray[np.float64]) -> Any:
+    whole = np.asarray(before).dtype == np.uint8
+    stored = np.rint(_LARGEST_CODE * values).astype(np.uint8) if whole else values.astype(np.float32)
+    return type(before)(stored)

@@ -19,7 +19,7 @@ from mitsim.acquire.drifting import levels
 from mitsim.acquire.exposure import camera_warnings
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.board import before_board, missed_pixels
-from mitsim.bench.feasibility import MOST_LOST, mask_fault
+from mitsim.bench.layout import MOST_LOST, mask_fault
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Cost, Job

@@ -37,16 +37,18 @@ _NOT_KNOWN_BEFORE = (
 """Beginnings of the names of fields that calibrations of 0.4 do not know."""
 
 
+PIXELS = 1, 16384
+"""Sensor pixels a side: more than the largest square sensors have, 10 560, of which a region is read."""
+
+
 class CameraGeometry(Configuration, arbitrary_types_allowed=True):
     """Bare sensor under a coded mask; the defaults are the geometry of Zheng & Asif, section IV-A."""
 
-    pixels: int = Field(default=512, ge=1, le=16384)
-    """Sensor pixels a side, of a square sensor.
-
-    More than the largest square sensors, 10 560, of which a region is read."""
-    rows: int | None = Field(default=None, ge=1, le=16384)
+    pixels: int = Field(default=512, ge=PIXELS[0], le=PIXELS[1])
+    """Sensor pixels a side, of a square sensor."""
+    rows: int | None = Field(default=None, ge=PIXELS[0], le=PIXELS[1])
     """Rows of sensor pixels; none: `pixels`."""
-    columns: int | None = Field(default=None, ge=1, le=16384)
+    columns: int | None = Field(default=None, ge=PIXELS[0], le=PIXELS[1])
     """Columns of sensor pixels; none: `pixels`."""
     pixel_pitch: float = Field(default=0.01172, ge=1e-6, le=1e3)
     """Distance between columns of sensor pixels, and between rows [mm].

@@ -2,7 +2,7 @@
 
 Each cell of the light lies in one pixel of the picture. The light of a picture is therefore that of a white print times
 the reflectance of each cell's pixel. That holds for light from one flat sheet straight to the sensor, however the
-projector blurs, scatters or leaks. Elsewhere (:func:`mitsim.bench.prints.traced_anew`) each picture's light is traced.
+projector blurs, scatters or leaks. Elsewhere (:func:`mitsim.bench.board.traced_anew`) each picture's light is traced.
 Idealised frames follow the paper's separable model.
 
 Pictures are square, of eight bits, drawn from a seed or cut from a folder of files. Drawn pictures have the statistics
@@ -33,7 +33,7 @@ from mitsim.acquire.exposure import ambient_shots, camera_warnings, peak_irradia
 from mitsim.acquire.spectral import plan_request
 from mitsim.api.bench import Bench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.prints import show_picture, show_white, traced_anew
+from mitsim.bench.board import show_picture, show_white, traced_anew
 from mitsim.bench.request import Task
 from mitsim.core.arrays import FloatArray, Labels
 from mitsim.core.environment import deciding_versions, versions

@@ -38,7 +38,7 @@ _ON_SHAPES = ("area", "mitsim_projector")
 _RIGID = ("mitsim_lensless", "mitsim_projector", "projector")
 """Plugins that may only be rotated and moved."""
 _METALS = ("conductor", "roughconductor")
-"""Materials whose default is copper."""
+"""Materials that may be coloured metals."""
 _PLACES = {
     "to_world": (("Transform",), "a <transform>"),
     **dict.fromkeys(("center", "p0", "p1", "position"), (("Vector",), "a <point>")),
@@ -170,7 +170,9 @@ class _Tree:
             check_plugin(tag, plugin)
             if self.variant is not None:
                 check_variant(tag, plugin, node.props, self.variant)
-            if plugin in _COLOURED or (plugin in _METALS and not _is_plain(node)):
+            # A metal is copper unless it states another material, or an index.
+            plain = _text(node, "material") == "none" or ("material" not in node.props and "eta" in node.props)
+            if plugin in _COLOURED or (plugin in _METALS and not plain):
                 self.coloured.append(tag)
             if plugin == _PARTING:
                 self.parting.append(tag)
@@ -208,16 +210,18 @@ class _Tree:
                 rule = f"a shape holds {' or '.join(_ON_SHAPES)} only; put other lamps beside the shapes"
                 raise self.outline.tag(inner).refusal("type", repr(within), rule)
             if name in limits.LIMITS:
-                self._check_texture(self._child(node, name), name, limits.LIMITS[name])
-            if plugin == "projector" and name == "irradiance" and "to_uv" in self._child(node, name).props:
-                place = self.outline.tag(self._child(node, name), "to_uv")
-                raise place.refusal(
-                    "to_uv",
-                    "a transform",
-                    "the projector's window is found in the bitmap as it is; remove it, and turn the projector",
-                )
+                self._check_texture(inner, name, limits.LIMITS[name])
+            if plugin == "projector" and name == "irradiance" and "to_uv" in inner.props:
+                rule = "the projector's window is found in the bitmap as it is; remove it, and turn the projector"
+                raise self.outline.tag(inner, "to_uv").refusal("to_uv", "a transform", rule)
         elif kind == _Type.String and name not in ("values", "wavelengths"):
-            _check_text(tag, plugin, name, node.props[name])
+            text = node.props[name]
+            if name == "filename" and plugin not in _READERS:
+                raise tag.refusal(name, repr(text), "only bitmap, envmap, ply and obj read a file")
+            if name == "material" and not re.fullmatch(r"[A-Za-z0-9_-]+", text):
+                raise tag.refusal(name, repr(text), "give the name of a material, as Au")
+            if name not in ("filename", "material") and ("/" in text or ".." in text):
+                raise tag.refusal(name, repr(text), "only filename may hold a path")
         elif name == "hide_emitters" and node.props[name]:
             rule = "the reference alone would leave out lamps that the sensor sees; remove it, or those lamps"
             raise tag.refusal(name, "true", rule)
@@ -325,20 +329,5 @@ def _text(node: mi.parser.SceneNode, name: str) -> str | None:
     return node.props[name] if name in node.props and node.props.type(name) == _Type.String else None
 
 
-def _is_plain(node: mi.parser.SceneNode) -> bool:
-    return _text(node, "material") == "none" or ("material" not in node.props and "eta" in node.props)
-
-
 def _words(node: mi.parser.SceneNode, name: str) -> list[str]:
     return re.findall(r"[^\s,\[\]\"]+", node.props.as_string(name))
-
-
-def _check_text(tag: Tag, plugin: str, name: str, value: str) -> None:
-    if name == "filename":
-        if plugin not in _READERS:
-            raise tag.refusal(name, repr(value), "only bitmap, envmap, ply and obj read a file")
-    elif name == "material":
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", value):
-            raise tag.refusal(name, repr(value), "give the name of a material, as Au")
-    elif "/" in value or ".." in value:
-        raise tag.refusal(name, repr(value), "only filename may hold a path")

@@ -123,11 +123,10 @@ def check_obj(path: Path) -> tuple[bool, str]:
             found = _LINE.fullmatch(line)
             if not found or line.endswith(b"\\"):
                 rule = (
-                    "no line may end in a backslash, vertices have three numbers, and faces have three or more "
-                    "corners, which count from 1"
+                    "no line may end in a backslash, vertices have three numbers, and faces have three or more corners"
                 )
                 shown = cut(line.decode("latin-1"))
-                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}")
+                raise ValueError(f"has a line that is not understood, {number} ({shown!r}); {rule}, which count from 1")
             if found["vertex"]:
                 vertices.append(found["vertex"].split())
             elif found["face"]:
@@ -222,12 +221,12 @@ class _Element:
         return len(before) + 3 * any(" " in kind for _, kind in before)
 
     @property
-    def words(self) -> int:
-        return len(self.properties) + 3 * any(" " in kind for _, kind in self.properties)
-
-    @property
     def lists(self) -> list[str]:
         return [name for name, kind in self.properties if " " in kind]
+
+    @property
+    def words(self) -> int:
+        return len(self.properties) + 3 * bool(self.lists)
 
 
 def _ply_header(header: bytes) -> tuple[str | None, dict[str, _Element]]:

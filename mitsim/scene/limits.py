@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.errors import MitsimError, cut, near_name
-from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.camera import PIXELS
 from mitsim.scene.headers import FARTHEST
 from mitsim.scene.outline import Tag
 
@@ -50,16 +50,6 @@ class Range:
                 raise tag.refusal(name, number, f"allowed is {words}{self.hint}")
 
 
-def _of_camera(field: str) -> Range:
-    bounds = {
-        kind: getattr(bound, kind)
-        for bound in CameraGeometry.model_fields[field].metadata
-        for kind in ("ge", "le")
-        if hasattr(bound, kind)
-    }
-    return Range(bounds["ge"], bounds["le"])
-
-
 ANY = Range(-_LARGEST, _LARGEST)
 LIGHT = Range(0, _LARGEST, hint=", light is at least 0")
 REFLECTED = Range(0, 1, hint=": light is at least 0, and nothing reflects more than 1")
@@ -91,7 +81,7 @@ LIMITS = {
     **dict.fromkeys(("eta", "k"), Range(0, 1000)),
     **dict.fromkeys(("fov", "cutoff_angle", "beam_width"), _ANGLE),
     **dict.fromkeys(("int_ior", "ext_ior"), _INDEX),
-    **dict.fromkeys(("width", "height", "crop_width", "crop_height"), _of_camera("pixels")),
+    **dict.fromkeys(("width", "height", "crop_width", "crop_height"), Range(*PIXELS)),
     "radius": Range(0, FARTHEST, above=True),
     "temperature": Range(0, 1e5, above=True),
     "g": Range(-1, 1, above=True, below=True),
@@ -237,15 +227,13 @@ class Unfit:
         """Determine the reasons from the ``nodes`` of a scene, the root first, whose tags are in ``outline``."""
         tree = _References(nodes)
         medium = next(tree.to(PLUGINS["medium"].split()), None)
-        if medium is None:
-            factored = _blended_picture(outline, tree) or _thin_sheet(outline, tree)
-        else:
-            node, name = medium
+        factored = _unfit_for_factored(outline, tree)
+        if medium is not None:
             rule = (
                 "only the reference estimator follows light through media; remove it, or use render's reference with "
                 "the integrator volpath"
             )
-            factored = outline.tag(node).refusal(name, "a medium", rule)
+            factored = outline.tag(medium[0]).refusal(medium[1], "a medium", rule)
         opaque = _under_bumps(outline, tree)
         return cls(
             factored or opaque,
@@ -269,8 +257,11 @@ def _caustics(outline: Outline, tree: _References, lights: Sequence[str], estima
     return str(outline.tag(light).refusal("light", repr(str(light.props.plugin_name())), rule))
 
 
-def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a projector whose picture blends its texels, because pixels are assumed to be even."""
+def _unfit_for_factored(outline: Outline, tree: _References) -> MitsimError | None:
+    """Return the refusal of a projector whose picture blends its texels, because pixels are assumed to be even.
+
+    A sheet is refused that, followed forward, sends on 8 times the light it gets at grazing angles.
+    """
     for node in tree.nodes:
         picture = tree.child(node, "irradiance") if node.props.plugin_name() == "projector" else None
         if picture is None or picture.props.plugin_name() != "bitmap":
@@ -282,11 +273,6 @@ def _blended_picture(outline: Outline, tree: _References) -> MitsimError | None:
                 '<string name="filter_type" value="nearest"/>, and blur_pixels of the projector\'s TOML file for a blur'
             )
             return outline.tag(picture, "filter_type").refusal("filter_type", repr(kind), rule)
-    return None
-
-
-def _thin_sheet(outline: Outline, tree: _References) -> MitsimError | None:
-    """Return the refusal of a sheet that, followed forward, sends on 8 times the light it gets at grazing angles."""
     for node, name in tree.to(("principledthin",)):
         thin = tree.nodes[node.props[name].index()]
         if thin.props.get("spec_trans", 0.0) != 0.0:  # a number, or a texture of unknown values
@@ -299,17 +285,15 @@ def _thin_sheet(outline: Outline, tree: _References) -> MitsimError | None:
 
 
 def _in_instances(outline: Outline, tree: _References) -> str | None:
-    for node in tree.nodes:
-        if node.props.plugin_name() != "shapegroup":
-            continue
-        mirror = next(tree.below(node, MIRRORS), None)
-        if mirror is not None:
-            rule = (
-                "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the "
-                "projector is missing; place the shape itself"
-            )
-            return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
-    return None
+    groups = (node for node in tree.nodes if node.props.plugin_name() == "shapegroup")
+    mirror = next((mirror for node in groups for mirror in tree.below(node, MIRRORS)), None)
+    if mirror is None:
+        return None
+    rule = (
+        "inside of an instance glass is no pane and a mirror casts no glint: light that it brings from the projector "
+        "is missing; place the shape itself"
+    )
+    return str(outline.tag(mirror).refusal("bsdf", repr(str(mirror.props.plugin_name())), rule))
 
 
 def _under_bumps(outline: Outline, tree: _References) -> MitsimError | None:

@@ -39,6 +39,7 @@ _MOST_BYTES = 4 << 20
 _PARAMETER = re.compile(r"\$([A-Za-z0-9_]*)")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _VERSION = re.compile(r"[23]\.[0-9]{1,3}\.[0-9]{1,3}")
+_LAST_ROW = re.compile(r"([+-]?0*\.?0* ){3}[+]?0*1\.?0*")
 _TRIPLES = ("point", "rotate", "scale", "translate", "vector")
 _NUMBERS = (*_TRIPLES, "float", "integer", "lookat", "matrix", "rgb")
 
@@ -155,13 +156,20 @@ class Outline:
             if self._elements > MOST_ELEMENTS:
                 raise refuse(f"over {MOST_ELEMENTS} elements with all includes; make the scene smaller")
             tag = Tag(path, parser.CurrentLineNumber, name, attributes)
-            if (name, attributes.get("name")) == ("string", "filename"):
-                self._name_file(tag)
+            own = attributes.get("value", "")
+            if (name, attributes.get("name")) == ("string", "filename") and own[:1] == "$" and own[1:] in self._given:
+                path_of_own = str(self._files.find_named(own[1:], self._given[own[1:]]))
+                self.defines[own[1:]] = self._values[own[1:]] = path_of_own
             texts = {key: self._with_parameters(tag, text) for key, text in attributes.items()}
             if texts.get("name") == "" and name != "default":
                 raise tag.refusal("name", "''", "give a name; only objects may go without the attribute")
             if not open_tags:
-                _check_root(tag, above)
+                if name != "scene" and not above:
+                    raise refuse(f"the root element is <{cut(name)}>; a Mitsuba scene starts with <scene>")
+                version = attributes.get("version", "")
+                if not _VERSION.fullmatch(version):
+                    rule = 'give the scene version="3.0.0"; 2 and 3 are read'
+                    raise tag.refusal("version", version or "none", rule)
             elif name not in ("default", "include") and texts.get("name"):
                 key = file, open_tags[-1], texts["name"]
                 if key in self._tags:
@@ -174,9 +182,20 @@ class Outline:
                 rule = "it can load native code; remove it and name files relative to the scene"
                 raise tag.refusal("path", repr(texts.get("value", "")), rule)
             if name == "default":
-                self._default(tag)
+                parameter, value = (attributes.get(key, "") for key in ("name", "value"))
+                if not _NAME.fullmatch(parameter) or "$" in value:
+                    rule = "its name has letters, digits and _ only, and it has a plain value without $"
+                    raise tag.refusal("default", repr(parameter), rule)
+                self._defaults.add(parameter)
+                self._values.setdefault(parameter, value)
             elif name == "include":
-                self._include(tag, texts.get("filename", ""), (*above, path.resolve()))
+                inner, open_files = self._files.include(tag, texts.get("filename", "")), (*above, path.resolve())
+                if inner.resolve() in open_files:
+                    raise tag.refusal("include", inner.name, "it comes back to itself; remove one of the two")
+                if self._opened > _MOST_INCLUDES or len(open_files) > _DEEPEST_INCLUDE:
+                    rule = f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed; join some"
+                    raise tag.refusal("include", inner.name, rule)
+                self._read(inner, path.parent, open_files)
             elif name == "spectrum" and "filename" in texts:
                 self._files.spectrum(tag, beside, texts["filename"])
             elif name in _NUMBERS:
@@ -199,12 +218,6 @@ class Outline:
         except ValueError as error:  # an encoding that Python does not know
             raise MitsimError(f"{path}:1: not well-formed XML ({error}); write the scene in UTF-8") from None
 
-    def _name_file(self, tag: Tag) -> None:
-        value = tag.attributes.get("value", "")
-        if value.startswith("$") and value[1:] in self._given:
-            path = str(self._files.find_named(value[1:], self._given[value[1:]]))
-            self.defines[value[1:]] = self._values[value[1:]] = path
-
     def _with_parameters(self, tag: Tag, text: str) -> str:
         if "\\" in text:
             raise tag.refusal("text", repr(text), "backslashes are not allowed")
@@ -216,23 +229,6 @@ class Outline:
             return self._values[match[1]]
 
         return text if tag.name == "default" else _PARAMETER.sub(value, text)
-
-    def _default(self, tag: Tag) -> None:
-        name, value = (tag.attributes.get(key, "") for key in ("name", "value"))
-        if not _NAME.fullmatch(name) or "$" in value:
-            rule = "its name has letters, digits and _ only, and it has a plain value without $"
-            raise tag.refusal("default", repr(name), rule)
-        self._defaults.add(name)
-        self._values.setdefault(name, value)
-
-    def _include(self, tag: Tag, name: str, above: tuple[Path, ...]) -> None:
-        path = self._files.include(tag, name)
-        if path.resolve() in above:
-            raise tag.refusal("include", path.name, "it comes back to itself; remove one of the two")
-        if self._opened > _MOST_INCLUDES or len(above) > _DEEPEST_INCLUDE:
-            rule = f"{_MOST_INCLUDES} includes, {_DEEPEST_INCLUDE} deep, are allowed; join some"
-            raise tag.refusal("include", path.name, rule)
-        self._read(path, tag.path.parent, above)
 
 
 def _content(path: Path) -> bytes:
@@ -256,15 +252,6 @@ def _content(path: Path) -> bytes:
     return content
 
 
-def _check_root(tag: Tag, above: tuple[Path, ...]) -> None:
-    if tag.name != "scene" and not above:
-        place = f"{tag.path}:{tag.line}"
-        raise MitsimError(f"{place}: the root element is <{cut(tag.name)}>; a Mitsuba scene starts with <scene>")
-    version = tag.attributes.get("version", "")
-    if not _VERSION.fullmatch(version):
-        raise tag.refusal("version", version or "none", 'give the scene version="3.0.0"; 2 and 3 are read')
-
-
 def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
     name, words = texts.get("name", tag.name), re.split(r"[\s,]+", texts.get("value", "").strip())
     for text in texts.values():
@@ -272,12 +259,9 @@ def _check_numbers(tag: Tag, texts: Mapping[str, str]) -> None:
             raise tag.refusal(name, repr(text), "give a number")
     if tag.name in _TRIPLES and "value" in texts and (len(words) not in (1, 3) or {"x", "y", "z"} & texts.keys()):
         raise tag.refusal(name, repr(texts["value"]), "give value with 1 or 3 numbers, or x, y and z")
-    if (
-        tag.name == "matrix"
-        and len(words) == 16
-        and not re.fullmatch(r"([+-]?0*\.?0* ){3}[+]?0*1\.?0*", " ".join(words[12:]))
-    ):
-        raise tag.refusal("matrix", f"last row {' '.join(words[12:])}", "it must be 0 0 0 1")
+    last = " ".join(words[12:])
+    if tag.name == "matrix" and len(words) == 16 and not _LAST_ROW.fullmatch(last):
+        raise tag.refusal("matrix", f"last row {last}", "it must be 0 0 0 1")
 
 
 def one_line(error: BaseException) -> str:

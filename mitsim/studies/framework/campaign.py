@@ -130,7 +130,7 @@ def _check_data(points: Sequence[Point]) -> None:
 
     A bench is opened once for all points that differ in their prints or accuracies alone.
     """
-    from mitsim.bench.feasibility import shortage  # here: it needs the renderer
+    from mitsim.bench.layout import shortage  # here: it needs the renderer
 
     asked = {(replace(each.setup, picture=None, accuracy=Setup.accuracy), each["patterns"]) for each in points}
     for setup, patterns in sorted(asked, key=str):

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.feasibility import mask_fault, obstacles, shortage
-from mitsim.bench.layout import layout_of
+from mitsim.bench.layout import layout_of, mask_fault, obstacles, shortage
 from mitsim.devices.mask_profile import MaskProfile
 
 pytestmark = pytest.mark.usefixtures("variant")

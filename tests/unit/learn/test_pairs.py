@@ -16,7 +16,7 @@ from scipy import sparse
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.api.bench import Bench, open_bench
-from mitsim.bench.prints import show_picture
+from mitsim.bench.board import show_picture
 from mitsim.bench.request import Request, Task
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer

@@ -94,7 +94,7 @@ def test_a_full_disk_is_a_line(loaded: Callable[[str], LoadedScene], monkeypatch
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(thin, "_write", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(
         MitsimError, match=r"thin cylinders and small lamps: .*No space left on device; free some space"
     ):
