@@ -16,7 +16,7 @@ from mitsim.core.images import image_size, read_image
 from mitsim.core.job import Cost, Job
 from mitsim.core.parallel import in_threads
 from mitsim.core.seeds import stream
-from mitsim.devices.flatlist import DarkSet, FlatFrames, LitSet, capacity_of
+from mitsim.devices.framelist import DarkSet, FlatFrames, LitSet, capacity_of
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.camera_fit import FoundCamera, Places, average_moments, nonuniform, saturation_of
 from mitsim.sensor.chain import dark_current_variance, expose, mean_dark_current, response_variance
