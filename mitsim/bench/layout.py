@@ -23,7 +23,6 @@ from mitsim.core.environment import keep_scenes
 from mitsim.devices.mask import Mask
 from mitsim.devices.patterns import PatternFamily, is_prime
 from mitsim.optics.shadow import Directions, ShadowGeometry
-from mitsim.reconstruct.focus import pixels_of_parallax
 from mitsim.scene.load import why_dark
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.plugins.base import channels, device_vectors, host_values, turn_and_origin, vectors
@@ -130,6 +129,8 @@ class Layout:
 @keep_scenes()
 def layout_of(bench: Apparatus) -> Layout:
     """Determine the layout of a ``bench`` with one ray per projector pixel."""
+    from mitsim.reconstruct.focus import pixels_of_parallax  # here: a capture needs none of the solver
+
     loaded, geometry, n = bench.loaded, bench.geometry, bench.n
     turn, origin = camera_place(bench)
     rays = PinholeRays(bench.projector_optics, [None])
