@@ -122,8 +122,8 @@ def closed() -> dict[str, float]:
     from mitsim.devices.camera import CameraGeometry, Devices
     from mitsim.devices.projector import Coherence, ProjectorModel, Spectrum
     from mitsim.devices.sensor import load_sensor
-    from mitsim.optics.shadow import Directions
     from mitsim.optics.frames import contrast_of
+    from mitsim.optics.shadow import Directions
     from mitsim.optics.terms import shadow_terms
     from mitsim.reconstruct.colour import ColourModel, chart, delta_e
 

@@ -19,7 +19,6 @@ from mitsim.core.manifests import Parallax
 from mitsim.core.runs import Capture
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from tests.shadow_factor import scene_factor
 from mitsim.reconstruct.depth import Depth, best_depth
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.focus import ColumnSpline, FactorOfDepths, move_factors
