@@ -23,6 +23,9 @@ _FIELDS = 4
 """Of a chessboard, a side (IEC 61947-1, ANSI IT7.228)."""
 
 
+# -------- Spectra and lines
+
+
 @dataclass(frozen=True, eq=False)
 class Spectrum(ByValue):
     """Wavelengths and the share of the photons at each; MitsimError for arrays that are none.
@@ -135,6 +138,8 @@ class Lines:
         edges.insert(0, 0)
         return tuple(Lines(lines.wavelengths_nm[a:b], lines.shares[a:b]) for a, b in pairwise(edges))
 
+
+# -------- A projector
 
 Nanometres = Annotated[float, Field(ge=1, le=1e6)]
 """Wavelength [nm]: from soft X-rays to a millimetre."""
