@@ -107,10 +107,8 @@ class Npy:
             raise ValueError("it is no array of numbers")
         try:
             shape, fortran, dtype = read(file)
-        except ValueError:
-            raise
-        except Exception:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
-            raise ValueError("its header is damaged") from None
+        except Exception as error:  # of a damaged header NumPy raises whatever Python does on reading it as a literal
+            raise error if isinstance(error, ValueError) else ValueError("its header is damaged") from None
         found = cls(shape, dtype, fortran, file.tell())
         if dtype.hasobject:
             raise ValueError("it holds objects of Python, which are code")
@@ -283,12 +281,24 @@ class _FirstErrorFile:
         self.tell, self.seek, self.read = disk.tell, disk.seek, disk.read  # by which h5py knows an open file
 
     def write(self, data: Any) -> int:
-        """Write ``data``; returns its length."""
-        return self._try(self._whole, memoryview(data).cast("B"), memoryview(data).nbytes)
+        """Write ``data``; return its length."""
+        view = memoryview(data).cast("B")
+        length = len(view)
+        try:
+            while view and self.error is None:
+                view = view[self._disk.write(view) :]
+        except OSError as error:
+            self.error = error
+        return length
 
     def truncate(self, size: int) -> int:
-        """Make the file ``size`` bytes long; returns that."""
-        return self._try(self._disk.truncate, size, size)
+        """Make the file ``size`` bytes long; return that."""
+        try:
+            if self.error is None:
+                self._disk.truncate(size)
+        except OSError as error:
+            self.error = error
+        return size
 
     def flush(self) -> None:
         """Nothing waits: it is not buffered here."""
@@ -299,18 +309,6 @@ class _FirstErrorFile:
         found = self._disk.readinto(view) or 0
         view[found:] = bytes(len(view) - found)
         return len(view)
-
-    def _whole(self, view: memoryview) -> None:
-        while view:
-            view = view[self._disk.write(view) :]
-
-    def _try(self, work: Any, argument: Any, result: int) -> int:
-        try:
-            if self.error is None:
-                work(argument)
-        except OSError as error:
-            self.error = error
-        return result
 
 
 # -------- MATLAB files of version 5
@@ -390,7 +388,7 @@ def read_variables(path: Path) -> dict[str, Any]:
 
 
 def _arrays_in(file: BinaryIO) -> dict[str, int]:
-    """Bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
+    """Return the bytes that each array of real numbers and each text of an open MATLAB ``file`` takes, by name.
 
     SciPy's readers allocate what a file claims, and call themselves for each cell within a cell until the process
     ends. Here no more than the beginning of each variable is unpacked, after "MAT-File Format" (MathWorks).
@@ -420,43 +418,35 @@ def _arrays_in(file: BinaryIO) -> dict[str, int]:
             beginning = beginning[8:]
         if kind != _MATRIX:
             raise ValueError(f"it holds an element of the kind {kind}")
-        named = _array(beginning, length, order)
-        if named is not None:
-            if named[0] in found or len(found) == _MOST_VARIABLES:
-                raise ValueError(f"it holds {named[0]!r} twice, or over {_MOST_VARIABLES} variables")
-            found[named[0]] = named[1]
+        flags, at = _element(beginning, 0, order)
+        (flag,) = struct.unpack_from(f"{order}I", flags)
+        size = _BYTES_OF.get(flag & 0xFF)
+        if size is None or flag >> 8 & _COMPLEX:
+            continue  # no array of real numbers, and no text
+        dimensions, at = _element(beginning, at, order)
+        name, at = _element(beginning, at, order)
+        sides = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
+        count = math.prod(sides)
+        if len(sides) < 2 or min(sides) < 0 or count * size > LARGEST_VARIABLE:
+            raise ValueError(f"its variable {name[:80]!r} claims a shape of {sides[:8]}")
+        # Numbers are stored as the smallest type that holds them, and never as a larger one than they are of.
+        stored, _ = _tag(beginning, at, order)
+        if stored > count * size or length > at + count * size + _PADDING:
+            raise ValueError(f"its variable {name[:80]!r} claims more bytes than its shape has")
+        if (text := name.decode("ascii")) in found or len(found) == _MOST_VARIABLES:
+            raise ValueError(f"it holds {text!r} twice, or over {_MOST_VARIABLES} variables")
+        found[text] = count * size
     return found
 
 
-def _array(beginning: bytes, length: int, order: str) -> tuple[str, int] | None:
-    """Name and bytes of an array of real numbers or a text that begins so, of ``length`` bytes in the file; None of
-    another. ValueError where it claims other bytes than its shape has."""
-    flags, place = _element(beginning, 0, order)
-    (flag,) = struct.unpack_from(f"{order}I", flags)
-    size = _BYTES_OF.get(flag & 0xFF)
-    if size is None or flag >> 8 & _COMPLEX:
-        return None
-    dimensions, place = _element(beginning, place, order)
-    name, place = _element(beginning, place, order)
-    sides = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
-    count = math.prod(sides)
-    if len(sides) < 2 or min(sides) < 0 or count * size > LARGEST_VARIABLE:
-        raise ValueError(f"its variable {name[:80]!r} claims a shape of {sides[:8]}")
-    # Numbers are stored as the smallest type that holds them, and never as a larger one than they are of.
-    stored, _ = _tag(beginning, place, order)
-    if stored > count * size or length > place + count * size + _PADDING:
-        raise ValueError(f"its variable {name[:80]!r} claims more bytes than its shape has")
-    return name.decode("ascii"), count * size
-
-
 def _tag(data: bytes, place: int, order: str) -> tuple[int, int]:
-    """Bytes of an element's content at a ``place``, and where it begins."""
+    """Return the bytes of an element's content at a ``place``, and where it begins."""
     kind, length = struct.unpack_from(f"{order}2I", data, place)
     return (kind >> 16, place + 4) if kind >> 16 else (length, place + 8)
 
 
 def _element(data: bytes, place: int, order: str) -> tuple[bytes, int]:
-    """Content of an element at a ``place``, and where the next one begins."""
+    """Return the content of an element at a ``place``, and where the next one begins."""
     length, start = _tag(data, place, order)
     if start + length > len(data):
         raise ValueError(f"a name or shape in it takes {length} bytes")

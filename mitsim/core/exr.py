@@ -67,10 +67,21 @@ def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> str
     MitsimError
         when the file cannot be written.
     """
-    _check_channels(channels)
+    if not channels:
+        raise ValueError("write_frame: no channels given; a frame needs at least one")
+    shapes = {np.shape(values) for values in channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
+        raise ValueError(f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape")
+    for name, values in channels.items():
+        if np.asarray(values).dtype not in (np.float32, np.uint32):
+            raise TypeError(f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32")
     # Noise does not compress: ZIP saves a tenth of the room for four times the time.
     header: dict[str, Any] = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
-    header.update({_PREFIX + key: json.dumps(_scalar(value)) for key, value in metadata.items()})
+    for key, value in metadata.items():
+        plain: Any = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(plain, (str, int, float)):
+            raise TypeError(f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float")
+        header[_PREFIX + key] = json.dumps(plain)
     pixels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
     image = io.BytesIO()
     with whole_file(path) as part:
@@ -85,7 +96,7 @@ def write_frame(path: Path | str, channels: Channels, metadata: Metadata) -> str
 
 
 def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
-    """Channels (2-D, float32 or uint32; half floats become float32) and metadata of the frame ``path``.
+    """Return channels (2-D, float32 or uint32; half floats become float32) and metadata of the frame ``path``.
 
     Files of other programs are read too; their metadata is then empty. MitsimError for a file that is
     missing, is not OpenEXR, or is damaged.
@@ -96,7 +107,12 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
         header = read_header(path)
         if not fits_a_frame((header.height, header.width)):
             raise ValueError(f"claims {header.width}x{header.height} pixels; {FRAME_LIMITS} are read")
-        with _open(path) as file:
+        # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++
+        # part one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's
+        # streams.
+        with stderr_silenced(), contextlib.redirect_stdout(io.StringIO()):
+            opened = OpenEXR.File(str(path), separate_channels=True)
+        with opened as file:
             header = file.header()
             # Both are emptied when the file closes, so they are copied here.
             metadata = {key[len(_PREFIX) :]: _plain(header[key]) for key in header if key.startswith(_PREFIX)}
@@ -110,7 +126,7 @@ def read_frame(path: Path | str) -> tuple[dict[str, Channel], dict[str, Value]]:
 
 
 def checksum(path: Path | str) -> str:
-    """SHA-256 of the bytes of the file ``path`` as 64 hexadecimal digits. MitsimError when it cannot be read."""
+    """Return the SHA-256 of the file ``path`` as 64 hexadecimal digits. MitsimError when it cannot be read."""
     digest = hashlib.sha256()
     check_plain(path)
     try:
@@ -163,7 +179,7 @@ def verify_files(folder: Path, stated: object, remedy: str) -> None:
 
 
 def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
-    """One channel of a frame in double precision.
+    """Return one channel of a frame in double precision.
 
     Parameters
     ----------
@@ -189,36 +205,11 @@ def finite_channel(channels: Channels, name: str, path: Path) -> FloatArray:
     return values
 
 
-def _check_channels(channels: Channels) -> None:
-    if not channels:
-        raise ValueError("write_frame: no channels given; a frame needs at least one")
-    shapes = {np.shape(values) for values in channels.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
-        raise ValueError(f"write_frame: channel shapes are {sorted(shapes)}; all must be one non-empty 2-D shape")
-    for name, values in channels.items():
-        if np.asarray(values).dtype not in (np.float32, np.uint32):
-            raise TypeError(f"write_frame: channel {name!r} is {np.asarray(values).dtype}; make it float32 or uint32")
-
-
 def _plain(text: str) -> Value:
     value = parse_json(text)
     if not isinstance(value, (str, int, float)):
         raise ValueError(f"metadata {cut(text)!r} is no text or number")
     return value
-
-
-def _scalar(value: Value) -> Value:
-    plain: Any = value.item() if isinstance(value, np.generic) else value
-    if not isinstance(plain, (str, int, float)):
-        raise TypeError(f"write_frame: metadata value {value!r} is {type(value).__name__}; use str, int or float")
-    return plain
-
-
-def _open(path: Path) -> Any:
-    # OpenEXR prints a warning to stdout for pixels it cannot read, where --json promises JSON alone, and its C++ part
-    # one to stderr, past Python; it raises later on. The lock keeps two threads from restoring each other's streams.
-    with stderr_silenced(), contextlib.redirect_stdout(io.StringIO()):
-        return OpenEXR.File(str(path), separate_channels=True)
 
 
 # -------- An OpenEXR file's path in
@@ -252,7 +243,7 @@ class ExrHeader:
 
 
 def read_header(path: Path) -> ExrHeader:
-    """The header of the file at ``path``, checked against the file's own size.
+    """Return the header of the file at ``path``, checked against the file's own size.
 
     Raises
     ------

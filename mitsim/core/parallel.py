@@ -97,15 +97,11 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> lis
 _inside = threading.local()
 
 
-def _mark() -> None:
-    """Make known that this thread is one of ours: were it to wait for others, all might wait."""
-    _inside.thread = True
-
-
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     """So many threads, kept for the next call: starting some takes as long as forming a small frame."""
-    return ThreadPoolExecutor(threads, initializer=_mark)
+    # Each thread is known as one of ours: were it to wait for others, all might wait.
+    return ThreadPoolExecutor(threads, initializer=setattr, initargs=(_inside, "thread", True))
 
 
 os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not live on in a forked process

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
@@ -73,8 +73,28 @@ def enter_worker() -> None:
         return
     if "drjit" in sys.modules:
         raise RuntimeError("enter_worker: Dr.Jit is imported already, and its threads do not survive a fork")
-    _check_descriptors()
-    _check_address_space()
+    # A file that is opened later would get the number of a closed standard output, and what is printed. Closed standard
+    # input and error lead to nothing instead.
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            if number == 1:
+                _say("standard output is closed; give it a file, a pipe or /dev/null")
+                sys.exit(2)
+            os.open(os.devnull, mode)  # which takes the lowest number that is free
+            if number == 2:
+                sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = _SPACE_BYTES + _SPACE_BYTES_PER_PROCESSOR * workers()
+    if limit != resource.RLIM_INFINITY and limit < needed:  # in which OpenBLAS, loaded with numpy, would try for ever
+        _say(
+            f"address space is limited to {limit / 2**30:.2g} GiB; at least {needed / 2**30:.2g} GiB are needed to "
+            "start; raise the limit, for example with: ulimit -v unlimited"
+        )
+        sys.exit(2)
     # Until both processes know what to do with them.
     signal.pthread_sigmask(signal.SIG_BLOCK, {*_STOPS, signal.SIGCHLD})
     _advice = mmap.mmap(-1, _LONGEST_ADVICE)  # shared: what the worker notes, its parent reads
@@ -87,8 +107,13 @@ def enter_worker() -> None:
         _watch(child)
     os.close(writing)
     atexit.register(_leave)  # before all others, so that it comes after them
+
+    def end_with_parent() -> None:
+        os.read(reading, 1)  # nothing is ever written: this returns when the parent is gone
+        os.kill(os.getpid(), signal.SIGKILL)
+
     # Signals stay blocked in this thread, so it is the main one that they interrupt.
-    threading.Thread(target=_end_with_parent, args=(reading,), daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     _insist_on_signals()
     for number in _signals_to_heed():
         signal.signal(number, _stop)
@@ -224,35 +249,6 @@ def say_note(text: str) -> None:
     _say(f"note: {' '.join(text.split())}")
 
 
-def _check_descriptors() -> None:
-    """Exit when standard output is closed: a file that is opened later would get its number, and what is printed.
-    Closed standard input and error lead to nothing instead."""
-    for number, mode in ((0, os.O_RDONLY), (1, os.O_WRONLY), (2, os.O_WRONLY)):
-        try:
-            os.fstat(number)
-        except OSError:
-            if number == 1:
-                _say("standard output is closed; give it a file, a pipe or /dev/null")
-                sys.exit(2)
-            os.open(os.devnull, mode)  # which takes the lowest number that is free
-            if number == 2:
-                sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
-
-
-def _check_address_space() -> None:
-    """Exit when the limit on address space is one in which OpenBLAS, loaded with numpy, would try for ever."""
-    import resource
-
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    needed = _SPACE_BYTES + _SPACE_BYTES_PER_PROCESSOR * workers()
-    if limit != resource.RLIM_INFINITY and limit < needed:
-        _say(
-            f"address space is limited to {limit / 2**30:.2g} GiB; at least {needed / 2**30:.2g} GiB are needed to "
-            "start; raise the limit, for example with: ulimit -v unlimited"
-        )
-        sys.exit(2)
-
-
 def _signals_to_heed() -> list[int]:
     """Signals that are not ignored already, as nohup and background jobs of a shell have it."""
     return [number for number in _STOPS if signal.getsignal(number) is not signal.SIG_IGN]
@@ -300,11 +296,6 @@ def _unraisable(lost: sys.UnraisableHookArgs) -> None:
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)
 
 
-def _end_with_parent(reading: int) -> None:
-    os.read(reading, 1)  # nothing is ever written: this returns when the parent is gone
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def _watch(child: int) -> NoReturn:
     """Wait for the worker, pass signals on, report its end, and exit."""
     asked: list[int] = []
@@ -322,16 +313,13 @@ def _watch(child: int) -> NoReturn:
         sys.stderr.flush()
     if os.WIFEXITED(status):
         os._exit(os.WEXITSTATUS(status))
-    killer = os.WTERMSIG(status)
-    _say(_obituary(signal.Signals(killer), asked))
-    os._exit(128 + (asked[0] if asked else killer))
-
-
-def _obituary(killer: signal.Signals, asked: Sequence[int]) -> str:
-    """Why the worker is gone that was ``asked`` to end by these signals, and what to do."""
+    killer = signal.Signals(os.WTERMSIG(status))
     if asked:
         # A first signal ends it without a word once Python has given up its handlers, in the last moment.
-        return _with_advice(_ending(killer) if killer == asked[0] else "stopped at once")
-    cause = "a crash in native code" if killer.name in _CRASHES else "out of memory, or killed from outside"
-    remedy = "run: mitsim doctor" if killer.name in _CRASHES else "free memory or ask for less"
-    return f"{_with_advice(f'the worker process was ended by {killer.name} ({cause})')}; {remedy}"
+        _say(_with_advice(_ending(killer) if killer == asked[0] else "stopped at once"))
+    else:
+        crash = killer.name in _CRASHES
+        cause = "a crash in native code" if crash else "out of memory, or killed from outside"
+        remedy = "run: mitsim doctor" if crash else "free memory or ask for less"
+        _say(f"{_with_advice(f'the worker process was ended by {killer.name} ({cause})')}; {remedy}")
+    os._exit(128 + (asked[0] if asked else killer))

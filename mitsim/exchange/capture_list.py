@@ -120,7 +120,7 @@ def load_capture_list(name: Path | str) -> CaptureList:
 
 
 def _from_folder(holder: Configuration, folder: Path, *names: str) -> dict[str, str]:
-    """Those of the fields ``names`` that hold a path, from ``folder`` on."""
+    """Return those of the fields ``names`` that hold a path, from ``folder`` on."""
     return {name: str(folder / path) for name in names if (path := getattr(holder, name)) is not None}
 
 
@@ -151,7 +151,7 @@ class Electronics:
 
 @dataclass(frozen=True)
 class RealCapture:
-    """What a person knows of a real capture.
+    """A person's knowledge of a real capture.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class RealCapture:
     exposure_s
         of every frame [s]; None: as ``listed`` says.
     calibration
-        CAL folder of the same camera, which tells its identity and the projector's pixels; of all planes a coloured
+        CAL folder of the same camera, which states its identity and the projector's pixels; of all planes a coloured
         one.
     black_level_dn
         digital number of a (binned) pixel without charge, where it is another than the camera's.
@@ -182,36 +182,28 @@ class RealCapture:
         return self.listed.patterns
 
     @property
-    def prepare(self) -> Preparation:
-        """What is done to the files' numbers."""
-        return self.listed.prepare
-
-    @property
-    def ambient(self) -> Path | None:
-        """Frame, or folder of frames, with the projector off."""
-        return None if self.listed.ambient is None else Path(self.listed.ambient)
+    def in_file(self) -> bool:
+        """Whether the patterns are in a file."""
+        return Path(self.patterns).suffix == ".json"
 
     @property
     def wanted(self) -> Wanted:
         """How its files are read."""
-        return Wanted.of(self.listed.raw, self.prepare)
-
-    @property
-    def in_file(self) -> bool:
-        """Whether the patterns stand in a file."""
-        return Path(self.patterns).suffix == ".json"
+        return Wanted.of(self.listed.raw, self.listed.prepare)
 
     @property
     def colours(self) -> ColourManifest | None:
         """All planes as lines of a coloured folder; None of a single plane, or a picture that is no mosaic."""
-        return lines_of_planes(RUN, self.prepare.wavelengths_nm) if self.prepare.channel == ALL else None
+        prepare = self.listed.prepare
+        return lines_of_planes(RUN, prepare.wavelengths_nm) if prepare.channel == ALL else None
 
     def electronics(self) -> tuple[Electronics, Preparation]:
-        """The camera, by its file or the list; and what is done to its numbers, with its mosaic.
+        """Return the camera, by its file or the list; and what is done to its numbers, with its mosaic.
 
         MitsimError where neither says it, or a value cannot be.
         """
-        prepare, listed = self.prepare, self.listed
+        listed = self.listed
+        prepare = listed.prepare
         if self.camera is not None:
             if self.exposure_s is None:
                 raise ArgumentError("exposure", "is not given, and frames do not say it; give it")
@@ -223,12 +215,8 @@ class RealCapture:
             stated = {"sensor": sensor.model_dump(mode="json", exclude={"full_well_e"})}
         elif listed.digital is not None and listed.camera is not None:
             seconds = check_exposure(self.exposure_s or listed.digital.exposure_s)
-            identity = dict(listed.camera)
-            digital, name = (
-                listed.digital.model_copy(update={"exposure_s": seconds}),
-                str(identity.get("name", "named")),
-            )
-            largest = None if listed.bits is None else 2**listed.bits - 1
+            digital, identity = listed.digital.model_copy(update={"exposure_s": seconds}), dict(listed.camera)
+            name, largest = str(identity.get("name", "named")), None if listed.bits is None else 2**listed.bits - 1
             stated = {"sensor": {"name": name, "digital": listed.digital.model_dump(mode="json"), "bits": listed.bits}}
         else:
             raise ArgumentError("camera", "is not given, and frames do not say it; give it")
@@ -238,16 +226,15 @@ class RealCapture:
         return Electronics(name, identity, digital, largest, stated), prepare
 
     def check(self, source: Path) -> None:
-        """MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
+        """Raise MitsimError for values that cannot be, and a ``source`` without frames, before any frame is opened."""
         listed = self.listed
         check_root(listed.seed)
         if listed.closing_exposure_s is not None:
             check_exposure(listed.closing_exposure_s)
-            if listed.closing_frame is None or self.prepare.dark is not None:
+            if listed.closing_frame is None or listed.prepare.dark is not None:
                 why = "without a closing frame" if listed.closing_frame is None else "beside dark frames of another"
-                raise ArgumentError(
-                    "closing_exposure", f"{listed.closing_exposure_s:g}: is of no use {why}; leave it out"
-                )
+                said = f"{listed.closing_exposure_s:g}: is of no use {why}; leave it out"
+                raise ArgumentError("closing_exposure", said)
         if listed.n is not None and listed.n < 1:
             raise ArgumentError("projector_pixels", f"{listed.n}: give 1 or more, those a side")
         if listed.ambient_shots is not None and (listed.ambient is None or listed.ambient_shots < 1):
@@ -256,20 +243,18 @@ class RealCapture:
         if self.calibration is not None:
             self._check_calibration(self.calibration)
         elif listed.n is None:
-            raise ArgumentError(
-                "calibration", "is not given, and patterns need its projector; give it, or --projector-pixels"
-            )
+            needed = "is not given, and patterns need its projector; give it, or --projector-pixels"
+            raise ArgumentError("calibration", needed)
         if self.in_file:
             check_plain(self.patterns)
         else:
             read_name(self.patterns, listed.n)
-        for name in CORRECTIONS:
-            if (path := getattr(self.prepare, name)) is not None:
-                image_files(Path(path), self.wanted)
-        image_files(source, self.wanted)
+        for place in (source, *(getattr(listed.prepare, name) for name in CORRECTIONS)):
+            if place is not None:
+                image_files(Path(place), self.wanted)
 
     def _check_calibration(self, folder: Path) -> None:
-        """MitsimError for a calibration that is none, of other lines, or that keeps means which the list takes off."""
+        """Raise MitsimError for a calibration that is none, of other lines, or that keeps means that the list takes."""
         colours = self.colours
         if colours is not None:
             read_colours(folder, CALIBRATION)
@@ -281,18 +266,20 @@ class RealCapture:
                     f"calibration {folder / line}: its centre is {str(manifest.centre).lower()}, and the list's "
                     f"{str(asked).lower()}: it takes other means off frames; calibrate as the list says, or correct it"
                 )
-            turned = manifest.configuration.get(TURNED, self.prepare.turn_deg)
-            if turned != self.prepare.turn_deg:
+            turned = manifest.configuration.get(TURNED, self.listed.prepare.turn_deg)
+            if turned != self.listed.prepare.turn_deg:
                 raise MitsimError(
                     f"calibration {folder / line}: is of frames turned by {turned} degrees, not by "
-                    f"{self.prepare.turn_deg:g}; give --turn {turned}"
+                    f"{self.listed.prepare.turn_deg:g}; give --turn {turned}"
                 )
 
 
 # ---- What is said of frames in the place of a list ----
 
 _OF_BARE = ("shape", "bits", "byte_order")
-"""Of files without a header alone."""
+"""Options of files without a header alone."""
+_said = partial(option, None)
+_LISTS, _CAMERAS = (partial(shipped_names, field) for field in (LIST, CAMERA))
 
 
 class FrameFacts(Options):
@@ -300,59 +287,45 @@ class FrameFacts(Options):
 
     VERB = "import_frames"
 
-    list: FilePath | None = option(
-        None,
-        "of frames: list of what is known of them; options take its place",
-        metavar="NAME|FILE",
-        complete=partial(shipped_names, LIST),
+    list: FilePath | None = _said(
+        "of frames: list of what is known of them; options take its place", metavar="NAME|FILE", complete=_LISTS
     )
-    patterns: str | None = option(None, "of frames: the family, or patterns.json of export", metavar="NAME|FILE")
-    camera: FilePath | None = option(
-        None,
-        "of frames: camera electronics, name or TOML file",
-        metavar="NAME|FILE",
-        complete=partial(shipped_names, CAMERA),
+    patterns: str | None = _said("of frames: the family, or patterns.json of export", metavar="NAME|FILE")
+    camera: FilePath | None = _said(
+        "of frames: camera electronics, name or TOML file", metavar="NAME|FILE", complete=_CAMERAS
     )
-    exposure: float | None = option(None, "of frames: seconds of each", metavar="SECONDS")
-    calibration: FilePath | None = option(
-        None, "of frames: calibration of the same camera, for its identity", metavar="CAL"
+    exposure: float | None = _said("of frames: seconds of each", metavar="SECONDS")
+    calibration: FilePath | None = _said("of frames: calibration of the same camera, for its identity", metavar="CAL")
+    projector_pixels: int | None = _said("of frames: projector pixels a side, without a calibration", metavar="N")
+    black_level: float | None = _said("of frames: number of a pixel without charge; the camera's if not given")
+    ambient_frame: FilePath | None = _said("frame, or folder of frames, with the projector off", metavar="PATH")
+    ambient_shots: int | None = _said("shots that a single such frame is the mean of", metavar="N")
+    closing_frame: Literal["first", "uniform"] | None = _said(
+        "the last frame checks lamp, camera and scene: the first one again, or a uniform one", metavar="first|uniform"
     )
-    projector_pixels: int | None = option(
-        None, "of frames: projector pixels a side, without a calibration", metavar="N"
+    closing_exposure: float | None = _said("seconds of that frame; those of all if not given", metavar="SECONDS")
+    order: str | None = _said(
+        "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
     )
-    black_level: float | None = option(None, "of frames: number of a pixel without charge; the camera's if not given")
-    ambient_frame: FilePath | None = option(None, "frame, or folder of frames, with the projector off", metavar="PATH")
-    ambient_shots: int | None = option(None, "shots that a single such frame is the mean of", metavar="N")
-    closing_frame: Literal["first", "uniform"] | None = option(
-        None,
-        "the last frame checks lamp, camera and scene: the first one again, or a uniform one",
-        metavar="first|uniform",
+    shape: str | tuple[int, int] | None = _said("of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS")
+    bits: int | None = _said("of a number in such a file", metavar="N")
+    byte_order: str | None = _said("of such a file: little or big", metavar="ORDER")
+    channel: str | None = _said(
+        "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
     )
-    closing_exposure: float | None = option(None, "seconds of that frame; those of all if not given", metavar="SECONDS")
-    order: str | None = option(
-        None, "in which the shots were taken, such as column-major; row-major if not given", metavar="NAME"
+    mosaic: str | None = _said(
+        "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
     )
-    shape: str | tuple[int, int] | None = option(
-        None, "of files without header (.raw, .bin, .dat)", metavar="ROWSxCOLUMNS"
+    divide: int | None = _said("of frames: factor that all numbers have; found if not given", metavar="N")
+    dark_frame: FilePath | None = _said("frame, or folder of frames, without any light", metavar="PATH")
+    flat_frame: FilePath | None = _said("the same of even light without a mask", metavar="PATH")
+    flat_dark_frame: FilePath | None = _said("the same without light, of the flat's exposure", metavar="PATH")
+    orientation: int | str | None = _said("of frames: Exif's, or as the file says", metavar="1..8|file")
+    turn: float | None = _said("of frames: turned counter-clockwise after that", metavar="DEGREES")
+    crop: str | tuple[int, ...] | None = _said(
+        "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
     )
-    bits: int | None = option(None, "of a number in such a file", metavar="N")
-    byte_order: str | None = option(None, "of such a file: little or big", metavar="ORDER")
-    channel: str | None = option(
-        None, "plane of a colour sensor, as FlatCam names it, or all of them", metavar="r|gb|gr|b|all"
-    )
-    mosaic: str | None = option(
-        None, "of frames: filters of the first 2 x 2 pixels; the camera's if not given", metavar="RGGB|BGGR|GRBG|GBRG"
-    )
-    divide: int | None = option(None, "of frames: factor that all numbers have; found if not given", metavar="N")
-    dark_frame: FilePath | None = option(None, "frame, or folder of frames, without any light", metavar="PATH")
-    flat_frame: FilePath | None = option(None, "the same of even light without a mask", metavar="PATH")
-    flat_dark_frame: FilePath | None = option(None, "the same without light, of the flat's exposure", metavar="PATH")
-    orientation: int | str | None = option(None, "of frames: Exif's, or as the file says", metavar="1..8|file")
-    turn: float | None = option(None, "of frames: turned counter-clockwise after that", metavar="DEGREES")
-    crop: str | tuple[int, ...] | None = option(
-        None, "of frames: part that is taken in the end", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
-    )
-    seed: int | None = option(None, "root of every random stream", panel=QUALITY)
+    seed: int | None = _said("root of every random stream", panel=QUALITY)
 
     def of(self, source: Path) -> RealCapture:
         """What is known of the frames at ``source``, checked before any is opened; MitsimError as

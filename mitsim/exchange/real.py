@@ -245,7 +245,7 @@ class _Plane:
         preparer = Preparer.of(how, camera.digital, known.wanted)
         kind = np.uint32 if camera.largest is not None and preparer.counts else np.float32
         shape = self._part(places[0][0], preparer.frame(places[0][0], first), how).shape
-        ambient = None if known.ambient is None else self._ambient(known.ambient, preparer, shape)
+        ambient = listed.ambient and self._ambient(Path(listed.ambient), preparer, shape)
         seconds = listed.closing_exposure_s or camera.digital.exposure_s
         closing = listed.closing_frame and ClosingFile(kind=listed.closing_frame, file=CLOSING, exposure_s=seconds)
         # The dark level depends on the exposure.
@@ -253,7 +253,11 @@ class _Plane:
         names = (
             *(shot.file for shot in captures), *((AMBIENT,) if ambient else ()), *((CLOSING,) if closing else ()),
         )  # fmt: skip
-        own = camera.identity if known.prepare.channel == how.channel else {**camera.identity, "channel": how.channel}
+        own = (
+            camera.identity
+            if known.listed.prepare.channel == how.channel
+            else {**camera.identity, "channel": how.channel}
+        )
         head = RunHead.of(_configuration(known, camera, how, files))
         manifest = RunManifest(
             configuration=head.configuration,
@@ -351,7 +355,7 @@ def _configuration(
     known: RealCapture, camera: Electronics, how: Preparation, files: tuple[Path, ...]
 ) -> dict[str, Any]:
     """All that decides the frames: whose files, and as what they are read."""
-    more = () if known.ambient is None else image_files(known.ambient, known.wanted)
+    more = () if known.listed.ambient is None else image_files(Path(known.listed.ambient), known.wanted)
     corrected = {
         name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
         for name in CORRECTIONS
