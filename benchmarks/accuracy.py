@@ -46,7 +46,6 @@ from harness import ROOT, arguments, held, show, write
 import mitsim as ms
 from mitsim.acquire.exposure import Exposer
 from mitsim.core.exr import read_frame
-from mitsim.core.job import Job
 from mitsim.core.seeds import integer
 from mitsim.light import light as light_module
 from mitsim.light.light import Sampling, trace_light
@@ -54,7 +53,7 @@ from mitsim.light.settings import Estimate
 from mitsim.optics.frames import monte_carlo_bound, monte_carlo_error
 from mitsim.planner.choose import predicted_candidate
 from mitsim.planner.planner import make_plan
-from mitsim.studies.accuracy_parts import Stand
+from mitsim.studies.accuracy_study import Probe
 
 SCENES = (
     *("photograph", "colour_chart", "resolution_target", "keystone", "gift_card", "corner", "cards", "metal_blade"),
@@ -78,7 +77,7 @@ def answer(scene: str, noise: float, halves: int = 2) -> npt.NDArray[np.float32]
     """(halves, shots, pixels, pixels) irradiance of all shots in so many independent ``halves``."""
     bench = ms.open_bench(scene)
     family = bench.family(PATTERNS, SEED)
-    stand = Stand(bench, family, ANSWERS, Job(), FINEST / SEEN)
+    stand = Probe(bench, family, ANSWERS, FINEST / SEEN)
     finest = stand.finest(stand.plan(FINEST))
     samples = predicted_candidate(noise, stand.pilot_result, finest.settings, {}).settings
     plan = replace(finest, settings=samples, sampling_target=noise)

@@ -58,6 +58,7 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
 from mitsim.studies import EXPOSED, OF_CAPTURES, OF_NO_SCENE
 from mitsim.studies.emva_options import Procedure
+from mitsim.studies.twin_files import TwinFiles
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -412,15 +413,25 @@ def _study_of_points(
     recipe = None if asked.recipe is None else str(asked.recipe)
     if recipe is not None:
         load_recipe(recipe)
-    scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe)
+    data = None if _captures(name, scene, asked) is None else str(asked.data)
+    scope = Scope(setup, pictures, seeds=(asked.seed,), quick=asked.quick, recipe=recipe, data=data)
     scope = scope_of(name, scope, request.patterns, asked.varied, asked.measure)
-    if name not in ("sweep", "drift"):
+    if name not in ("accuracy", "sweep", "drift"):
         asked.refuse(["patterns"], f"on the study {name}, which has its own")
     if asked.scheduler is not None:
         asked.refuse(["jobs"], "with a scheduler, whose machines have processes of their own")
     where = Where(Shard.of(asked.shard), asked.jobs, asked.scheduler)
     _check_setup(scope, scene)
     return partial(run_experiment, name, scope, output, job, where)
+
+
+def _captures(name: str, scene: str | None, asked: StudyOptions) -> TwinFiles | None:
+    """Return the real captures that a study is of, if any; MitsimError for a study of no scene that is given one."""
+    if name in OF_NO_SCENE:
+        if scene is not None:
+            raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
+        asked.refuse(_OF_SCENES, f"on the study {name}, which is of no scene")
+    return TwinFiles.find(None if asked.data is None else Path(asked.data), name) if name in OF_CAPTURES else None
 
 
 def scope_of(
@@ -447,12 +458,15 @@ def scope_of(
         check_sweep(tuple(varied), len(scope.pictures))
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), measures=measures_of(measure), patterns=patterns)
+    if name == "accuracy" and measure == "psnr" and not varied:
+        read_name(patterns)
+        return replace(scope, patterns=patterns)
     if name == "drift" and measure == "psnr":
         check_drifts(tuple(varied))
         read_name(patterns)
         return replace(scope, sweep=tuple(varied), patterns=patterns)
     if varied or patterns != "dots:7" or measure != "psnr":
-        others = "measure is for sweep, over and patterns for drift and sweep"
+        others = "measure is for sweep, over for drift and sweep, patterns for these and accuracy"
         raise MitsimError(f"study {name}: has its own points and measures; {others}")
     return scope
 
@@ -461,7 +475,7 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     """Refuse files of a ``scope`` that cannot be used, before the renderer is imported. A study without a ``scene`` of
     its own may use others."""
     from mitsim.bench.apparatus import check_devices, check_scene
-    from mitsim.studies.framework.experiment import NO_SCENE
+    from mitsim.studies.framework.experiment import NO_SCENE, Scope
 
     camera, projector = check_devices(scope.setup.camera, scope.setup.projector)
     # A study in colour may see through colour filters; all fill a part of the full well.
@@ -469,7 +483,7 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     if scene or scope.measures:
         knobs = dict(scope.sweep) if scope.measures else {}
         varied = {name: values[0] for name, values in knobs.items() if name not in NO_SCENE}
-        shown = knobs.get("patterns", (scope.patterns,) if scope.measures else ())
+        shown = knobs.get("patterns", (scope.patterns,) if scope.measures or scope.patterns != Scope.patterns else ())
         check_scene(scope.setup.scene, {**dict(scope.setup.parameters), **varied}, scope.setup.outside, shown)
     from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
@@ -481,16 +495,10 @@ def _study_of_a_bench(
 ) -> Study:
     from mitsim.studies.framework.run import check_study_folder, find_study
 
-    if name in OF_NO_SCENE:
-        if scene is not None:
-            raise MitsimError(f"study {name} {scene}: it is of no scene; leave the scene out")
-        asked.refuse(_OF_SCENES, f"on the study {name}, which is of no scene")
+    files = _captures(name, scene, asked)
     settings: dict[str, Any] = {} if asked.recipe is None else {"recipe": load_recipe(asked.recipe)}
-    if name in OF_CAPTURES:
-        from mitsim.studies.twin_files import TwinFiles
-
-        settings = {"files": TwinFiles.find(None if asked.data is None else Path(asked.data), name)}
-        settings |= {"variant": asked.variant} if name == "twin" else {}
+    if files is not None:
+        settings = {"files": files}
     run_study = find_study(name, **settings)
     if asked.over or asked.measure != "psnr" or asked.shard != WHOLE or asked.jobs or asked.scheduler:
         raise MitsimError(f"study {name}: is measured whole, here; leave out over, measure, shard, jobs and scheduler")

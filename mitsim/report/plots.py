@@ -251,23 +251,6 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
     return figure
 
 
-def stacked_bars(rows: Mapping[str, Mapping[str, float]], x: str) -> Figure:
-    """Draw a bar for each row, the first on top, stacked from its parts (values >= 0) in their order."""
-    parts = list(dict.fromkeys(part for row in rows.values() for part in row))
-    figure, axes = figure_of(1.6 + ROW * len(rows), _BARS)
-    places, ends = np.arange(len(rows))[::-1], np.zeros(len(rows))
-    for number, part in enumerate(parts):
-        own = np.array([row.get(part, 0.0) for row in rows.values()])
-        row, column = divmod(number, len(_PALETTE))
-        style = {"color": _PALETTE[column], "hatch": "//" * row, "edgecolor": "white"}
-        axes.barh(places, own, 0.66, left=ends, label=part, **style)
-        ends += own
-    axes.set_yticks(places, list(rows), fontsize=FONT)
-    label_axes(axes, x, "", grid="x")
-    legend_below(figure, *axes.get_legend_handles_labels())
-    return figure
-
-
 def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
     """Draw the singular values of each family's system, relative to the largest, over their rank in percent."""
     figure, axes = figure_of(0.42 * WIDTH)

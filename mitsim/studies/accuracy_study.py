@@ -1,249 +1,551 @@
-"""`mitsim study accuracy`: what accuracy costs in time, on one scene, within two minutes.
+"""Time and error of captures at several accuracies, of each part of their light, and of the reference, on one scene.
 
-The whole study has BUDGET_S seconds. What is worth most comes first, what does not fit is left out and named, and what
-is cheap is repeated:
+Every error is relative to the *judge*, a factored answer with a seed of its own, every effect of the scene and, where
+its time allows, more anchors, layers and cells than the plans have. The judge's own noise is subtracted, because seeds
+differ and squares therefore add.
 
-1. the *judge*, one factored answer of its own seed with every effect of the scene and, where time allows, more anchors,
-   layers and cells than the plans, that all errors are measured against (:mod:`.judge`);
-2. a whole run of `mitsim capture` at the default accuracy, from opening the scene to the last file (:mod:`.runs`);
-3. each effect, the anchors, layers, cells and the projector's lines left out in turn (:mod:`.parts`), and light over
-   two, three, four and more surfaces where the plan follows it (:mod:`.orders`);
-4. whole runs at other accuracies, and the reference on one frame, extrapolated to all;
-5. repeats of all but the reference.
+*run*: a whole `mitsim capture`, from opening the scene to the last file. *part*: the error without an effect, or with
+anchors, layers or cells reduced to one, and the time of light with all parts less that of light without this part.
+*surfaces*: the same for light over 2, 3, 4 and more surfaces. *reference*: one frame of the scene's own integrator;
+time for all frames, and samples for another error, are extrapolated.
 
-The time of the solver depends on no scene; `python benchmarks/solver.py --forms` measures it.
+The time of the solver does not depend on the scene; `python benchmarks/solver.py --forms` measures it.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from operator import add
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsim.acquire.capture import capture
+from mitsim.acquire.exposure import NoiseTarget
+from mitsim.acquire.reference import render, show_pattern
 from mitsim.acquire.spectral import SpectralBench
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.effects import present
-from mitsim.bench.request import Request, Task
-from mitsim.core.arrays import FloatArray
+from mitsim.bench.effects import EFFECTS, Physics, names, present
+from mitsim.bench.request import Exposure, Request, Task
+from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
-from mitsim.core.runs import Capture
+from mitsim.devices.patterns import PatternFamily, read_name
+from mitsim.light.light import SampledLight, Sampling, Target, trace_light, traced_again
 from mitsim.light.memory import frame_seconds
 from mitsim.light.passes import PASSES
-from mitsim.light.settings import Settings
-from mitsim.report import plots
+from mitsim.light.plan import Plan
+from mitsim.light.sampling import first_samples
+from mitsim.light.settings import (
+    COUNTED,
+    GROUPS,
+    REPLICATES,
+    Approximation,
+    ErrorCovariance,
+    Estimate,
+    PilotResult,
+    Settings,
+)
+from mitsim.light.simulation import Simulation
+from mitsim.metrics import relative_error
+from mitsim.optics.frames import ExpectedFrames
+from mitsim.planner import pilot
+from mitsim.planner.choose import counts_of, predicted_candidate
+from mitsim.planner.planner import SceneFacts, explain_plan
+from mitsim.report.pages import Value
+from mitsim.report.plots import pareto_front
 from mitsim.sensor.chain import electrons_from_irradiance
-from mitsim.studies.accuracy_findings import AccuracyFindings, Budget, Row, Timed
-from mitsim.studies.accuracy_parts import PARENT, Judge, Orders, Parts, Stand
+from mitsim.studies.causes import MOST, OfOrders, ablations, reform
+from mitsim.studies.framework.claims import Judged, choose_rows
+from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
+from mitsim.studies.framework.panels import Bars, Lines
+from mitsim.studies.framework.studio import Studio
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 ACCURACIES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 """Two steps a decade, from a first look to far below the sensor's noise."""
 QUOTED = 1e-3
-"""The default accuracy."""
-BUDGET_S = 100.0
-"""Seconds of the whole study on a quiet machine: with starting, opening and figures below two minutes."""
-_JUDGE_PART, _FRONT_PART, _PARTS_PART, _ORDERS_PART = 0.12, 0.6, 0.6, 0.4
-"""Of what is left, what the judge, one whole run, one look at all parts, and one at light by surfaces may take."""
-_SHORTEST_PILOT_S = 1.0
-"""Shorter looks tell more of kernels than of the machine's pace."""
+"""The default accuracy of a capture."""
+SAMPLES = (16, 64)
+"""Samples a pixel of the reference: the second has half the error of the first."""
+LONGEST_S = 30.0
+"""Predicted seconds above which a run, or a step of the reference, is not measured."""
+PART_S, JUDGE_S = 1.5, 12.0
+"""Predicted seconds of light with all parts, and of the judge's."""
+_REPEATS, _REPEATED_S = 3, 5.0
+"""Repeats of work that takes at most so many seconds; longer work is timed once."""
+_ALIKE = 0.1
+"""Relative difference of two single runs of the same work on an idle machine."""
+_FINER, _STEP = 10.0, 1.25
+"""The judge's noise is a tenth of the quoted accuracy where time allows, and grows by this factor where not."""
+RUN, PART, REFERENCE, PARENT = "factored", "part", "reference", "interreflection"
+ORDERS = {"2 surfaces": (2, 2), "3 surfaces": (3, 3), "4 surfaces": (4, 4), "5 or more": (5, MOST)}
+"""Orders of light by row. A surface keeps at most its albedo of the light, so little is left beyond four."""
+_FEWER = 4
+"""Factor by which fewer samples determine what an order changes, because it is traced alone."""
 
-
-def measure(bench: Apparatus, request: Request, job: Job) -> AccuracyFindings:
-    """Error against time.
-
-    MitsimError for patterns that do not fit, or a scene without light.
-
-    Parameters
-    ----------
-    bench, request, job
-        the scene, patterns and seed (accuracies are the study's own), and who is told how far the work is; seconds of
-        its clock so far, of starting and opening the scene, count for every whole run.
-    """
-    budget = Budget(BUDGET_S)
-    opening = {name: seconds for name, seconds in job.clock.seconds().items() if name in ("start", "open scene")}
-    stand = Stand(bench, bench.family(request.patterns, request.seed), request.seed, job, QUOTED)
-    job.progress("judge", 0.1)
-    with job.clock.stage("judge"):
-        started = time.perf_counter()
-        looked = stand.pilot_runs.seconds
-        budget.saw(time.perf_counter() - started, max(looked, _SHORTEST_PILOT_S))
-        judge = Judge.trace(stand, stand.plan(QUOTED), _JUDGE_PART * budget.left / budget.slower)
-    runs, parts = Runs(stand, request, judge, opening), Parts(stand, judge)
-    job.progress("whole runs", 0.3)
-    with job.clock.stage("whole runs"):
-        runs.measure(ACCURACIES, budget, 1.0, whatever_it_takes=QUOTED)
-    job.progress("parts", 0.4)
-    orders = Orders(stand, judge, parts)
-    with job.clock.stage("parts"):
-        parts.measure(budget, _PARTS_PART)
-        orders.measure(budget, _ORDERS_PART)
-    job.progress("whole runs", 0.6)
-    with job.clock.stage("whole runs"):
-        runs.measure(ACCURACIES, budget, _FRONT_PART)
-    job.progress("reference", 0.7)
-    with job.clock.stage("reference"):
-        reference = list(judge.reference(budget))
-    job.progress("repeats", 0.8)
-    with job.clock.stage("repeats"):
-        budget.repeat([*runs.timed, *parts.timed, *orders.timed])
-    rows = _mark_front(runs.rows)
-    quoted = next(row for row in rows if QUOTED in row.accuracies)
-    slow = reference[-1] if reference else None
-    return AccuracyFindings(
-        rows=(*rows, *reference, *([slow.reaching(quoted.error)] if slow else [])),
-        effects=tuple(each for part in parts.costs for each in (part, *(orders.costs if part.name == PARENT else ()))),
-        parts_accuracy=parts.accuracy,
-        judge=judge.facts,
-        sensor_noise=judge.sensor_noise,
-        opening=opening,
-        speedup_at_equal_error=slow.seconds_at(quoted.error) / runs.light_seconds(QUOTED) if slow else None,
-        left_out=tuple(budget.left_out),
-        quoted=QUOTED,
-        took=budget.seconds - budget.left,
-    )
-
-
-def _mark_front(rows: list[Row]) -> list[Row]:
-    """Measured ``rows``, those marked that no other beats in both time and error."""
-    front = plots.pareto_front([(row.spread.median, row.error) for row in rows])
-    return [replace(row, on_front=(row.spread.median, row.error) in front) for row in rows]
-
-
-# -------- Whole runs of `mitsim capture`
+# -------- A scene and its patterns, with what the pilot measured of them
 
 
 @dataclass(frozen=True, eq=False)
-class _Run:
-    """One run and its repeats: the ``accuracies`` that lead to it, its frames' error, and seconds by stage."""
+class Probe:
+    """A scene, a pattern family and a seed, whose pilot looks down to ``accuracy``."""
 
-    accuracies: tuple[float, ...]
-    timed: Timed
-    stages: list[dict[str, float]]
-    found: list[tuple[float, float]]
+    bench: Apparatus
+    family: PatternFamily
+    seed: int
+    accuracy: float
+
+    @cached_property
+    def pilot_runs(self) -> pilot.PilotRuns:
+        """Runs of the pilot, made once."""
+        return pilot.PilotRuns(self.bench, self.family.lighting, self.accuracy, self.seed)
+
+    @property
+    def pilot_result(self) -> PilotResult:
+        """Return what the pilot measured."""
+        return self.pilot_runs.pilot_result
+
+    @cached_property
+    def few_shots(self) -> Labels:
+        """Numbers of at most eight evenly spread shots; what changes all frames differs among them by few percent."""
+        return np.unique(np.linspace(0, len(self.family.shots) - 1, 8).astype(np.int64))
+
+    def plan(self, accuracy: float) -> Plan:
+        """Return the plan for an ``accuracy``."""
+        return explain_plan(accuracy, self.pilot_result, SceneFacts.of(self.bench))
+
+    def finest(self, plan: Plan) -> Plan:
+        """Return a ``plan`` with every effect, and one step finer in each number."""
+        ladders, now = self.pilot_result.ladders, plan.settings
+        anchors, layers, cells, followed, occluded = (
+            next((finer for finer in ladders[name] if finer > count), count)
+            for name, count in zip(COUNTED, counts_of(now), strict=True)
+        )
+        settings = replace(
+            now,
+            anchors=anchors,
+            layers=self.pilot_result.layers[layers] if layers > 1 else (),
+            subdivision=cells,
+            effects=frozenset(present(self.bench)),
+            followed_anchors=followed,
+            occluded_anchors=occluded,
+            coarse_layers=True,
+        )
+        return replace(plan, settings=settings)
+
+    def within(self, plan: Plan, seconds: float) -> tuple[Plan, float]:
+        """Return the ``plan`` with the least noise whose light is predicted to take at most so many ``seconds``, or
+        else with the noise of its own accuracy, and the predicted seconds."""
+        accuracy = plan.accuracy / _FINER
+        while True:
+            choice = predicted_candidate(accuracy, self.pilot_result, plan.settings, {})
+            if choice.work <= seconds or accuracy > plan.accuracy:
+                return replace(plan, settings=choice.settings, sampling_target=choice.target), choice.work
+            accuracy *= _STEP
+
+    def trace(
+        self, plan: Plan, seed: int, bench: Apparatus | None = None, target: Target | None = None
+    ) -> SampledLight:
+        """Return the light of a ``plan`` by classes of projector pixels, on another ``bench`` or to another ``target``
+        error if they are given."""
+        return trace_light(
+            bench or self.bench, plan, self.family.lighting, seed, Sampling(by_pixel=False, target=target)
+        )
 
 
-class Runs:
-    """Whole runs at several accuracies, each measured at least once.
+def stack_frames(expected: ExpectedFrames) -> tuple[FloatArray, float]:
+    """Return all ``expected`` frames (shots, m, m') and their relative Monte Carlo error.
 
-    Parameters
-    ----------
-    stand, request, judge
-        scene and family, what else is asked of a run, and what its frames are held against.
-    opening
-        seconds that count for every run.
+    MitsimError if all frames are dark.
     """
+    formed = list(expected)
+    frames = np.stack([frame.irradiance for frame in formed])
+    if not frames.any():
+        raise MitsimError("all frames are dark; nothing can be compared")
+    noise = sum(frame.variance * frame.irradiance.size for frame in formed)
+    return frames, float(np.sqrt(noise / np.square(frames).sum()))
 
-    def __init__(self, stand: Stand, request: Request, judge: Judge, opening: Mapping[str, float]) -> None:
-        self._stand, self._judge, self._opening = stand, judge, opening
-        # Speckle is drawn anew in every frame and is no error of the light.
-        off = {"speckle": False} if "speckle" in present(stand.bench) else {}
-        self._request = request.with_values(effects={**request.effects, **off})
-        self._runs: list[_Run] = []
 
-    def measure(
-        self, accuracies: Sequence[float], budget: Budget, share: float, whatever_it_takes: float | None = None
-    ) -> None:
-        """Run each of the ``accuracies`` once that fits and was not run; those that lead to the same settings are one.
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """The answer that errors are relative to: its light, its expected frames, and the errors of these."""
 
-        Parameters
-        ----------
-        accuracies
-            all that the study knows: some of them may share their settings.
-        budget, share
-            time that is left, and the part of it that one run may take.
-        whatever_it_takes
-            run the group of this accuracy alone, and without asking for time.
-        """
-        known = {accuracy for run in self._runs for accuracy in run.accuracies}
-        for group, predicted in sorted(self._groups(accuracies), key=lambda group: group[1]):
-            first = whatever_it_takes in group
-            if known.intersection(group) or (whatever_it_takes is not None and not first):
-                continue
-            name = f"accuracy {_list(group)}"
-            if first or budget.allows(name, budget.slower * predicted, share):
-                run = self._begin(group)
-                run.timed.seconds.append(run.timed.again())
-                self._runs.append(run)
-                budget.saw(run.timed.spread.median, predicted)
+    probe: Probe
+    light: SampledLight
+    expected: ExpectedFrames
+    frames: FloatArray
+    mc_error: float
+    systematic_error: float
 
-    @property
-    def timed(self) -> list[Timed]:
-        """What can be repeated."""
-        return [run.timed for run in self._runs]
+    @classmethod
+    def trace(cls, probe: Probe, seconds: float = JUDGE_S) -> Judge:
+        """Return the best answer that is predicted to take so many ``seconds``."""
+        plan, seed = probe.plan(probe.accuracy), probe.seed + 1
+        finest, work = probe.within(probe.finest(plan), seconds)
+        if work > seconds:  # the plan's own numbers then; what they leave is stated with the judge
+            finest, _ = probe.within(plan, seconds)
+        light = probe.trace(finest, seed)
+        expected = light.frames(probe.family.lighting, seed)
+        counted = zip(COUNTED, counts_of(finest.settings), strict=True)
+        left = probe.pilot_result.error(*(Approximation(*both) for both in counted)).value
+        return cls(probe, light, expected, *stack_frames(expected), left)
 
-    @property
-    def rows(self) -> list[Row]:
-        """Of all runs, the loosest first."""
-        return [
-            Row(
-                "factored",
-                "accuracy",
-                f"accuracy {_list(run.accuracies)}",
-                run.timed.spread + sum(self._opening.values()),
-                *run.found[0],
-                accuracies=run.accuracies,
-                stages={**self._opening, **{name: median(each[name] for each in run.stages) for name in run.stages[0]}},
-            )
-            for run in sorted(self._runs, key=lambda run: -min(run.accuracies))
-        ]
+    def error(self, frames: FloatArray) -> float:
+        """Return the relative error of ``frames`` without the judge's own noise, at least half of that noise."""
+        distance = relative_error(frames, self.frames)
+        return max(math.sqrt(max(distance**2 - self.mc_error**2, 0.0)), self.mc_error / 2)
 
-    def light_seconds(self, accuracy: float) -> float:
-        """Seconds of transport and optics of the run at an ``accuracy``."""
-        run = next(run for run in self._runs if accuracy in run.accuracies)
-        return median(each["transport"] + each["optics"] for each in run.stages)
+    def row(self, **measured: Value) -> dict[str, Value]:
+        """Return columns of a row with those of the judge."""
+        sensor = self.probe.bench.sensor
+        noise = NoiseTarget(self.probe.bench.devices, Exposure(), 1.0)(self.expected)
+        judge = {"judge_error": math.hypot(self.mc_error, self.systematic_error), "judge_mc_error": self.mc_error}
+        return {**measured, **judge, "sensor_noise": noise if np.isfinite(sensor.full_well_e) else None}
 
-    def _groups(self, accuracies: Sequence[float]) -> Iterator[tuple[tuple[float, ...], float]]:
-        """Accuracies by the settings that they lead to, and the seconds that a run of them is predicted to take."""
-        groups: dict[Settings, list[float]] = {}
-        lit: dict[Settings, float] = {}
-        for accuracy in sorted(accuracies, reverse=True):
-            plan = self._stand.plan(accuracy)
-            # With the samples that are taken: parts of one are as good as a whole one.
-            taken = {row.name: float(row.whole(row.predicted_samples(plan.settings))) for row in PASSES.values()}
-            settings = replace(plan.settings, samples=taken)
-            groups.setdefault(settings, []).append(accuracy)
-            lit[settings] = plan.predicted_seconds
-        around = self._stand.pilot_runs.seconds + sum(
-            frame_seconds(self._stand.bench, len(self._stand.family.shots)).values()
+    def of_reference(self) -> SampledLight:
+        """Return the light without effects that the reference lacks, traced again where these have shaped it."""
+        probe, plan, absent = self.probe, self.light.plan, names(lambda effect: not effect.in_reference)
+        if not any(EFFECTS[name].retraced(Physics.of(probe.bench)) for name in absent & plan.settings.effects):
+            return reform(self.light, absent)
+        plain = replace(plan, settings=replace(plan.settings, effects=plan.settings.effects - absent))
+        return probe.trace(plain, probe.seed + 1)
+
+
+# -------- Times
+
+
+def repeated(work: Callable[[], float]) -> list[float]:
+    """Return the seconds of each repeat of some ``work``, which returns its own."""
+    seconds = [work()]
+    return seconds + [work() for _ in range(_REPEATS - 1) if seconds[0] <= _REPEATED_S]
+
+
+def spread(seconds: Sequence[float]) -> dict[str, Value]:
+    """Return the columns of a time that was measured several times."""
+    return {
+        "seconds": median(seconds), "least_s": min(seconds), "most_s": max(seconds), "repeats": len(seconds)
+    }  # fmt: skip
+
+
+def extra(with_it: Sequence[float], without: Sequence[float]) -> dict[str, Value]:
+    """Return the columns of a difference of two times, each measured several times.
+
+    ``seconds`` is None if the difference may be chance (``within_noise``). A single measurement may be a tenth off.
+    """
+    (least, most), (low, high) = (
+        (min(each), max(each)) if len(each) > 1 else ((1 - _ALIKE) * each[0], (1 + _ALIKE) * each[0])
+        for each in (with_it, without)
+    )
+    noisy = least <= high
+    return {
+        "seconds": None if noisy else median(with_it) - median(without),
+        "least_s": max(least - high, 0.0),
+        "most_s": max(most - low, 0.0),
+        "within_noise": noisy,
+        "repeats": min(len(with_it), len(without)),
+    }
+
+
+def _timed(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+# -------- What one point measures
+
+
+def measure_run(judge: Judge, accuracy: float, opening_s: float) -> Iterator[dict[str, Value]]:
+    """Yield the row of a whole capture at an ``accuracy``, whose scene took ``opening_s`` to open."""
+    probe, stages, errors = judge.probe, [], []
+    bench, plan = probe.bench, probe.plan(accuracy)
+    around = probe.pilot_runs.seconds + sum(frame_seconds(bench, len(probe.family.shots)).values())
+    known: dict[str, Value] = {"estimator": RUN, "setting": f"accuracy {accuracy:g}", "accuracy": accuracy}
+    if (predicted := plan.predicted_seconds + around) > LONGEST_S:
+        by = f"not measured, predicted to take {predicted:.0f} s"
+        yield judge.row(**known, seconds=predicted, extrapolated=True, by=by)
+        return
+    # Speckle is drawn anew in every frame and is no error of the light.
+    effects = {"speckle": False} if "speckle" in present(bench) else {}
+    request = Request.of(patterns=probe.family.name, seed=probe.seed, accuracy=accuracy, effects=effects)
+
+    def run() -> float:
+        job = Job()
+        with TemporaryDirectory(prefix="mitsim-study-") as folder:
+            shots = capture(SpectralBench(bench), request, Task(Path(folder) / "run", job=job)).runs[0]
+            seconds = job.clock.seconds()
+            devices = bench.devices
+            wavelength = devices.projector.effective_wavelength_nm
+            unit = electrons_from_irradiance(1.0, shots.exposure_s, devices.sensor, wavelength)
+            errors.append((judge.error(np.asarray(shots.electrons, np.float64) / unit), shots.manifest.mc_error or 0.0))
+        total = seconds.pop("total")
+        stages.append({"open scene": opening_s, **seconds})
+        return total + opening_s
+
+    took = repeated(run)
+    by_stage = {f"{name}_s".replace(" ", "_"): median(each[name] for each in stages) for name in stages[0]}
+    error, noise = errors[0]
+    yield judge.row(**known, error=error, mc_error=noise, **spread(took), extrapolated=False, by="", **by_stage)
+
+
+def measure_parts(judge: Judge) -> Iterator[dict[str, Value]]:
+    """Yield a row for each part of the light, the one that changes most first."""
+    probe, found = judge.probe, []
+    full = full_plan(probe)
+    whole = repeated(_light_of(probe, probe.bench, full))
+    for name, less in ablations(full.settings, frozenset(present(probe.bench))):
+        known = {"followed-anchors": "followed_anchors"}.get(name, name)
+        part = Approximation(known, 1) if known in probe.pilot_result.ladders else Approximation(known)
+        found.append((name, probe.pilot_result.error(part), probe.bench, replace(full, settings=less)))
+    if len(probe.bench.spectrum.weights) > 1:
+        mono, shots = one_line(probe.bench), probe.few_shots
+        seen = replace(judge.light, simulation=Simulation(mono, judge.light.simulation.settings))
+        frames, _ = stack_frames(seen.frames(probe.family.lighting.shots(shots), probe.seed + 1))
+        error = relative_error(frames, judge.frames[shots])
+        found.append(("lines", Estimate(error, error), mono, full))
+    planned = {
+        name for name, _ in ablations(probe.plan(probe.accuracy).settings, probe.plan(probe.accuracy).settings.effects)
+    }
+    for name, (error, bound), bench, plan in sorted(found, key=lambda part: -part[1][0]):
+        took = extra(whole, repeated(_light_of(probe, bench, plan)))
+        yield _part_row(judge, name, error, bound, took, name == "lines" or name in planned)
+
+
+def _part_row(
+    judge: Judge, name: str, error: float, bound: float, took: dict[str, Value], planned: bool, of: str = ""
+) -> dict[str, Value]:
+    label = f"{of}: {name}" if of else name
+    return judge.row(
+        estimator=PART, setting=label, name=name, of=of, error_if_off=error, error_bound=bound, **took, in_plan=planned
+    )
+
+
+def full_plan(probe: Probe) -> Plan:
+    """Return the plan at the probe's accuracy with all parts on, and samples that take at most :data:`PART_S`."""
+    plan = probe.plan(probe.accuracy)
+    now, finer = plan.settings, probe.finest(plan).settings
+    counted = ("anchors", "followed_anchors", "occluded_anchors", "subdivision")
+    numbers = {name: getattr(finer if getattr(now, name) == 1 else now, name) for name in counted}
+    settings = replace(now, effects=finer.effects, layers=now.layers or finer.layers, **numbers)
+    for accuracy in (1e-3, 3e-3, 1e-2, 3e-2, 0.1):
+        choice = predicted_candidate(accuracy, probe.pilot_result, settings, {})
+        if choice.work <= PART_S:
+            break
+    return replace(plan, settings=choice.settings)
+
+
+def _light_of(probe: Probe, bench: Apparatus, plan: Plan) -> Callable[[], float]:
+    """Return work that traces the light of a ``plan`` and forms its frames; its kernels are compiled at once."""
+
+    def work(plan: Plan) -> object:
+        return list(probe.trace(plan, probe.seed, bench, at_once).frames(probe.family.lighting, probe.seed))
+
+    work(replace(plan, settings=with_samples(plan.settings, 1)))
+    return lambda: _timed(lambda: work(plan))
+
+
+def measure_surfaces(judge: Judge, settings: Settings) -> Iterator[dict[str, Value]]:
+    """Yield a row for each order of light, if the plan follows light over several surfaces.
+
+    Light of an order alone determines what the order changes. Its time is that of following light to this order less
+    that of following it to the order before, with the frames of followed light.
+    """
+    probe = judge.probe
+    if PARENT not in probe.plan(probe.accuracy).settings.effects:
+        return
+    bench, family = probe.bench, probe.family
+    samples = first_samples(Simulation(bench, settings))
+
+    def light_of(simulation: Simulation, samples: dict[str, int]) -> SampledLight:
+        return traced_again(replace(judge.light, seed=probe.seed, samples=samples), simulation, "orders")
+
+    def looks(fewest: int, most: int) -> FloatArray:
+        """Return (REPLICATES, shots, m, m') frames of some shots by light of some orders alone."""
+        fewer = {name: max(1, count // _FEWER) for name, count in samples.items()}
+        light = light_of(OfOrders(bench, settings, fewest, most), fewer)
+        each = [reduce(add, light.groups[look::REPLICATES]) / (GROUPS // REPLICATES) for look in range(REPLICATES)]
+        shots = family.lighting.shots(probe.few_shots)
+        return np.array(
+            [[frame.irradiance for frame in replace(light, groups=(one,)).frames(shots, probe.seed)] for one in each]
         )
-        for settings, group in groups.items():
-            yield tuple(group), lit[settings] + around
 
-    def _begin(self, accuracies: tuple[float, ...]) -> _Run:
-        """A run at the tightest of its ``accuracies`` that was not made yet."""
-        request = self._request.with_values(accuracy=min(accuracies))
-        stages: list[dict[str, float]] = []
-        found: list[tuple[float, float]] = []
+    def following(last: int) -> list[float]:
+        simulation = OfOrders(bench, settings, 0, last)
+        if last == 1:
+            simulation = OfOrders(bench, replace(settings, effects=settings.effects - {PARENT}), 0, MOST)
+            if not simulation.passes:
+                return [0.0]
+            light_of(simulation, dict.fromkeys(samples, 1))  # compiles its kernels
+        return repeated(lambda: _timed(lambda: list(light_of(simulation, samples).frames(family.lighting, probe.seed))))
 
-        def again() -> float:
-            """Seconds of the run."""
-            job = Job()
-            with TemporaryDirectory(prefix="mitsim-study-") as folder:
-                task = Task(Path(folder) / "run", job=job)
-                shots = capture(SpectralBench(self._stand.bench), request, task).runs[0]
-                seconds = job.clock.seconds()
-                if not found:
-                    error = self._judge.error(self._irradiance(shots))
-                    found.append((error, shots.manifest.mc_error or 0.0))
-            total = seconds.pop("total")
-            stages.append(seconds)
-            return total
-
-        return _Run(accuracies, Timed(again), stages, found)
-
-    def _irradiance(self, shots: Capture) -> FloatArray:
-        """(shots, pixels, pixels) expected irradiance that a capture was exposed to [W m^-2]."""
-        devices = self._stand.bench.devices
-        unit = electrons_from_irradiance(
-            1.0, shots.exposure_s, devices.sensor, devices.projector.effective_wavelength_nm
-        )
-        return np.asarray(shots.electrons, dtype=np.float64) / unit
+    energy = float(np.square(judge.frames[probe.few_shots]).sum())
+    changes = ErrorCovariance.between({Approximation(name): looks(*each) for name, each in ORDERS.items()}, energy)
+    before = following(1)
+    for name, (_, most) in ORDERS.items():
+        error, bound = changes.estimate([Approximation(name)])
+        after = following(most)
+        yield _part_row(judge, name, error, bound, extra(after, before), True, PARENT)
+        before = after
 
 
-def _list(accuracies: Sequence[float]) -> str:
-    return ", ".join(f"{accuracy:g}" for accuracy in accuracies)
+def measure_reference(judge: Judge) -> Iterator[dict[str, Value]]:
+    """Yield rows that compare one frame of the reference with light that has the same effects."""
+    probe, shots = judge.probe, judge.probe.family.shots
+    index, predicted_s = len(shots) // 2, 0.0
+    answer, _ = stack_frames(judge.of_reference().frames(probe.family.lighting.shots([index]), probe.seed + 1))
+    with show_pattern(probe.bench, probe.family.light(shots[index])):
+        predicted_s = _timed(lambda: render(probe.bench, REFERENCE, SAMPLES[0], 1e-3, probe.seed))  # compiles kernels
+        for spp in SAMPLES:
+            if predicted_s > LONGEST_S:
+                return
+            rendered = render(probe.bench, REFERENCE, spp, 1e-3, probe.seed)
+            one = float(rendered.facts["seconds"])
+            predicted_s = 5 * one  # four times the samples, and some more
+            error = relative_error(rendered.mean.mean(axis=2), answer[0])
+            by = f"one of {len(shots)} frames was measured, {one:.2g} s" if len(shots) > 1 else ""
+            yield judge.row(
+                estimator=REFERENCE, setting=f"{spp} spp", error=error, mc_error=rendered.mc_error,
+                **spread([one * len(shots)]), extrapolated=bool(by), by=by,
+            )  # fmt: skip
+
+
+def at_once(expected: ExpectedFrames) -> float:
+    """Return a target that any error meets, so that sampling stops after its first round."""
+    return float("inf")
+
+
+def with_samples(settings: Settings, samples: int) -> Settings:
+    """Return ``settings`` with so many ``samples`` of a projector pixel and of a cell in each group's first round."""
+    each = {name: samples / 8 if row.anchors else float(samples) for name, row in PASSES.items() if name != "sharp"}
+    return replace(settings, samples={**settings.samples, **each})
+
+
+def one_line(bench: Apparatus) -> Apparatus:
+    """Return a ``bench`` whose projector has its effective wavelength alone."""
+    model = bench.projector
+    changes = {"wavelengths_nm": (model.effective_wavelength_nm,), "radiant_shares": (1.0,)}
+    return replace(bench, devices=replace(bench.devices, projector=model.model_copy(update=changes)))
+
+
+# -------- The study
+
+
+def _points(scope: Scope) -> list[Point]:
+    read_name(scope.patterns)
+    settings = [*(f"{each:g}" for each in scope.choose(ACCURACIES, (1e-2, QUOTED))), REFERENCE]
+    settings += scope.choose((PART, "surfaces"), ())
+    return [Point.of(scope.setup, patterns=scope.patterns, seed=scope.seeds[0], measured=each) for each in settings]
+
+
+def _measure(studio: Studio, point: Point) -> Found:
+    def opened() -> tuple[Judge, float]:
+        seconds = _timed(lambda: studio.bench(point.setup))
+        bench, seed = studio.bench(point.setup), int(point["seed"])
+        return Judge.trace(Probe(bench, bench.family(point["patterns"], seed), seed, QUOTED)), seconds
+
+    judge, opening_s = studio.once("judge", 1, (point.setup, point["patterns"], point["seed"]), opened)
+    kinds: dict[str, Callable[[], Iterator[dict[str, Value]]]] = {
+        PART: lambda: measure_parts(judge),
+        "surfaces": lambda: measure_surfaces(judge, full_plan(judge.probe).settings),
+        REFERENCE: lambda: measure_reference(judge),
+    }
+    rows = kinds.get(point["measured"], lambda: measure_run(judge, float(point["measured"]), opening_s))()
+    return Found(tuple(point.row(**row) for row in rows))
+
+
+def _derive(results: Results) -> Results:
+    """Return results with the column ``on_front`` for runs that no other run beats in both time and error, and a row
+    of the reference at the error of the quoted run."""
+    runs = [row for row in results.rows if row["estimator"] == RUN and not row["extrapolated"]]
+    front = pareto_front([(float(str(row["seconds"])), float(str(row["error"]))) for row in runs])
+    rows = [{**row, "on_front": (row["seconds"], row.get("error")) in front} for row in results.rows]
+    slow = [row for row in rows if row["estimator"] == REFERENCE][-1:]
+    for quoted in [row for row in runs if row["accuracy"] == QUOTED][:1]:
+        rows += [_reaching(row, float(str(quoted["error"]))) for row in slow]
+    return replace(results, rows=rows)
+
+
+def _reaching(row: dict[str, Any], error: float) -> dict[str, Any]:
+    """Return the ``row`` of the reference at samples that leave another ``error``, which falls with their root."""
+    more = (row["error"] / error) ** 2
+    times = {name: row[name] * more for name in ("seconds", "least_s", "most_s")}
+    setting = f"{float(row['setting'].split()[0]) * more:.0e} spp"
+    by = f"error falls with 1/sqrt(samples) from {row['setting']}"
+    return {
+        **row, **times, "setting": setting, "error": error, "mc_error": row["mc_error"] / more**0.5,
+        "extrapolated": True, "by": by,
+    }  # fmt: skip
+
+
+def _kept(rows: DataFrame) -> tuple[str, bool | None]:
+    """Judge whether each run keeps its accuracy, with room for the judge's own error and for sampling."""
+    rows = rows[rows["error"].notna()]
+    over = [row["error"] / math.hypot(row["accuracy"], row["judge_error"]) for row in rows.to_dict("records")]
+    return (f"error over accuracy at most {max(over):.2f}", max(over) <= 1.25) if over else ("not measured", None)
+
+
+def _unbiased(rows: DataFrame) -> tuple[str, bool]:
+    over = [row["error"] / row["mc_error"] for row in rows.to_dict("records") if not row["by"].startswith("error")]
+    return f"error over Monte Carlo error {min(over):.2f} to {max(over):.2f}", all(0.8 < each < 1.25 for each in over)
+
+
+def _faster(rows: DataFrame) -> tuple[str, bool | None]:
+    """Judge how much longer than transport and optics of the quoted run the reference takes for the same error."""
+    quoted = choose_rows(rows, {"estimator": RUN, "accuracy": QUOTED, "extrapolated": False}).to_dict("records")
+    slow = choose_rows(rows, {"estimator": REFERENCE}).to_dict("records")
+    if not quoted or not slow:
+        return "not measured", None
+    speedup = slow[-1]["seconds"] / (quoted[0]["transport_s"] + quoted[0]["optics_s"])
+    return f"the reference takes {speedup:.1e} times as long (extrapolated)", speedup > 1
+
+
+_TIME, _STAGES = "wall time [s]", ("open scene", "plan", "transport", "truth", "optics", "sensor", "write")
+
+STUDY = Study(
+    "accuracy",
+    "What accuracy costs in time",
+    "How long do a capture, each part of its light, and the reference take for their errors?",
+    points=_points,
+    measure=_measure,
+    derive=_derive,
+    claims=(
+        Judged("Whole runs keep their accuracy", _kept, where={"estimator": RUN}),
+        Judged("The reference has no error but noise", _unbiased, where={"estimator": REFERENCE}, optional=True),
+        Judged(f"At the error of the run at {QUOTED:g} the factored light is faster than the reference", _faster),
+    ),
+    panels=(
+        Lines(
+            "seconds", _TIME, y="error", y_label="relative error of the frames [1]", file="accuracy", log=True,
+            title="Whole runs from opening the scene to the last file; reference: light alone, extrapolated",
+            where={"estimator": (RUN, REFERENCE)}, colour="estimator", facet="", ticks=False,
+        ),
+        Bars(
+            "setting", file="stages", title="Stages of whole runs", where={"estimator": RUN, "extrapolated": False},
+            colour={f"{name}_s".replace(" ", "_"): name for name in _STAGES}, x_label=_TIME,
+        ),
+        Bars(
+            "setting", file="effects", title="Error without each part of the light", where={"estimator": PART},
+            colour={"error_if_off": "error without it", "error_bound": "below, at 95 %"},
+            x_label="relative error of the frames [1]",
+        ),
+        Bars(
+            "setting", file="parts", title="Time of each part of the light", where={"estimator": PART},
+            colour={"seconds": "measured", "most_s": "at most"}, x_label=_TIME,
+        ),
+    ),
+    about="Errors are those of the noise-free frames against the judge (columns judge_error and sensor_noise), whose "
+    "Monte Carlo error is subtracted. Times are medians with the least and the most of three repeats, or were measured "
+    "once. A part's time is a difference of two such times, and empty where noise hides it.",
+    heads=("", "", "Found"),
+    traced=False,
+)  # fmt: skip

@@ -49,7 +49,7 @@ from mitsim.report.lit_scene import LINE, IdealCamera, LitScene, ShadowRow, ligh
 from mitsim.report.pages import Mean, with_error
 from mitsim.report.plots import bars
 from mitsim.studies import error_budget
-from mitsim.studies.ablation import ablations, reform
+from mitsim.studies.causes import ablations, reform
 from mitsim.studies.drift_study import SESSION, DriftStand, squared_error
 from mitsim.studies.error_budget import LossRow
 from mitsim.studies.framework.page import Part

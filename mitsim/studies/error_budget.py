@@ -4,7 +4,7 @@ Beside one image that is measured, its squared error E is told by its parts V, w
 a perturbation of the solver with its lambda fixed (:mod:`mitsim.studies.perturbation`). What the scene's light has
 that factors, measured on an even white board, do not hold - detail inside projector pixels, depth, light over several
 surfaces - is found from frames without noise of the light that was traced, solved with factors without noise: of the
-same with one cause after another taken out of the light (:mod:`mitsim.studies.ablation`), and less what lambda alone
+same with one cause after another taken out of the light (:mod:`mitsim.studies.causes`), and less what lambda alone
 takes away. What is left of E is not explained. Noise is drawn once, so every V and what is left scatter by chance, as
 :mod:`mitsim.studies.perturbation` states.
 
@@ -28,8 +28,8 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.session import DRIFT_WORDS, SIDES, Drift, amount_in_words
 from mitsim.reconstruct.factors import Factors
 from mitsim.report.lit_scene import SPECKLE
-from mitsim.studies import ablation
-from mitsim.studies.ablation import Ablation
+from mitsim.studies import causes
+from mitsim.studies.causes import Ablation
 from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, Prediction, squared_error
 from mitsim.studies.perturbation import Noise, Scatter
 
@@ -39,13 +39,13 @@ RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
 """Sampling of simulated light; what the solver takes away of the scene itself; and what no named cause has."""
 ERROR_SOURCES = MappingProxyType(
     {
-        ablation.DETAIL: "detail inside projector pixels",
-        ablation.DEPTH: "depth beside the board's",
-        ablation.OCCLUSION: "edges that hide pixels from part of the sensor",
-        ablation.INTERREFLECTION: "light over several surfaces",
-        ablation.MIRRORS: "light over mirrors",
-        ablation.GLOSS: "gloss over the sensor",
-        ablation.BLACK_LEVEL: "light that black pixels leak",
+        causes.DETAIL: "detail inside projector pixels",
+        causes.DEPTH: "depth beside the board's",
+        causes.OCCLUSION: "edges that hide pixels from part of the sensor",
+        causes.INTERREFLECTION: "light over several surfaces",
+        causes.MIRRORS: "light over mirrors",
+        causes.GLOSS: "gloss over the sensor",
+        causes.BLACK_LEVEL: "light that black pixels leak",
     }
 )
 """Effects of the scene's light that factors do not hold, in the order in which they are taken out, in words. The others
@@ -208,7 +208,7 @@ def _of_scene(scatter: Scatter, seen: Mapping[str, FloatArray], sampled: Noise) 
     ``seen`` are images of the light with its causes, then without one after another; ``sampled`` is the noise of its
     rendering, which all of these have alike.
     """
-    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[ablation.DETAIL]): _Part(0.0)}
+    exact, scene, found = scatter.solver, scatter.scene, {(SCENE, ERROR_SOURCES[causes.DETAIL]): _Part(0.0)}
     (_, last), *others = seen.items()
     for name, image in others:
         moved = scatter.common(sampled, last - image) / scene.size

@@ -1,6 +1,6 @@
 """`mitsim study transfer`: networks that a simulated twin taught, on real captures; beside classical images.
 
-Codes of a FlatCam's mask are learned from one capture and its authors' image (:mod:`mitsim.studies.twin_capture`).
+Codes of a FlatCam's mask are learned from one capture and its authors' image (:mod:`mitsim.studies.twin_study`).
 Their factors are the twin: frames of drawn pictures through them, with noise, teach networks, and no real frame does.
 The other capture is then reconstructed. How like the authors' image that is, is all that can be measured: no truth is
 known.
@@ -34,9 +34,8 @@ from mitsim.reconstruct.solvers import solve_tv
 from mitsim.report import plots
 from mitsim.studies.framework.page import Part
 from mitsim.studies.framework.run import Findings
-from mitsim.studies.twin_capture import Learned, Measured, read_captures
 from mitsim.studies.twin_files import SOURCES, TwinFiles
-from mitsim.studies.twin_frame import correlation
+from mitsim.studies.twin_study import Learned, Measured, correlation, read_captures
 
 if TYPE_CHECKING:
     from mitsim.learn.methods import Method

@@ -3,7 +3,7 @@
 An effect is measured in three ways: *alone*, added to the idealised model; *in order*, added after all effects before
 it, so that the steps add up to the whole; *left out* of the whole. The paper has no such figure.
 
-Effects of the scene are removed from its light (:mod:`mitsim.studies.ablation`). Three more belong to the camera:
+Effects of the scene are removed from its light (:mod:`mitsim.studies.causes`). Three more belong to the camera:
 *saturation*, the full well and the end of the ADC; *quantisation*, its steps and its first number; and *calibration
 noise*, the error of the factors that follows from the noise of a session's frames. Shot noise, read noise and dark
 current are always on, because the paper's model has such noise as well. The exposure is that of equal peak with the
@@ -44,8 +44,8 @@ from mitsim.reconstruct.factors import Estimate, Factors, factors_of_sums, strip
 from mitsim.reconstruct.reconstruct import reconstruct
 from mitsim.reconstruct.solution import Solution, Status, Verdict
 from mitsim.report.lit_scene import IdealCamera, LitScene
-from mitsim.studies import ablation
-from mitsim.studies.ablation import Ablation
+from mitsim.studies import causes
+from mitsim.studies.causes import Ablation
 from mitsim.studies.framework.claims import TOLERANCE_DB, Gain
 from mitsim.studies.framework.experiment import QUICK_IMAGES, TRUTH, Found, Point, Scope, Study
 from mitsim.studies.framework.panels import Bars, Images
@@ -53,13 +53,13 @@ from mitsim.studies.framework.studio import Studio, flags_of, single_precision
 
 SATURATION, QUANTISATION, CALIBRATION_NOISE = "saturation", "quantisation", "calibration noise"
 EFFECTS = (
-    ablation.FALLOFF, ablation.DIFFRACTION, ablation.KEYSTONE, ablation.DEPTH, ablation.OCCLUSION, ablation.DETAIL,
-    ablation.INTERREFLECTION, ablation.MIRRORS, ablation.GLOSS, ablation.AMBIENT, ablation.BLACK_LEVEL,
-    ablation.DEFOCUS, ablation.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, ablation.RENDER_NOISE,
+    causes.FALLOFF, causes.DIFFRACTION, causes.KEYSTONE, causes.DEPTH, causes.OCCLUSION, causes.DETAIL,
+    causes.INTERREFLECTION, causes.MIRRORS, causes.GLOSS, causes.AMBIENT, causes.BLACK_LEVEL,
+    causes.DEFOCUS, causes.SPECKLE, SATURATION, CALIBRATION_NOISE, QUANTISATION, causes.RENDER_NOISE,
 )  # fmt: skip
 """Order in which effects are added: devices, scene, light, camera, simulation."""
 ASSUMED, CALIBRATED = MODELS = ("assumed", "calibrated")
-_IN_SESSIONS = frozenset({ablation.FALLOFF, ablation.DIFFRACTION, ablation.KEYSTONE, ablation.DEFOCUS})
+_IN_SESSIONS = frozenset({causes.FALLOFF, causes.DIFFRACTION, causes.KEYSTONE, causes.DEFOCUS})
 """Effects that change the expected frames of a session; the black level is a factor for all frames."""
 _ROOM = 1024.0
 """Full wells of a sensor without saturation: a power of two changes no other number."""
@@ -107,7 +107,7 @@ class Sessions:
         if not noise:
             return Factors.of(found, self.manifest)
         noisy = self.noisy
-        if not off & (self._effects | {ablation.BLACK_LEVEL}):
+        if not off & (self._effects | {causes.BLACK_LEVEL}):
             return noisy
         left = _align(found.left, whole.left) + _align(noisy.left, whole.left) - whole.left
         right = _align(found.right, whole.right) + _align(noisy.right, whole.right) - whole.right
@@ -119,7 +119,7 @@ class Sessions:
             self._kept[own] = self._by_lines(own)
         found, leak = self._kept[own], self._lit.light.simulation.physics.black_level
         # A +-1 pattern is the difference of two shots: the leak of black pixels cancels, but white ones lose it.
-        white = math.sqrt(1.0 - (0.0 if ablation.BLACK_LEVEL in off else leak))
+        white = math.sqrt(1.0 - (0.0 if causes.BLACK_LEVEL in off else leak))
         return replace(found, left=white * found.left, right=white * found.right)
 
     @single_threaded_blas()

@@ -21,7 +21,6 @@ import pytest
 
 from mitsim.bench.layout import Preview
 from mitsim.report import bench_view
-from mitsim.studies import accuracy_study as accuracy
 
 VERBS = (
     *(
@@ -233,17 +232,15 @@ def test_render(call: Callable[..., Any], lab: Any, tmp_path: Path, estimator: s
 
 
 @pytest.mark.slow
-def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of no time, which leaves all but one run out; what whole rows hold is held by unit/studies/test_accuracy.py."""
-    monkeypatch.setattr(accuracy, "BUDGET_S", 0.0)
-    monkeypatch.setattr(accuracy, "QUOTED", 3e-2)
-    options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet"
+def test_study_accuracy(call: Callable[..., Any], lab: Any, tmp_path: Path) -> None:
+    """Rows of runs and of the reference; unit/studies/test_accuracy.py has the parts of the light."""
+    options = "--patterns", "uniform", "-o", tmp_path / "study", "--json", "--quiet", "--quick"
     study = call("study", "accuracy", lab.scene, *options).payload
-    assert {"rows", "speedup_at_equal_error", "left_out", "took", "opening", "solver"} <= study.keys()
-    assert (study["scene"], study["patterns"], study["output"]) == (str(lab.scene), "uniform", str(tmp_path / "study"))
-    assert study["rows"] and study["left_out"] and number(study["took"])
-    written = {path.name for path in (tmp_path / "study").iterdir()}
-    assert written == {"accuracy.json", "accuracy.html", "stages.png", "effects.png"}, "one run is no curve"
+    assert {"study", "output", "points", "rows", "claims", "figures", "warnings"} <= study.keys()
+    assert [row["setting"] for row in study["rows"]] == ["accuracy 0.01", "accuracy 0.001", "16 spp", "64 spp"]
+    keys = {"patterns", "estimator", "setting", "seconds", "least_s", "most_s", "repeats", "error", "mc_error", "by"}
+    assert all(keys | {"judge_error", "sensor_noise", "extrapolated"} <= row.keys() for row in study["rows"])
+    assert {"accuracy.csv", "accuracy.png"} <= {path.name for path in (tmp_path / "study").iterdir()}
 
 
 def test_doctor(call: Callable[..., Any]) -> None:

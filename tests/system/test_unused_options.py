@@ -63,7 +63,7 @@ CASES = [
     ("study distance -o {out}", "--experiment a.b"),
     ("study distance -o {out}", "--patterns dots:7"),
     ("study distance --scheduler tcp://a:1 -o {out}", "--jobs 1"),
-    ("study accuracy -o {out}", "--quick"),
+    ("study calibration -o {out}", "--quick"),
     ("study transfer -o {out}", "--camera imx249"),
     ("study transfer -o {out}", "-D a=1"),
 ]

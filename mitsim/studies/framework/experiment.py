@@ -141,6 +141,8 @@ class Scope:
         patterns of a sweep that does not vary them, and of a drift.
     recipe
         recipe of a calibration whose drift is studied; None: the shipped one.
+    data
+        folder of real captures.
     """
 
     setup: Setup
@@ -151,6 +153,7 @@ class Scope:
     measures: tuple[str, ...] = ()
     patterns: str = "dots:7"
     recipe: str | None = None
+    data: str | None = None
 
     @property
     def repeats(self) -> tuple[int, ...]:

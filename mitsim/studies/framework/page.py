@@ -219,6 +219,7 @@ def _options(scope: Scope) -> list[str]:
     given += [f"--measure {','.join(scope.measures)}"] if scope.measures else []
     given += [f"--patterns {scope.patterns}"] if scope.patterns != Scope.patterns else []
     given += [f"--recipe {scope.recipe}"] if scope.recipe else []
+    given += [f"--data {scope.data}"] if scope.data else []
     given += [f"--seed {scope.seeds[0]}"] if scope.seeds[0] != Scope.seeds[0] else []
     given += [f"--variant {setup.variant}"] if setup.variant != Setup.variant else []
     return [*given, *(["--allow-outside-files"] if setup.outside else []), *(["--quick"] if scope.quick else [])]

@@ -14,7 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import parse_patterns, stripe_signs
 from mitsim.devices.session import Drift
 from mitsim.report.lit_scene import SPECKLE
-from mitsim.studies import ablation, error_budget
+from mitsim.studies import causes, error_budget
 from mitsim.studies.drift_study import AMBIENT, SESSION
 from mitsim.studies.error_budget import ERROR_SOURCES, LAMBDA, RENDERING, REST, LossRow
 from mitsim.studies.perturbation import Expected, LinearImage, Noise
@@ -103,15 +103,15 @@ def test_a_row_is_named_by_where_it_comes_from(row: LossRow, name: str) -> None:
 def test_causes_are_taken_out_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the order of ERROR_SOURCES, each beside those before it; what the white board's light has as well stays.
     (Planted: each alone.)"""
-    effects = ("falloff", ablation.GLOSS, ablation.DETAIL, ablation.DEPTH)
+    effects = ("falloff", causes.GLOSS, causes.DETAIL, causes.DEPTH)
     scene_ablation = SimpleNamespace(effects=effects, without=lambda off: sorted(off))
     monkeypatch.setattr(error_budget.Ablation, "of", lambda light: scene_ablation)
     stand: Any = SimpleNamespace(lit=SimpleNamespace(light="all"), clear=lambda factors, light: (factors, light))
     assert list(error_budget._clear_images(stand, "exact")) == [  # type: ignore[arg-type]
         ("", ("exact", "all")),
-        (ablation.DETAIL, ("exact", [ablation.DETAIL])),
-        (ablation.DEPTH, ("exact", sorted([ablation.DETAIL, ablation.DEPTH]))),
-        (ablation.GLOSS, ("exact", sorted([ablation.DETAIL, ablation.DEPTH, ablation.GLOSS]))),
+        (causes.DETAIL, ("exact", [causes.DETAIL])),
+        (causes.DEPTH, ("exact", sorted([causes.DETAIL, causes.DEPTH]))),
+        (causes.GLOSS, ("exact", sorted([causes.DETAIL, causes.DEPTH, causes.GLOSS]))),
     ]
 
 
@@ -128,14 +128,12 @@ def test_a_cause_has_what_the_image_gains_without_it() -> None:
         common=lambda noise, error: noise.light * float(np.abs(error).sum()),
         deviation=lambda noise, error: 3 * noise.light * float(np.abs(error).sum()),
     )
-    found = error_budget._of_scene(
-        scatter, dict(zip(("", ablation.DEPTH, ablation.GLOSS), images, strict=True)), sampled
-    )
+    found = error_budget._of_scene(scatter, dict(zip(("", causes.DEPTH, causes.GLOSS), images, strict=True)), sampled)
     squares, whole = [mean_square(image - SCENE) for image in images], float(np.abs(STEADY).sum()) / SCENE.size
-    depth, gloss = (found["scene", ERROR_SOURCES[name]] for name in (ablation.DEPTH, ablation.GLOSS))
+    depth, gloss = (found["scene", ERROR_SOURCES[name]] for name in (causes.DEPTH, causes.GLOSS))
     assert (depth.square, depth.deviation) == pytest.approx((squares[0] - squares[1], 2 * whole))
     assert (gloss.square, gloss.deviation) == pytest.approx((squares[1] - squares[2], 2 * 1.5 * whole))
-    assert found["scene", ERROR_SOURCES[ablation.DETAIL]] == error_budget._Part(0.0)
+    assert found["scene", ERROR_SOURCES[causes.DETAIL]] == error_budget._Part(0.0)
     bias, rest = found["solver", LAMBDA], found["scene", REST]
     assert (bias.square, bias.deviation) == (pytest.approx(mean_square(0.1 * SCENE)), 0.0)
     assert rest.square == pytest.approx(squares[2] - bias.square - 2e-3 / SCENE.size)

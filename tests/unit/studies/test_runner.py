@@ -106,5 +106,5 @@ def test_every_study_can_be_found(name: str) -> None:
 
 
 def test_another_name_is_refused_with_the_studies() -> None:
-    with pytest.raises(MitsimError, match=r"'weather'.*accuracy, calibration, transfer"):
+    with pytest.raises(MitsimError, match=r"'weather'.*calibration, transfer"):
         find_study("weather")

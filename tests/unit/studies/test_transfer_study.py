@@ -17,12 +17,12 @@ from mitsim.core.imagelist import Crop
 from mitsim.core.job import Job
 from mitsim.learn import verbs
 from mitsim.reconstruct.shifted_codes import Pose
-from mitsim.studies import transfer_study, twin_capture
+from mitsim.studies import transfer_study, twin_study
 from mitsim.studies.framework.run import run_study
 from mitsim.studies.transfer_study import AUTHORS, METHODS, Budget, Camera, measure, noise_range, twin_sums
-from mitsim.studies.twin_capture import Learned, Recipe
 from mitsim.studies.twin_files import TwinFiles
-from tests.unit.studies.test_twin_capture import SCENE, made, made_codes
+from mitsim.studies.twin_study import Learned, Recipe
+from tests.unit.studies.test_twin_study import SCENE, made, made_codes
 
 CAPTURES = Path(__file__).parents[3] / "captures"
 POSE = Pose("turned", (0.4733, 0.4806))
@@ -37,8 +37,8 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> TwinFiles:
     crop = Crop(row=1, column=2, rows=125, columns=155)
     small = replace(recipe, how=recipe.how.model_copy(update={"crop": crop}), n=64)
     monkeypatch.setattr(Recipe, "load", lambda: small)
-    monkeypatch.setattr(twin_capture, "_RAW", (254, 318))
-    monkeypatch.setattr(twin_capture, "find_pose", lambda _: POSE)
+    monkeypatch.setattr(twin_study, "_RAW", (254, 318))
+    monkeypatch.setattr(twin_study, "find_pose", lambda _: POSE)
     return TwinFiles.find(CAPTURES)
 
 
@@ -53,7 +53,7 @@ def test_a_capture_is_seen_by_what_the_other_taught(
     known: list[set[str]] = []
     fit = Learned.of
 
-    def watched(planes: list[twin_capture.Measured]) -> Learned:
+    def watched(planes: list[twin_study.Measured]) -> Learned:
         known.append({each.capture for each in planes})
         return fit(planes)
 

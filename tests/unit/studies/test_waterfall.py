@@ -15,7 +15,7 @@ from mitsim.light.simulation import Simulation
 from mitsim.metrics import psnr
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.report.lit_scene import LitScene
-from mitsim.studies.ablation import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
+from mitsim.studies.causes import BLACK_LEVEL, DEPTH, FALLOFF, Ablation
 from mitsim.studies.framework.claims import UNDECIDED
 from mitsim.studies.framework.experiment import Results, Scope, Setup
 from mitsim.studies.framework.studio import Studio
