@@ -385,7 +385,6 @@ WITHOUT_NUMPY = (
     "study patterns -o s --camera endless.toml",
     "study all -o s --camera endless.toml",
     "study drift -o s --camera endless.toml",
-    "study accuracy photograph -o full",
     "study calibration photograph -o s --camera endless.toml",
     "study transfer -o s",
     "study twin -o s",
@@ -396,6 +395,7 @@ WITHOUT_NUMPY = (
 WITHOUT_RENDERER = (
     "study sweep photograph -o full --over sheet_z=1:2:3",
     "study drift -o full",
+    "study accuracy photograph -o full",
     "study colour -o full",
     "study all -o full",
     "study patterns -o full",
