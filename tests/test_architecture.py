@@ -567,13 +567,13 @@ SIZES = {
     "optics": (10, 1985),
     "planner": (6, 1957),
     "reconstruct": (27, 7321),
-    "report": (9, 2474),
+    "report": (9, 2460),
     "scene": (8, 1805),
     "sensor": (5, 1257),
     "sessions": (4, 1101),
-    "studies": (42, 9046),
+    "studies": (37, 8414),
     "transport": (22, 4609),
-    "verbs": (1, 369),
+    "verbs": (1, 375),
     "version": (1, 1),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
